@@ -1,0 +1,217 @@
+"""The boat-docking task as a batched TorchRL environment: the key-press PAMDP with the controller choice as a leaf.
+
+Source: *A Benchmark for Hierarchical Parameterized Action Markov Decision Process*, with constants measured on its
+human data. What a user gives and reads are screen px; the state inside is px from the harbour's centre.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from hpamdp import keys
+from hpamdp.env import counter_rng, episode, harbour, physics
+from hpamdp.env.episode import BoatState, Rules
+
+_LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
+
+
+class BoatDockEnv(EnvBase):
+    """Dock boats in `num_envs` harbours at once.
+
+    Action leaves: `("action", "key")` int64 `[N]` in {0, 1, 2}; `("action", "duration")` float32 `[N, 3]`, seconds in
+    [0, 2], one for each key, of which only the pressed key's counts (values outside are clipped, NaN and infinite ones
+    refused); with `controller="choose"` also `option` int64 `[N]` (0 incongruent, 1 congruent), read at an episode's
+    first press and held until its end.
+
+    Args:
+        num_envs: how many boats.
+        controller: `choose` (the agent picks), `congruent`, `incongruent`, or `random` (drawn for each episode).
+        keymap: of the incongruent boat: 1, 2 or `random`.
+        reward: `paper` (progress, 5 x fuel fraction on success, -1 on failure) or `sparse` (the success term alone).
+        observation: `scaled` to about [-1, 1] with goal - boat appended (`[N, 16]`), or the paper's `pixels`
+            (`[N, 14]`).
+        motor_noise: standard deviation of the log of the executed duration.
+        sensor_noise: standard deviation (px) of the observed positions.
+        slip: probability that a uniformly random key is pressed.
+        compile_physics: compile the pure step, reset and observation functions (the first steps take about a minute).
+        device: where the boats live.
+        seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
+
+    `reset` also takes layouts to play: a tensordict with `start` and `goal` `[N, 2]` in screen px and, optionally,
+    `controller` and `keymap` int `[N]`.
+
+    Raises:
+        ValueError: an argument, action or layout that is out of range; the boats are left as they were.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        controller: Literal["choose", "congruent", "incongruent", "random"] = "choose",
+        keymap: Literal[1, 2, "random"] = 1,
+        reward: Literal["paper", "sparse"] = "paper",
+        observation: Literal["scaled", "pixels"] = "scaled",
+        motor_noise: float = 0.0,
+        sensor_noise: float = 0.0,
+        slip: float = 0.0,
+        compile_physics: bool = False,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+    ) -> None:
+        rules = Rules(controller, keymap, reward, observation, motor_noise, sensor_noise, slip)
+        _check_arguments(num_envs, rules)
+        super().__init__(device=device, batch_size=[num_envs])
+        self.num_envs = num_envs
+        self.rules = rules
+        self._pure_step, self._pure_reset, self._pure_read = episode.step, episode.reset, episode.read
+        if compile_physics:
+            self._pure_step, self._pure_reset, self._pure_read = (
+                torch.compile(function, fullgraph=True, dynamic=False)
+                for function in (episode.step, episode.reset, episode.read)
+            )
+        self._environment = torch.arange(num_envs, dtype=torch.int32, device=self.device)
+        self._make_specs()
+        self._set_seed(seed)
+
+    @property
+    def has_choice(self) -> bool:
+        """Whether the agent picks the controller."""
+        return self.rules.controller == "choose"
+
+    @property
+    def state(self) -> BoatState:
+        """The boats as they are; assign a state to put them elsewhere (checkpoints do)."""
+        return self._state
+
+    @state.setter
+    def state(self, state: BoatState) -> None:
+        self._state = BoatState(*(column.to(self.device) for column in state))
+
+    def _make_specs(self) -> None:
+        n, device = self.num_envs, self.device
+        names = episode.OBSERVATION_NAMES if self.rules.observation == "pixels" else episode.SCALED_NAMES
+        self.observation_spec = Composite(
+            observation=Unbounded(shape=(n, len(names)), device=device),
+            outcome=Categorical(len(physics.OUTCOMES), shape=(n,), device=device),
+            fuel=Bounded(0.0, 1.0, shape=(n, 1), device=device),
+            shape=(n,),
+        )
+        press = Composite(
+            key=Categorical(harbour.NUM_KEYS, shape=(n,), device=device),
+            duration=Bounded(0.0, physics.MAX_DURATION, shape=(n, harbour.NUM_KEYS), device=device),
+            shape=(n,),
+        )
+        option = {keys.OPTION: Categorical(len(harbour.CONTROLLERS), shape=(n,), device=device)}
+        self.action_spec = Composite(**(option if self.has_choice else {}), action=press, shape=(n,))
+        self.reward_spec = Unbounded(shape=(n, 1), device=device)
+        flag = Binary(n=1, shape=(n, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
+        floats = torch.zeros(self.num_envs, device=self.device)
+        integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
+        self._state = BoatState(*[floats] * 9, *[integers] * 4, episode=integers - 1)
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        mask, given = None, None
+        if tensordict is not None:
+            mask = tensordict.get("_reset", None)
+            given = self._given_layout(tensordict) if _LAYOUT_KEYS & set(tensordict.keys()) else None
+        mask = torch.ones_like(self._environment, dtype=torch.bool) if mask is None else mask.reshape(self.num_envs)
+        self._state = self._pure_reset(self._state, mask, self._seed, self._environment, self.rules)
+        if given is not None:
+            self._state = episode.where(mask, self._state._replace(**given), self._state)
+        return self._read()
+
+    def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
+        """Check a user's layout and return the state's columns that it sets."""
+        centre = torch.tensor(harbour.CENTRE, device=self.device)
+        points = {}
+        for name in ("start", "goal"):
+            point = given.get(name, None)
+            if point is None or point.shape != (self.num_envs, 2):
+                shape = None if point is None else list(point.shape)
+                raise ValueError(f"reset: {name} has shape {shape}, but must be [{self.num_envs}, 2] (screen px)")
+            points[name] = point.to(self.device, torch.float32) - centre
+            if not (points[name].norm(dim=-1) < physics.HARBOUR_RADIUS).all():
+                radius = f"{physics.HARBOUR_RADIUS:g} px"
+                raise ValueError(f"reset: a {name} lies outside the harbour: centre {harbour.CENTRE}, radius {radius}")
+        if not ((points["start"] - points["goal"]).norm(dim=-1) > physics.DOCK_RADIUS).all():
+            raise ValueError(f"reset: a start lies within the dock's {physics.DOCK_RADIUS:g} px of its goal")
+        (start_x, start_y), (goal_x, goal_y) = (points[name].unbind(-1) for name in ("start", "goal"))
+        columns = dict(start_x=start_x, start_y=start_y, goal_x=goal_x, goal_y=goal_y, x=start_x, y=start_y)
+        for name, allowed in (("controller", (0, 1)), ("keymap", (1, 2))):
+            value = given.get(name, None)
+            if value is None:
+                continue
+            if name == "controller" and self.has_choice:
+                raise ValueError('reset: controller is given, but with controller="choose" it comes from the option')
+            if value.shape != (self.num_envs,) or not ((value == allowed[0]) | (value == allowed[1])).all():
+                raise ValueError(f"reset: {name} must be {allowed[0]} or {allowed[1]} in shape [{self.num_envs}]")
+            columns[name] = value.to(self.device, torch.int32)
+        return columns
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        key, durations = tensordict.get(keys.KEY), tensordict.get(keys.DURATION)
+        option = tensordict.get(keys.OPTION) if self.has_choice else self._state.controller
+        self._check_shapes(key, durations, option)
+        state, reward, is_action = self._pure_step(
+            self._state, option, key, durations, self._seed, self._environment, self.rules
+        )
+        if not is_action.all():
+            row = int((~is_action).nonzero()[0])
+            raise ValueError(
+                f"step: environment {row} got option={option[row].item()} (allowed 0, 1), key={key[row].item()} "
+                f"(allowed 0, 1, 2), durations={durations[row].tolist()} (the pressed key's must be finite)"
+            )
+        mask = tensordict.get("_step", None)
+        if mask is not None:
+            mask = mask.reshape(self.num_envs)
+            state, reward = episode.where(mask, state, self._state), torch.where(mask, reward, 0.0)
+        self._state = state
+        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+
+    def _check_shapes(self, key: Tensor, durations: Tensor, option: Tensor) -> None:
+        n = self.num_envs
+        expected = (
+            (keys.KEY, key, (n,)),
+            (keys.DURATION, durations, (n, harbour.NUM_KEYS)),
+            (keys.OPTION, option, (n,)),
+        )
+        for name, value, shape in expected:
+            if value.shape != shape:
+                raise ValueError(f"step: {name} has shape {list(value.shape)}, but must be {list(shape)}")
+
+    def _read(self) -> TensorDict:
+        reading = self._pure_read(self._state, self._seed, self._environment, self.rules)
+        return TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device)
+
+
+def _check_arguments(num_envs: int, rules: Rules) -> None:
+    choices = {
+        "controller": ("choose", *harbour.CONTROLLERS[::-1], "random"),
+        "keymap": (1, 2, "random"),
+        "reward": ("paper", "sparse"),
+        "observation": ("scaled", "pixels"),
+    }
+    for name, allowed in choices.items():
+        value = getattr(rules, name)
+        if value not in allowed:
+            raise ValueError(f"BoatDockEnv: {name}={value!r}, but must be one of {', '.join(map(str, allowed))}")
+    if num_envs < 1:
+        raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
+    if not 0.0 <= rules.slip <= 1.0:
+        raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
+    for name in ("motor_noise", "sensor_noise"):
+        if not 0.0 <= getattr(rules, name) < float("inf"):
+            raise ValueError(f"BoatDockEnv: {name}={getattr(rules, name)}, but must be a finite number of at least 0")

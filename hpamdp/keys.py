@@ -1,0 +1,20 @@
+"""The names under which data travels in tensordicts, once."""
+
+OBSERVATION = "observation"
+OPTION = "option"
+ACTION = "action"
+KEY = (ACTION, "key")
+DURATION = (ACTION, "duration")
+REWARD = "reward"
+DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
+OUTCOME, FUEL = "outcome", "fuel"
+
+# Written by DecisionTracker.
+IS_DECISION = "is_decision"
+OPTION_RETURN, OPTION_STEPS = "option_return", "option_steps"
+DECISION_OBSERVATION = "decision_observation"
+
+# Written by an environment that knows the best action: what the `oracle` selector and the `planner` learner read.
+ORACLE_OPTION = ("oracle", "option")
+ORACLE_KEY = ("oracle", "key")
+ORACLE_DURATION = ("oracle", "duration")

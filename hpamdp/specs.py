@@ -1,0 +1,69 @@
+"""The sizes and bounds of a parameterised-action problem, which is all that learners and selectors get to know of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from hpamdp import keys
+
+
+@dataclass(frozen=True)
+class PAMDPSpecs:
+    """Sizes and bounds of one problem.
+
+    Attributes:
+        observation_dim: length of the observation.
+        num_options: how many options the agent chooses from at a decision; 0 where there is no choice.
+        parameter_dims: how many parameters each key takes, `num_keys` entries; they lie side by side in the action.
+        parameter_low, parameter_high: bounds of all parameters, `sum(parameter_dims)` entries.
+    """
+
+    observation_dim: int
+    num_options: int
+    parameter_dims: tuple[int, ...]
+    parameter_low: tuple[float, ...]
+    parameter_high: tuple[float, ...]
+
+    @property
+    def num_keys(self) -> int:
+        """How many keys (discrete actions) there are."""
+        return len(self.parameter_dims)
+
+    @property
+    def num_parameters(self) -> int:
+        """How many parameters all keys take together."""
+        return sum(self.parameter_dims)
+
+    @property
+    def parameter_mask(self) -> Tensor:
+        """Return bool `[num_keys, num_parameters]`: which parameters are each key's own."""
+        owner = torch.repeat_interleave(torch.arange(self.num_keys), torch.tensor(self.parameter_dims))
+        return owner == torch.arange(self.num_keys).unsqueeze(-1)
+
+    def to_unit(self, parameters: Tensor) -> Tensor:
+        """Map parameters `[*B, num_parameters]` from their bounds to [-1, 1]."""
+        low, high = parameters.new_tensor(self.parameter_low), parameters.new_tensor(self.parameter_high)
+        return 2.0 * (parameters - low) / (high - low) - 1.0
+
+    def from_unit(self, unit: Tensor) -> Tensor:
+        """Map `[*B, num_parameters]` in [-1, 1] to the parameters' bounds."""
+        low, high = unit.new_tensor(self.parameter_low), unit.new_tensor(self.parameter_high)
+        return low + (unit + 1.0) * 0.5 * (high - low)
+
+    @classmethod
+    def from_env(cls, env: EnvBase) -> PAMDPSpecs:
+        """Read the sizes off an environment whose action has the leaves `keys.KEY` and `keys.DURATION`."""
+        action = env.full_action_spec_unbatched
+        duration = action[keys.DURATION]
+        num_keys = action[keys.KEY].n
+        return cls(
+            observation_dim=env.observation_spec_unbatched[keys.OBSERVATION].shape[-1],
+            num_options=action[keys.OPTION].n if keys.OPTION in action.keys() else 0,
+            parameter_dims=tuple(getattr(env, "parameter_dims", (1,) * num_keys)),
+            parameter_low=tuple(duration.space.low.flatten().tolist()),
+            parameter_high=tuple(duration.space.high.flatten().tolist()),
+        )
