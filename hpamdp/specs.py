@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -17,16 +17,21 @@ class PAMDPSpecs:
 
     Attributes:
         observation_dim: length of the observation.
-        num_options: how many options the agent chooses from at a decision; 0 where there is no choice.
+        option_names: the options that the agent chooses from at a decision; none where there is no choice.
         parameter_dims: how many parameters each key takes, `num_keys` entries; they lie side by side in the action.
         parameter_low, parameter_high: bounds of all parameters, `sum(parameter_dims)` entries.
     """
 
     observation_dim: int
-    num_options: int
+    option_names: tuple[str, ...]
     parameter_dims: tuple[int, ...]
     parameter_low: tuple[float, ...]
     parameter_high: tuple[float, ...]
+
+    @property
+    def num_options(self) -> int:
+        """How many options there are."""
+        return len(self.option_names)
 
     @property
     def num_keys(self) -> int:
@@ -54,6 +59,10 @@ class PAMDPSpecs:
         low, high = unit.new_tensor(self.parameter_low), unit.new_tensor(self.parameter_high)
         return low + (unit + 1.0) * 0.5 * (high - low)
 
+    def with_option_observed(self) -> PAMDPSpecs:
+        """Return the specs of a learner whose observation ends in the one-hot option."""
+        return replace(self, observation_dim=self.observation_dim + self.num_options)
+
     @classmethod
     def from_env(cls, env: EnvBase) -> PAMDPSpecs:
         """Read the sizes off an environment whose action has the leaves `keys.KEY` and `keys.DURATION`."""
@@ -62,7 +71,7 @@ class PAMDPSpecs:
         num_keys = action[keys.KEY].n
         return cls(
             observation_dim=env.observation_spec_unbatched[keys.OBSERVATION].shape[-1],
-            num_options=action[keys.OPTION].n if keys.OPTION in action.keys() else 0,
+            option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
             parameter_dims=tuple(getattr(env, "parameter_dims", (1,) * num_keys)),
             parameter_low=tuple(duration.space.low.flatten().tolist()),
             parameter_high=tuple(duration.space.high.flatten().tolist()),

@@ -15,8 +15,9 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
-from hpamdp.env import counter_rng, episode, harbour, physics
+from hpamdp.env import counter_rng, episode, harbour, physics, planner
 from hpamdp.env.episode import BoatState, Rules
+from hpamdp.env.oracle import BoatDockOracle, oracle_spec
 
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 
@@ -40,6 +41,7 @@ class BoatDockEnv(EnvBase):
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
         compile_physics: compile the pure step, reset and observation functions (the first steps take about a minute).
+        oracle: also write what the planner knows under `oracle` (`option` `[N]`; `key`, `duration` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
 
@@ -49,6 +51,8 @@ class BoatDockEnv(EnvBase):
     Raises:
         ValueError: an argument, action or layout that is out of range; the boats are left as they were.
     """
+
+    option_names = harbour.CONTROLLERS
 
     def __init__(
         self,
@@ -62,6 +66,7 @@ class BoatDockEnv(EnvBase):
         sensor_noise: float = 0.0,
         slip: float = 0.0,
         compile_physics: bool = False,
+        oracle: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
     ) -> None:
@@ -78,6 +83,10 @@ class BoatDockEnv(EnvBase):
             )
         self._environment = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
+        self._oracle = None
+        if oracle:
+            self._oracle = BoatDockOracle(num_envs, rules, self.device)
+            self.observation_spec["oracle"] = oracle_spec(num_envs, rules, self.device)
         self._set_seed(seed)
 
     @property
@@ -93,6 +102,37 @@ class BoatDockEnv(EnvBase):
     @state.setter
     def state(self, state: BoatState) -> None:
         self._state = BoatState(*(column.to(self.device) for column in state))
+
+    @property
+    def position(self) -> Tensor:
+        """Where the boats are, px from the harbour's centre, `[N, 2]`."""
+        return torch.stack([self._state.x, self._state.y], -1)
+
+    def fixed_episodes(self, seed: int) -> TensorDict:
+        """Return layouts to `reset` with, one for each boat, that no training episode meets, whatever its seed."""
+        layout = harbour.fixed_layouts(self.num_envs, seed)
+        centre = torch.tensor(harbour.CENTRE)
+        points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
+        return TensorDict(points, batch_size=self.batch_size, device=self.device)
+
+    def score(self, td: TensorDictBase) -> Tensor:
+        """Return the score `[N]` of finished (or abandoned) episodes from their last `outcome` and `fuel`."""
+        return harbour.score(td.get(keys.OUTCOME), td.get(keys.FUEL).squeeze(-1))
+
+    def describe(self) -> dict[str, Tensor]:
+        """Return the boats' layouts for evaluation, px from the harbour's centre.
+
+        `start`, `goal` `[N, 2]`, `bearing_offset` `[N]` (degrees) and `optimum` `[N, 2]`: the best possible score with
+        the incongruent and the congruent boat from a full tank.
+        """
+        state = self._state
+        layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
+        return {
+            "start": torch.stack(layout[:2], -1),
+            "goal": torch.stack(layout[2:], -1),
+            "bearing_offset": harbour.bearing_offset(layout),
+            "optimum": planner.best_plans(layout, state.keymap).score,
+        }
 
     def _make_specs(self) -> None:
         n, device = self.num_envs, self.device
@@ -131,6 +171,8 @@ class BoatDockEnv(EnvBase):
         self._state = self._pure_reset(self._state, mask, self._seed, self._environment, self.rules)
         if given is not None:
             self._state = episode.where(mask, self._state._replace(**given), self._state)
+        if self._oracle is not None:
+            self._oracle.plan(self._state, mask)
         return self._read()
 
     def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
@@ -194,7 +236,8 @@ class BoatDockEnv(EnvBase):
 
     def _read(self) -> TensorDict:
         reading = self._pure_read(self._state, self._seed, self._environment, self.rules)
-        return TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device)
+        seen = TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device)
+        return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
 
 
 def _check_arguments(num_envs: int, rules: Rules) -> None:

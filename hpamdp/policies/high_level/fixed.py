@@ -1,0 +1,34 @@
+"""Always one option."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.policies.base import Selector
+from hpamdp.specs import PAMDPSpecs
+
+
+class Fixed(Selector):
+    """Choose the same option at every decision.
+
+    Args:
+        specs: of the problem.
+        option: the option's name or number.
+
+    Raises:
+        ValueError: the problem has no such option.
+    """
+
+    def __init__(self, specs: PAMDPSpecs, *, option: str | int) -> None:
+        super().__init__(specs)
+        names = specs.option_names
+        if option not in names and option not in range(specs.num_options):
+            raise ValueError(f"option={option}: no such option; there are {', '.join(names)}")
+        self.option = names.index(option) if isinstance(option, str) else option
+
+    def select(self, td: TensorDictBase) -> Tensor:
+        """Return the option for every environment, int64 `[*B]`."""
+        return torch.full_like(td.get(keys.IS_DECISION).squeeze(-1), self.option, dtype=torch.long)

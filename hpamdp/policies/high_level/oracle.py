@@ -1,0 +1,26 @@
+"""The better option as the environment's planner knows it: the upper line for selectors."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.policies.base import Selector
+from hpamdp.specs import PAMDPSpecs
+
+
+class Oracle(Selector):
+    """Choose the option with which the best plan scores higher."""
+
+    needs_oracle: ClassVar[bool] = True
+
+    def __init__(self, specs: PAMDPSpecs) -> None:
+        super().__init__(specs)
+        self.in_keys = [*self.in_keys, keys.ORACLE_OPTION]
+
+    def select(self, td: TensorDictBase) -> Tensor:
+        """Return the planner's option for every environment, int64 `[*B]`."""
+        return td.get(keys.ORACLE_OPTION)

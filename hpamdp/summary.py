@@ -1,0 +1,42 @@
+"""What one run comes to, as one JSON object."""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from typing import Any
+
+from omegaconf import DictConfig
+
+from hpamdp.config import name_of
+
+_PACKAGES = ("hpamdp", "torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
+
+
+def summarise(
+    cfg: DictConfig, measured: dict[str, float], random: dict[str, float], frames: int, wall_s: float
+) -> dict[str, Any]:
+    """Return the run's summary: its final evaluation's means, what to hold them against, what it cost, what made it.
+
+    Args:
+        cfg: the resolved config.
+        measured: means of the agent's final evaluation, from `evaluate.measure`.
+        random: the same for random choices and presses.
+        frames, wall_s: presses and seconds of training, evaluations included.
+    """
+    controller = "chosen" if cfg.env.controller == "choose" else cfg.env.controller
+    ceiling = {"score": measured["ceiling"], "success": 1.0, "optimality_gap": 0.0}
+    if controller == "chosen":
+        ceiling["oracle_agreement"] = 1.0
+    return {
+        "high": name_of(cfg.high),
+        "low": name_of(cfg.low),
+        "controller": controller,
+        **measured,
+        "references": {"random": random, "ceiling": ceiling},
+        "episodes": cfg.eval.layouts,
+        "frames": frames,
+        "wall_s": wall_s,
+        "seed": cfg.seed,
+        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+    }
