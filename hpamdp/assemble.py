@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TransformedEnv
 
 from hpamdp import checkpoint
-from hpamdp.config import ConfigError, RunConfig, build, load_class, run_config, validate
+from hpamdp.config import ConfigError, RunConfig, build, load_class, name_of, run_config, validate
 from hpamdp.env.decisions import with_decisions
 from hpamdp.evaluate import Evaluation
 from hpamdp.policies.agent import HierarchicalAgent
@@ -71,7 +72,7 @@ def _make_env(
 def _check_choice(cfg: DictConfig, specs: PAMDPSpecs, has_selector: bool) -> None:
     if has_selector and not specs.num_options:
         raise ConfigError(
-            f"high={_name(cfg.high)}: env.controller={cfg.env.controller} leaves nothing to choose; use high=none or "
+            f"high={name_of(cfg.high)}: env.controller={cfg.env.controller} leaves nothing to choose; use high=none or "
             "env.controller=choose"
         )
     if not has_selector and specs.num_options:
@@ -96,10 +97,6 @@ def _make_learner(node: Any, specs: PAMDPSpecs, device: torch.device) -> Learner
     return build("low", node, specs=specs, device=device)
 
 
-def _name(node: DictConfig) -> str:
-    return "none" if node._target_ is None else node._target_.split(".")[-2]
-
-
 def random_policy(parts: Parts) -> torch.nn.Module:
     """Return the policy that chooses and presses at random: the lower line of every figure."""
     specs = parts.agent.specs
@@ -110,9 +107,25 @@ def random_policy(parts: Parts) -> torch.nn.Module:
     return HierarchicalAgent(selector, learners, specs).policy
 
 
-def resolve(cfg: DictConfig) -> tuple[DictConfig, RunConfig, Path | None]:
-    """Return the config to run, its typed run values and the checkpoint to start from.
+def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, RunConfig, Path | None]:
+    """Return the config to run, its typed run values and the checkpoint to start from, if any.
 
-    With `resume` or `mode=eval` the checkpoint's own config is taken, changed by what the command line sets anew.
+    With `resume` or `mode=eval` the checkpoint's own config is taken, changed by what `overrides`, the command line's
+    words, set anew.
+
+    Raises:
+        ConfigError: a wrong value, no such checkpoint, or a word that would change the saved agent.
     """
-    return cfg, run_config(cfg), None
+    settings = run_config(cfg)
+    where = "resume" if settings.resume is not None else "checkpoint"
+    source = settings.resume or settings.checkpoint
+    if source is None:
+        return cfg, settings, None
+    file = checkpoint.find(source, where)
+    saved = OmegaConf.create(checkpoint.progress_of(file)["config"])
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
+        if key.split(".")[0] in ("high", "low", "agent", "experiment"):
+            raise ConfigError(f"{override}: {where} takes the agent from {file}; leave this out")
+        OmegaConf.update(saved, key, OmegaConf.select(cfg, key), merge=False)
+    return saved, run_config(saved), file

@@ -12,7 +12,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.env.episode import MAX_PRESSES
-from hpamdp.env.physics import OUTCOMES, SUCCESS
+from hpamdp.env.harbour import CONTROLLERS
+from hpamdp.env.physics import OUTCOMES, SAILING, SUCCESS
 
 
 class Evaluation:
@@ -91,11 +92,12 @@ def measure(played: dict[str, np.ndarray], has_choice: bool) -> dict[str, float]
         "presses": float(played["presses"].mean()),
         "ceiling": ceiling,
         "optimality_gap": ceiling - float(played["score"].mean()),
-        "congruent": float((controller == 1).mean()),
     }
     for code, name in enumerate(OUTCOMES):
-        if code:
-            scores[f"outcome_{name}"] = float((outcome == code).mean())
+        if code != SAILING:
+            scores[name] = float((outcome == code).mean())
+    for option, name in enumerate(CONTROLLERS):
+        scores[f"option_{name}"] = float((controller == option).mean())
     if has_choice:
         is_better = optimum.argmax(1) == controller
         worth = np.abs(optimum[:, 1] - optimum[:, 0])

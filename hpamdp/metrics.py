@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 import csv
-import logging
 import math
 import netrc
 import os
 import shutil
+import sys
 from collections.abc import Iterable, Mapping
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Literal, Protocol
 from urllib.parse import urlsplit
 
-from hpamdp.reference import references
-
-_LOG = logging.getLogger(__name__)
+from hpamdp.reference import CHOICE_FIGURES, has_choice, references
 
 FRAMES, WALL_SECONDS = "frames", "wall_s"
 EVALUATION = "eval/"
 
 # Seconds that an online wandb run may keep the training waiting, at its start and at its end.
 _WANDB_START, _WANDB_FINISH = 20.0, 60.0
+
+
+def warn(message: str) -> None:
+    """Write one line to the terminal; the run's logging, which Hydra sets up, may be off."""
+    print(message, file=sys.stderr)
 
 
 def read_rows(path: Path) -> list[dict[str, float]]:
@@ -49,7 +52,8 @@ class MetricsFile:
     """A csv file with one row a log, complete on disk after every row, whose columns may grow.
 
     Args:
-        path: the file. What an earlier run left there is kept as `<name>.previous`.
+        path: the file. It stays as it is until the first row; what an earlier run left there is then kept as
+            `<name>.previous`.
         resume_from: the metrics file of the run that is resumed, which may be `path` itself; its rows come first.
         up_to_frames: leave out the resumed rows from the first one past this many frames on.
     """
@@ -58,24 +62,32 @@ class MetricsFile:
         self.path = path
         self._columns: list[str] = []
         resumed = read_rows(resume_from) if resume_from is not None else []
-        resumed = list(takewhile(lambda row: row.get(FRAMES, 0.0) <= up_to_frames, resumed))
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists():
-            shutil.copyfile(path, path.with_name(path.name + ".previous"))
-        self._rewrite(resumed)
+        # Rows that wait for the first one of this run; None once they are in the file.
+        self._resumed: list[dict[str, float]] | None = list(
+            takewhile(lambda row: row.get(FRAMES, 0.0) <= up_to_frames, resumed)
+        )
 
     def append(self, row: Mapping[str, float]) -> None:
         """Add one row; it is on disk when this returns. Columns not seen before join the header."""
         row = {column: float(value) for column, value in row.items()}
-        if not row.keys() <= set(self._columns):
+        if self._resumed is not None:
+            self._keep_previous()
+            self._rewrite([*self._resumed, row])
+            self._resumed = None
+        elif not row.keys() <= set(self._columns):
             self._rewrite([*self.rows(), row])
-            return
-        with self.path.open("a", newline="") as file:
-            self._writer(file).writerow(row)
+        else:
+            with self.path.open("a", newline="") as file:
+                self._writer(file).writerow(row)
 
     def rows(self) -> list[dict[str, float]]:
         """Return all rows so far, each with the columns it has a number for."""
-        return read_rows(self.path)
+        return read_rows(self.path) if self._resumed is None else list(self._resumed)
+
+    def _keep_previous(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists():
+            shutil.copyfile(self.path, self.path.with_name(self.path.name + ".previous"))
 
     def _rewrite(self, rows: list[dict[str, float]]) -> None:
         self._columns = list(dict.fromkeys(column for column in [*self._columns, *(c for row in rows for c in row)]))
@@ -83,8 +95,7 @@ class MetricsFile:
         draft = self.path.with_name(self.path.name + ".draft")
         with draft.open("w", newline="") as file:
             writer = self._writer(file)
-            if self._columns:
-                writer.writeheader()
+            writer.writeheader()
             writer.writerows(rows)
         draft.replace(self.path)
 
@@ -201,16 +212,20 @@ class WandbLogger:
             login_timeout=_WANDB_START,
             finish_timeout=_WANDB_FINISH,
         )
-        wandb.setup(settings)  # silences the login too, which `init` does on its own
         where = {"project": project, "entity": entity, "group": group, "name": name, "dir": str(output_dir)}
-        mode = _wandb_mode(mode)
+        # Told to `setup` too: that silences the login and keeps an offline run from reporting its use over the network.
+        settings.mode = _wandb_mode(mode, wandb.setup(settings).settings.base_url)
+        wandb.setup(settings)
         try:
-            self._run = wandb.init(**where, config=config, mode=mode, settings=settings)
+            self._run = wandb.init(**where, config=config, settings=settings)
         except wandb.errors.Error as error:
-            if mode != "online":
+            if settings.mode != "online":
                 raise
-            _LOG.warning("wandb did not answer, the run is logged offline: %s", str(error).partition("\n")[0])
-            self._run = wandb.init(**where, config=config, mode="offline", settings=settings)
+            reason, _, _ = str(error).partition("\n")
+            warn(f"wandb could not start online, the run is logged offline: {reason}")
+            settings.mode = "offline"
+            wandb.setup(settings)
+            self._run = wandb.init(**where, config=config, settings=settings)
         self._image = wandb.Image
         self._step = 0
 
@@ -237,32 +252,39 @@ class WandbLogger:
         self._run.finish()
 
 
-def _wandb_mode(mode: str) -> str:
+def _wandb_mode(mode: str, server: str) -> str:
     if mode == "auto":
-        mode = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key() else "offline")
-    if mode == "online" and not _has_wandb_key():
-        _LOG.warning("wandb has no API key (WANDB_API_KEY or netrc), the run is logged offline")
+        mode = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
+    if mode == "online" and not _has_wandb_key(server):
+        warn("wandb has no API key (WANDB_API_KEY or netrc), the run is logged offline")
         return "offline"
     return mode
 
 
-def _has_wandb_key() -> bool:
+def _has_wandb_key(server: str) -> bool:
     if os.environ.get("WANDB_API_KEY"):
         return True
-    host = urlsplit(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")).hostname or ""
+    host = urlsplit(server).netloc
+    # Keys of wandb's own cloud may still be kept under its older name, where wandb finds them as well.
+    hosts = [host, "api.wandb.ai"] if host == "api.forge.coreweave.com" else [host]
     files = [os.environ["NETRC"]] if "NETRC" in os.environ else [Path.home() / ".netrc", Path.home() / "_netrc"]
     for file in files:
         try:
-            if netrc.netrc(str(file)).authenticators(host):
-                return True
+            logins = netrc.netrc(str(file))
         except (OSError, netrc.NetrcParseError):
             continue
+        if any(logins.authenticators(name) for name in hosts):
+            return True
     return False
 
 
-_PERCENT, _NUMBER, _PRESSES = "{:.1%}".format, "{:.3f}".format, "{:.2f}".format
+def _number(value: float) -> str:
+    return f"{round(value, 3) + 0.0:.3f}"  # adding 0 turns -0.0 into 0.0
+
+
+_PERCENT, _PRESSES = "{:.1%}".format, "{:.2f}".format
 _TABLE = (
-    ("score", "score", _NUMBER),
+    ("score", "score", _number),
     ("success", "success", _PERCENT),
     ("too_fast", "too fast", _PERCENT),
     ("out_of_bounds", "out of bounds", _PERCENT),
@@ -271,7 +293,7 @@ _TABLE = (
     ("presses", "presses an episode", _PRESSES),
     ("option_congruent", "congruent boat", _PERCENT),
     ("oracle_agreement", "oracle's choice", _PERCENT),
-    ("optimality_gap", "gap to the ceiling", _NUMBER),
+    ("optimality_gap", "gap to the ceiling", _number),
 )
 _REFERENCE_TITLES = {"random": "random", "human": "people", "best_person": "best person", "ceiling": "ceiling"}
 
@@ -280,13 +302,13 @@ def closing_table(summary: Mapping[str, Any]) -> str:
     """Return a plain aligned table of this agent beside random, people and the ceiling.
 
     Args:
-        summary: the agent's figures under `eval/<name>` with the names of `hpamdp.reference`, `frames`, `wall_s`, and
-            what `reference.references` reads. Rows that the agent has no figure for, and columns without any, are
-            left out.
+        summary: the agent's figures under the names of `hpamdp.reference`, `frames`, `wall_s`, and what
+            `reference.references` reads. Rows that the agent has no figure for, and columns without any, are left out.
     """
-    own = {name: summary.get(EVALUATION + name) for name, _, _ in _TABLE}
+    own = {name: summary.get(name) for name, _, _ in _TABLE}
     columns = {"this agent": own, **{_REFERENCE_TITLES[name]: row for name, row in references(summary).items()}}
     rows = [entry for entry in _TABLE if _is_known(own[entry[0]])]
+    rows = [entry for entry in rows if has_choice(summary) or entry[0] not in CHOICE_FIGURES]
     columns = {t: f for t, f in columns.items() if any(_is_known(f.get(name)) for name, _, _ in rows)}
     cells = [["", *columns]] if rows else []
     for name, label, write in rows:
@@ -306,7 +328,14 @@ def _effort(summary: Mapping[str, Any]) -> list[str]:
     if _is_known(summary.get(FRAMES)):
         parts.append(f"{summary[FRAMES]:,.0f} frames")
     if _is_known(summary.get(WALL_SECONDS)):
-        minutes, seconds = divmod(round(summary[WALL_SECONDS]), 60)
-        hours, minutes = divmod(minutes, 60)
-        parts.append(f"{hours} h {minutes:02} min" if hours else f"{minutes} min {seconds:02} s")
+        parts.append(duration(summary[WALL_SECONDS]))
     return [" in ".join(parts)] if parts else []
+
+
+def duration(seconds: float) -> str:
+    """Return a time in words, as precise as its length calls for."""
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,12 +18,10 @@ from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
 from hpamdp.env.harbour import CONGRUENT, INCONGRUENT, NOT_CHOSEN
 from hpamdp.env.physics import DOCK_RADIUS, HARBOUR_RADIUS, OUTCOMES, SUCCESS
-from hpamdp.metrics import EVALUATION, FRAMES, WALL_SECONDS, read_rows
-from hpamdp.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES, references
+from hpamdp.metrics import EVALUATION, FRAMES, WALL_SECONDS, duration, read_rows, warn
+from hpamdp.reference import CHOICE_FIGURES, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES, has_choice, references
 
-_LOG = logging.getLogger(__name__)
-
-# Okabe and Ito's colours, which the colour-blind tell apart; one meaning each in all figures.
+# Colours of Okabe and Ito and of Tol that the colour-blind tell apart, each with one meaning in all figures.
 _AGENT, _INK, _FAINT = "#0072B2", "#2b2b2b", "#8c8c8c"
 _REFERENCES = {
     "random": ("random", "#8c8c8c", ":"),
@@ -35,9 +32,9 @@ _REFERENCES = {
 _OUTCOME_COLOURS = {
     "success": "#009E73",
     "too_fast": "#D55E00",
-    "out_of_bounds": "#B65A93",
-    "out_of_fuel": "#B39B00",
-    "time_limit": "#56B4E9",
+    "out_of_bounds": "#AA4499",
+    "out_of_fuel": "#332288",
+    "time_limit": "#7FC8F2",
     "sailing": "#8c8c8c",
 }
 _WATER, _RIM, _DOCK, _DOCK_EDGE = "#eef4f6", "#9fb9c2", "#f4dfb0", "#c8963e"
@@ -61,7 +58,8 @@ _STYLE = {
 _PANELS = (
     ("score", "Score", False),
     ("success", "Episodes that dock", True),
-    ("oracle_agreement", "Episodes with the better boat", True),
+    ("oracle_agreement", "Better boat chosen", True),
+    ("option_congruent", "Congruent boat chosen", True),
 )
 
 _SHEET = (4, 6)  # rows and columns of the sheet of trajectories
@@ -71,11 +69,13 @@ def draw_all(output_dir: Path) -> list[Path]:
     """Draw what the files in a run's folder allow and return the figures' paths.
 
     `metrics.csv` gives `learning_curves.png`; `evaluation.npz` gives `trajectories.png` and, where the agent chose its
-    boat, `choices.png`; `summary.json` gives the references beside them. A missing or broken file leaves its figures out.
+    boat, `choices.png`; `summary.json` gives the references. A missing or broken file leaves its figures out.
     """
     summary = _read_summary(output_dir / "summary.json")
     rows = read_rows(output_dir / "metrics.csv")
     evaluation = _read_evaluation(output_dir / "evaluation.npz")
+    if summary.get("controller") == "chosen" and "controller" in evaluation:
+        evaluation.setdefault("option", evaluation["controller"])
     with mpl.rc_context(_STYLE):
         figures = {
             "learning_curves.png": _learning_curves(rows, summary),
@@ -92,7 +92,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
     try:
         return json.loads(path.read_text()) if path.exists() else {}
     except ValueError as error:
-        _LOG.warning("%s is no json, its references are left out: %s", path, error)
+        warn(f"{path} is no json, its references are left out: {error}")
         return {}
 
 
@@ -103,25 +103,38 @@ def _read_evaluation(path: Path) -> dict[str, np.ndarray]:
         with np.load(path) as arrays:
             return dict(arrays)
     except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        _LOG.warning("%s cannot be read, its figures are left out: %s", path, error)
+        warn(f"{path} cannot be read, its figures are left out: {error}")
         return {}
 
 
-def _label_ends(axes: Axes, labels: list[tuple[float, str, str]]) -> None:
-    """Write labels (height, text, colour) right of the axes, apart where their heights are too near each other."""
-    if not labels:
-        return
+def _label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1.0) -> None:
+    """Write labels (height, text, colour) right of the axes, a line's height apart at least.
+
+    A thin leader joins a label to its line's end, `ends` of the way across the axes.
+    """
     low, high = axes.get_ylim()
-    gap = 0.062  # of the axes' height
     labels = sorted(labels)
-    wanted = np.array([(height - low) / (high - low) for height, _, _ in labels])
-    steps = gap * np.arange(len(labels))
-    # Each label stands at least a gap above the one below; what that pushed past the top goes back down.
-    placed = np.maximum.accumulate(wanted - steps) + steps
-    placed = np.minimum.accumulate((placed.clip(max=1.0) - steps)[::-1])[::-1] + steps
-    placed = np.minimum(placed, 1.02 - gap * np.arange(len(labels))[::-1])
-    for place, (_, text, colour) in zip(placed, labels, strict=True):
-        axes.annotate(text, (1.02, place), xycoords="axes fraction", color=colour, va="center", fontsize=8.5)
+    heights = [(height - low) / (high - low) for height, _, _ in labels]
+    for height, place, (_, text, colour) in zip(heights, _apart(heights, 0.064), labels, strict=True):
+        leader = {"color": colour, "linewidth": 0.7, "clip_on": False, "transform": axes.transAxes}
+        axes.plot([ends, 1.03], [height, place], alpha=0.7, **leader)
+        axes.annotate(text, (1.04, place), xycoords="axes fraction", color=colour, va="center", fontsize=8.5)
+
+
+def _apart(heights: list[float], gap: float) -> list[float]:
+    """Move sorted heights to be at least `gap` apart, every cluster about its own mean, none above 1."""
+    clusters: list[list[float]] = []
+    for height in heights:
+        clusters.append([height])
+        while len(clusters) > 1 and _foot(clusters[-1], gap) < _foot(clusters[-2], gap) + gap * len(clusters[-2]):
+            last = clusters.pop()
+            clusters[-1].extend(last)
+    return [_foot(cluster, gap) + gap * i for cluster in clusters for i in range(len(cluster))]
+
+
+def _foot(cluster: list[float], gap: float) -> float:
+    reach = gap * (len(cluster) - 1)
+    return min(sum(cluster) / len(cluster) - reach / 2.0, 1.02 - reach)
 
 
 def _series(rows: list[dict[str, float]], name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -133,14 +146,19 @@ def _series(rows: list[dict[str, float]], name: str) -> tuple[np.ndarray, np.nda
 def _learning_curves(rows: list[dict[str, float]], summary: Mapping[str, Any]) -> Figure | None:
     logged = {name for row in rows for name in row}
     panels = [panel for panel in _PANELS if {EVALUATION + panel[0], "train/" + panel[0]} & logged]
+    panels = [panel for panel in panels if has_choice(summary) or panel[0] not in CHOICE_FIGURES]
     if not panels:
         return None
-    figure = Figure(figsize=(4.6 * len(panels), 3.5), layout="constrained")
-    all_axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, panel in zip(all_axes, panels, strict=True):
+    columns = min(len(panels), 2)
+    num_rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.8 * columns, 3.2 * num_rows + 0.3), layout="constrained")
+    all_axes = figure.subplots(num_rows, columns, squeeze=False).ravel()
+    for axes in all_axes[len(panels) :]:
+        axes.set_axis_off()
+    for axes, panel in zip(all_axes, panels, strict=False):
         _draw_curve(axes, rows, panel, references(summary))
-    minutes = max((row.get(WALL_SECONDS, 0.0) for row in rows), default=0.0) / 60.0
-    figure.supxlabel(f"presses while training{f' ({minutes:.3g} min in all)' if minutes else ''}", fontsize=9)
+    seconds = _series(rows, WALL_SECONDS)[1].max(initial=0.0)
+    figure.supxlabel(f"presses while training{f' ({duration(seconds)} in all)' if seconds else ''}", fontsize=9)
     return figure
 
 
@@ -149,17 +167,18 @@ def _draw_curve(
 ) -> None:
     name, title, is_share = panel
     write = "{:.0%}".format if is_share else "{:.2f}".format
-    labels, heights = [], []
+    labels = []
     for reference, (label, colour, dashes) in _REFERENCES.items():
         value = beside.get(reference, {}).get(name)
         if value is not None and np.isfinite(value):
             axes.axhline(value, color=colour, linestyle=dashes, linewidth=1.1, zorder=1)
             labels.append((value, f"{label} {write(value)}", colour))
     trained, evaluated = _series(rows, "train/" + name), _series(rows, EVALUATION + name)
-    axes.plot(*trained, color=_AGENT, alpha=0.35, linewidth=1.0, zorder=2)
-    axes.plot(*evaluated, color=_AGENT, linewidth=2.0, marker="o", markersize=3.5, zorder=3)
-    for (_, values), label in ((evaluated, "greedy"), (trained, "exploring")):
+    faint = {"alpha": 0.35, "linewidth": 1.0, "zorder": 2}
+    bold = {"linewidth": 2.0, "marker": "o", "markersize": 3.5, "zorder": 3, "clip_on": False}
+    for (frames, values), label, line in ((evaluated, "this agent", bold), (trained, "exploring", faint)):
         if len(values):
+            axes.plot(frames, values, color=_AGENT, **line)
             labels.append((values[-1], f"{label} {write(values[-1])}", _AGENT))
     heights = [height for height, _, _ in labels] + [*trained[1], *evaluated[1]]
     if is_share:
@@ -168,7 +187,7 @@ def _draw_curve(
     elif heights:
         margin = 0.05 * max(max(heights) - min(heights), 0.1)
         axes.set_ylim(min(heights) - margin, max(heights) + margin)
-    axes.set_xlim(left=0.0)
+    axes.set_xlim(0.0, max([1.0, *trained[0], *evaluated[0]]))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set_title(title)
@@ -197,8 +216,12 @@ def _trajectories(evaluation: Mapping[str, np.ndarray]) -> Figure | None:
         for name, share in present
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
-    note = f"{num} of {len(scores)} episodes, evenly spaced by score. Above each: score / best possible, boat"
-    figure.supxlabel(f"{note} (C congruent, I incongruent).", fontsize=8.5, color=_FAINT)
+    figure.supxlabel(
+        f"{num} of {len(scores)} episodes, evenly spaced by score. Open circle: start; a dot where each press ends.\n"
+        "Above: score / best possible score, boat (C congruent, I incongruent).",
+        fontsize=8.5,
+        color=_FAINT,
+    )
     return figure
 
 
@@ -244,22 +267,20 @@ def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int) -> str:
 
 
 def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> Figure | None:
-    if not {"option", "bearing_offset"} <= evaluation.keys():
+    if not {"option", "bearing_offset", "outcome"} <= evaluation.keys():
         return None
     chose = (evaluation["option"] != NOT_CHOSEN) & np.isfinite(evaluation["bearing_offset"])
     if not chose.any():
         return None
-    has_outcomes = "outcome" in evaluation
-    figure = Figure(figsize=(9.6 if has_outcomes else 6.0, 3.7), layout="constrained")
-    grid = figure.add_gridspec(1, 2 if has_outcomes else 1, width_ratios=[1.5, 1.0][: 2 if has_outcomes else 1])
-    _draw_choices(figure.add_subplot(grid[0]), {name: array[chose] for name, array in evaluation.items()})
-    if has_outcomes:
-        people = references(summary).get("human", {})
-        _draw_outcomes(figure.add_subplot(grid[1]), evaluation["outcome"].astype(int), people)
+    people = references(summary).get("human", {})
+    figure = Figure(figsize=(9.6, 3.7), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
+    _draw_choices(left, {name: array[chose] for name, array in evaluation.items()}, has_people=bool(people))
+    _draw_outcomes(right, evaluation["outcome"].astype(int), people)
     return figure
 
 
-def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray]) -> None:
+def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: bool) -> None:
     edges = np.array(OFFSET_EDGES, dtype=float)
     centres = (edges[:-1] + edges[1:]) / 2.0
     bins = np.clip(np.digitize(evaluation["bearing_offset"], edges) - 1, 0, len(centres) - 1)
@@ -272,24 +293,30 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray]) -> None:
     labels = []
     optimum = evaluation.get("optimum", np.full((len(bins), 2), np.nan))
     congruent = evaluation["option"] == CONGRUENT
-    title = "Episodes with the congruent boat"
+    title = "Congruent boat chosen"
     if np.isfinite(optimum).all():
         better = optimum[:, CONGRUENT] > optimum[:, INCONGRUENT]
         oracle = shares(better)
         axes.plot(centres[filled], oracle, color=_INK, linewidth=1.1, marker="s", markersize=4)
         labels.append((oracle[-1], "oracle", _INK))
-        title += f" (the better one in {(better == congruent).mean():.0%})"
-    label, colour, dashes = _REFERENCES["human"]
-    axes.plot(centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
-    labels.append((HUMAN_CONGRUENT_BY_OFFSET[-1], label, colour))
+        title += f" (better boat in {(better == congruent).mean():.0%})"
+    if has_people:
+        label, colour, dashes = _REFERENCES["human"]
+        axes.plot(centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
+        labels.append((HUMAN_CONGRUENT_BY_OFFSET[-1], label, colour))
     share = shares(congruent)
     errors = _wilson(share, num[filled])
     axes.errorbar(centres[filled], share, errors, color=_AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
     labels.append((share[-1], "this agent", _AGENT))
-    axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=edges, xlabel="degrees between goal and the boat's nearest key")
+    axes.set(
+        xlim=(0, 60),
+        ylim=(-0.03, 1.03),
+        xticks=edges,
+    )
+    axes.set_xlabel("degrees between the goal's bearing and the congruent boat's nearest key")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_title(title)
-    _label_ends(axes, labels)
+    _label_ends(axes, labels, ends=centres[filled][-1] / edges[-1])
 
 
 def _wilson(share: np.ndarray, num: np.ndarray) -> np.ndarray:
@@ -301,17 +328,19 @@ def _wilson(share: np.ndarray, num: np.ndarray) -> np.ndarray:
 
 
 def _draw_outcomes(axes: Axes, outcomes: np.ndarray, people: Mapping[str, float]) -> None:
-    names = [name for name in OUTCOMES[SUCCESS:] if (outcomes == OUTCOMES.index(name)).any() or people.get(name)]
+    names = [name for code, name in enumerate(OUTCOMES) if (outcomes == code).any() or people.get(name)]
+    colour = _REFERENCES["human"][1]
     for row, name in enumerate(names):
         share = (outcomes == OUTCOMES.index(name)).mean()
         axes.barh(row, share, color=_OUTCOME_COLOURS[name], height=0.62)
-        axes.annotate(
-            f"{share:.1%}", (share, row), xytext=(9, 0), textcoords="offset points", va="center", fontsize=8.5
-        )
-        if name in people:
-            axes.plot([people[name]] * 2, [row - 0.4, row + 0.4], color=_REFERENCES["human"][1], linewidth=2.0)
-    axes.set(xlim=(0, 1.12), yticks=range(len(names)), yticklabels=[_words(name) for name in names])
-    axes.invert_yaxis()
+        axes.annotate(f"{share:.1%}", (1.12, row), ha="right", va="center", fontsize=8.5, annotation_clip=False)
+        if people.get(name) is not None:
+            for edge, width in (("white", 4.5), (colour, 2.0)):  # the white edge keeps it apart from the bar
+                axes.plot([people[name]] * 2, [row - 0.38, row + 0.38], color=edge, linewidth=width)
+    if people.get("success") is not None:
+        axes.annotate("people", (people["success"], -0.45), color=colour, ha="center", va="bottom", fontsize=8.5)
+    axes.set(xlim=(0, 1), ylim=(len(names) - 0.4, -0.85))
+    axes.set_yticks(range(len(names)), [_words(name) for name in names])
     axes.xaxis.set_major_formatter(PercentFormatter(1.0))
     axes.tick_params(axis="y", length=0)
     axes.set_title("How episodes end")

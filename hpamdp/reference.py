@@ -17,6 +17,8 @@ from typing import Any
 
 Figures = dict[str, float]
 
+CHOICE_FIGURES = ("option_congruent", "oracle_agreement")  # which mean something only where the boat is chosen
+
 # The first entry is the whole task, in which the boat is chosen.
 HUMAN: dict[str, Figures] = {
     "chosen": {
@@ -49,6 +51,11 @@ CEILING: dict[str, Figures] = {
     "incongruent": {"score": 3.41, "success": 1.0, "optimality_gap": 0.0},
     "random": {"score": 3.41, "success": 1.0, "optimality_gap": 0.0},
 }
+
+
+def has_choice(summary: Mapping[str, Any]) -> bool:
+    """Return whether the run of this summary chose its boats."""
+    return summary.get("controller", "chosen") == "chosen"
 
 
 def references(summary: Mapping[str, Any]) -> dict[str, Figures]:

@@ -8,9 +8,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from hpamdp import __version__
 from hpamdp.config import name_of
 
-_PACKAGES = ("hpamdp", "torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
+_PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
 
 
 def summarise(
@@ -38,5 +39,9 @@ def summarise(
         "frames": frames,
         "wall_s": wall_s,
         "seed": cfg.seed,
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "versions": {
+            "hpamdp": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in _PACKAGES},
+        },
     }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +18,25 @@ from tqdm import tqdm
 
 from hpamdp import checkpoint, keys, plots
 from hpamdp.assemble import Parts, assemble, random_policy, resolve
+from hpamdp.config import ConfigError
 from hpamdp.env.physics import SUCCESS
 from hpamdp.evaluate import measure
 from hpamdp.metrics import MetricsFile, closing_table
 from hpamdp.summary import summarise
 
 
-def run(cfg: DictConfig, output_dir: Path) -> int:
+def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = ()) -> int:
     """Train or score an agent as `cfg` says, write everything under `output_dir`, return the exit code.
+
+    Args:
+        cfg: the composed config.
+        output_dir: a folder, made if need be.
+        overrides: the command line's words, which change a resumed run's config.
 
     Raises:
         ConfigError: a value, a path or a pair of choices that cannot be.
     """
-    cfg, settings, source = resolve(cfg)
+    cfg, settings, source = resolve(cfg, overrides)
     output_dir.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
     torch.set_num_threads(settings.threads)
@@ -39,7 +46,7 @@ def run(cfg: DictConfig, output_dir: Path) -> int:
     if source is not None:
         trainer.restore(source)
     is_interrupted = False
-    if settings.mode == "train":
+    if settings.mode == "train" and trainer.frames < settings.total_frames:
         is_interrupted = trainer.train()
     trainer.finish()
     if is_interrupted:
@@ -65,9 +72,14 @@ class Trainer:
         env_state = checkpoint.load(source, self.parts.agent, self.parts.device, is_training)
         progress = checkpoint.progress_of(source)
         self.frames, self.wall_s = progress["frames"], progress["wall_s"]
-        if is_training:
-            self.parts.env.state = type(self.parts.env.state)(**env_state)
-            self.metrics.start_from(progress["rows"])
+        if not is_training:
+            return
+        state = self.parts.env.state
+        if env_state["episode"].shape != state.episode.shape:
+            had, given = len(env_state["episode"]), self.settings.num_envs
+            raise ConfigError(f"num_envs={given}: the run to resume had {had}; leave this out")
+        self.parts.env.state = type(state)(**env_state)
+        self.metrics = MetricsFile(self.metrics.path, source.parent / "metrics.csv", self.frames)
 
     def train(self) -> bool:
         """Run until `total_frames`; return whether the user stopped it before. Either way the agent is saved."""
@@ -117,7 +129,6 @@ class Trainer:
             "config": OmegaConf.to_container(self.cfg, resolve=True),
             "frames": self.frames,
             "wall_s": self.wall_s,
-            "rows": self.metrics.rows(),
         }
         path = self.output_dir / checkpoint.FILE_NAME
         checkpoint.save(path, self.parts.agent, self.parts.env.state._asdict(), progress)

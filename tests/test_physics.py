@@ -243,7 +243,7 @@ def test_compiled_and_eager_agree(compiled):
     num = 4096
     rows = torch.arange(num, dtype=torch.int32)
     seed = torch.tensor(7, dtype=torch.int32)
-    rules = episode.Rules(motor_noise=0.1, slip=0.2)
+    rules = episode.Rules()
     blank = episode.BoatState(*[torch.zeros(num)] * 9, *[torch.zeros_like(rows)] * 5)
     state = episode.reset(blank, torch.ones(num, dtype=torch.bool), seed, rows, rules)
     generator = torch.Generator().manual_seed(0)

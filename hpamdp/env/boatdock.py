@@ -175,6 +175,14 @@ class BoatDockEnv(EnvBase):
             self._oracle.plan(self._state, mask)
         return self._read()
 
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        # `_reset` gives the boats that were not reset as they are, so TorchRL's merge by mask, which takes longer than
+        # the physics of 65,536 boats, would change nothing.
+        if tensordict is None:
+            return tensordict_reset
+        tensordict.pop("_reset", None)
+        return tensordict.update(tensordict_reset)
+
     def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
         """Check a user's layout and return the state's columns that it sets."""
         centre = torch.tensor(harbour.CENTRE, device=self.device)
@@ -206,7 +214,7 @@ class BoatDockEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         key, durations = tensordict.get(keys.KEY), tensordict.get(keys.DURATION)
         option = tensordict.get(keys.OPTION) if self.has_choice else self._state.controller
-        self._check_shapes(key, durations, option)
+        self._check_leaves(key, durations, option)
         state, reward, is_action = self._pure_step(
             self._state, option, key, durations, self._seed, self._environment, self.rules
         )
@@ -223,7 +231,7 @@ class BoatDockEnv(EnvBase):
         self._state = state
         return self._read().set(keys.REWARD, reward.unsqueeze(-1))
 
-    def _check_shapes(self, key: Tensor, durations: Tensor, option: Tensor) -> None:
+    def _check_leaves(self, key: Tensor | None, durations: Tensor | None, option: Tensor | None) -> None:
         n = self.num_envs
         expected = (
             (keys.KEY, key, (n,)),
@@ -231,8 +239,11 @@ class BoatDockEnv(EnvBase):
             (keys.OPTION, option, (n,)),
         )
         for name, value, shape in expected:
-            if value.shape != shape:
-                raise ValueError(f"step: {name} has shape {list(value.shape)}, but must be {list(shape)}")
+            if value is None or value.shape != shape:
+                given = None if value is None else list(value.shape)
+                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
+            if name != keys.DURATION and value.is_floating_point():
+                raise ValueError(f"step: {name} has type {value.dtype}, but must be integer")
 
     def _read(self) -> TensorDict:
         reading = self._pure_read(self._state, self._seed, self._environment, self.rules)

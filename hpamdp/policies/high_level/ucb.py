@@ -82,7 +82,7 @@ class UCB(Selector):
         # An arm's bound falls with each pull, so taking the best arm `num` times over is taking the `num` best bounds.
         # An arm without payoffs has an infinite one; the term in `pulls` lets such arms take turns.
         bounds = self.means.unsqueeze(-1) + self.exploration * deviation * width
-        bounds = torch.where(self.counts.unsqueeze(-1) < 1e-9, 1e9 - pulls, bounds)
+        bounds = torch.where(self.counts.unsqueeze(-1) < 1e-9, 1e9 - pulls.double(), bounds)
         chosen = bounds.flatten().topk(num).indices // num
         return chosen[torch.randperm(num, device=chosen.device)]
 

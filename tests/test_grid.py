@@ -1,0 +1,68 @@
+"""Every selector runs over every learner, and every one of them survives a checkpoint: the lists are those of conf/."""
+
+import itertools
+
+import pytest
+import torch
+from conftest import choices, compose_config
+from tensordict import TensorDict
+
+from hpamdp import checkpoint
+from hpamdp.assemble import assemble
+from hpamdp.config import run_config
+from hpamdp.train import run
+
+# What makes a learner's training short; a learner that is not named needs nothing.
+SHORT = {
+    "hyar": ["low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.updates_per_frame=0.05", "low.batch_size=16"]
+}
+SMALL = ["num_envs=16", "steps_per_batch=4", "total_frames=256", "eval.layouts=10", "eval.every=0", "log_every=0"]
+
+
+def words(high: str, low: str) -> list[str]:
+    controller = "random" if high == "none" else "choose"
+    return [f"high={high}", f"low={low}", f"env.controller={controller}", *SHORT.get(low, []), *SMALL]
+
+
+def make(high: str, low: str, tmp_path):
+    cfg = compose_config(words(high, low))
+    torch.manual_seed(0)
+    return assemble(cfg, run_config(cfg), tmp_path)
+
+
+@pytest.mark.parametrize(("high", "low"), itertools.product(choices("high"), choices("low")))
+def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
+    monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
+    assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0
+    assert (tmp_path / "summary.json").is_file()
+
+
+@pytest.mark.parametrize("sharing", ["per_option", "shared"])
+def test_learners_work_for_each_option_and_shared(sharing, tmp_path, monkeypatch):
+    monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
+    assert run(compose_config([*words("ucb", "hyar"), f"agent.sharing={sharing}"]), tmp_path) == 0
+
+
+@pytest.mark.parametrize(
+    ("high", "low"), [*((high, "random") for high in choices("high")), *(("uniform", low) for low in choices("low"))]
+)
+def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(high, low, tmp_path):
+    parts = make(high, low, tmp_path)
+    collected = parts.env.rollout(20, parts.agent.policy, break_when_any_done=False).contiguous()
+    parts.agent.learn(collected)
+    file = tmp_path / checkpoint.FILE_NAME
+    checkpoint.save(file, parts.agent, parts.env.state._asdict(), {"frames": 320})
+
+    other = make(high, low, tmp_path)
+    torch.manual_seed(99)
+    env_state = checkpoint.load(file, other.agent, other.device, with_training=True)
+    other.env.state = type(other.env.state)(**env_state)
+    assert checkpoint.progress_of(file) == {"frames": 320}
+    results = []
+    for one in (other, parts):
+        torch.manual_seed(5)
+        one.agent.learn(collected)
+        td: TensorDict = one.env.rollout(5, one.agent.policy, break_when_any_done=False)
+        results.append(td)
+    for key in ("observation", ("action", "key"), ("action", "duration")):
+        torch.testing.assert_close(results[0][key], results[1][key])

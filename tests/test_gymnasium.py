@@ -1,0 +1,331 @@
+"""The Gymnasium faces keep Gymnasium's contract and play the same task as BoatDockEnv."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+import hpamdp
+from hpamdp.env.gymnasium import BoatDock, BoatDockVector
+from hpamdp.env.rendering import Leg, Scene, draw
+
+ID = "hpamdp/BoatDock-v0"
+START, GOAL = np.array([640.0, 512.0]), np.array([640.0, 452.0])  # 60 px straight up, the congruent boat's key 1
+NOISE = {"motor_noise": 0.2, "sensor_noise": 4.0, "slip": 0.2}
+# Gymnasium recommends actions scaled to [-1, 1]; ours are seconds on purpose.
+RECOMMENDATION = "we recommend using a symmetric and normalized space"
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def press(key: int, seconds: float, **option: int) -> dict:
+    return {"key": key, "duration": np.full(3, seconds, np.float32), **option}
+
+
+def same(one, other) -> bool:
+    """Tell whether nested infos or observations are equal, types included and floats but for rounding."""
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
+    if isinstance(one, np.ndarray) and one.dtype == object:
+        return one.shape == other.shape and all(map(same, one, other))
+    if isinstance(one, np.ndarray):
+        return one.dtype == other.dtype and one.shape == other.shape and np.allclose(one, other, atol=1e-5)
+    return type(one) is type(other) and one == other
+
+
+@pytest.mark.parametrize("action_format", ["dict", "tuple"])
+@pytest.mark.parametrize("controller", ["choose", "congruent", "incongruent", "random"])
+@pytest.mark.parametrize("observation", ["scaled", "pixels"])
+@pytest.mark.parametrize("noise", [{}, NOISE], ids=["exact", "noisy"])
+def test_gymnasiums_checker_has_nothing_to_say(action_format, controller, observation, noise):
+    env = gymnasium.make(
+        ID, controller=controller, keymap="random", observation=observation, action_format=action_format, **noise
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    assert [w for w in caught if RECOMMENDATION not in str(w.message)] == []
+
+
+def test_importing_the_package_registers_the_ids_and_loads_no_torch():
+    code = f"import hpamdp, gymnasium, sys; print({ID!r} in gymnasium.registry, 'torch' in sys.modules)"
+    root = Path(hpamdp.__file__).parents[1]
+    out = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=True)
+    assert out.stdout.split() == ["True", "False"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hpamdp.register()
+
+
+def test_observations_stay_in_their_space_whatever_is_pressed():
+    for observation in ("scaled", "pixels"):
+        env = BoatDockVector(2000, controller="random", observation=observation, **NOISE)
+        env.action_space.seed(0)
+        seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(15))]
+        assert all(batch in env.observation_space for batch in seen)
+
+
+def test_a_seed_fixes_the_layouts_and_a_reset_without_one_goes_on_to_the_next():
+    env, other = BoatDock(), BoatDock()
+    first, second = env.reset(seed=5)[0], env.reset()[0]
+    assert not np.array_equal(first, second)
+    for _ in range(2):
+        assert np.array_equal(other.reset(seed=5)[0], first)
+    assert np.array_equal(other.reset()[0], second)
+    assert not np.array_equal(BoatDock().reset(seed=6)[0], first)
+    many, more = (BoatDockVector(num).reset(seed=5)[0] for num in (2, 7))
+    assert same(many, more[:2])
+    assert same(many[0], first)
+
+
+def test_unseeded_environments_differ_and_take_their_seed_from_np_random():
+    envs = [BoatDock() for _ in range(3)] + [BoatDockVector(1) for _ in range(2)]
+    assert len({env.reset()[0].tobytes() for env in envs}) == 5
+    twins = [BoatDock(), BoatDock()]
+    for env in twins:
+        env.np_random = np.random.default_rng(1)
+    assert np.array_equal(twins[0].reset()[0], twins[1].reset()[0])
+
+
+def test_global_generators_are_not_moved():
+    before = torch.get_rng_state(), np.random.get_state()[1].copy()
+    env = BoatDock(**NOISE)
+    env.reset(seed=1)
+    env.step(press(0, 0.3, option=1))
+    assert torch.equal(torch.get_rng_state(), before[0])
+    assert np.array_equal(np.random.get_state()[1], before[1])
+
+
+def test_info_tells_the_outcome_and_the_score_at_the_end():
+    env = BoatDock()
+    _, info = env.reset(options={"start": START, "goal": GOAL})
+    assert info == {"outcome": "sailing", "fuel": 1.0, "presses": 0, "controller": -1}
+    *_, terminated, truncated, info = env.step(press(1, 0.5, option=1))
+    assert not terminated and not truncated
+    assert info == {"outcome": "sailing", "fuel": pytest.approx(5.5 / 6.0), "presses": 1, "controller": 1}
+    _, reward, terminated, truncated, info = env.step(press(1, 0.9, option=0))
+    assert (terminated, truncated, info["outcome"], info["presses"]) == (True, False, "success", 2)
+    assert info["score"] == pytest.approx(5.0 * info["fuel"])
+    assert reward == pytest.approx(info["score"] + (60.0 - 1.95 * (0.125 * 100 / 3 - 0.0625 * 5 / 3) - 15.0) / 60.0)
+
+
+def test_the_25th_press_truncates():
+    env = gymnasium.make(ID, controller="congruent")
+    assert env.spec.max_episode_steps is None
+    env.reset(seed=0, options={"start": START, "goal": GOAL})
+    flags = [env.step(press(number % 3, 0.05))[2:] for number in range(25)]
+    assert [flag[:2] for flag in flags] == [(False, False)] * 24 + [(False, True)]
+    assert flags[-1][2]["outcome"] == "time_limit"
+    assert flags[-1][2]["score"] == -1.0
+
+
+def test_both_formats_and_the_vector_do_the_same():
+    layout = {"start": START, "goal": GOAL + 10.0}
+    single, nested = BoatDock(), BoatDock(action_format="tuple")
+    many, nested_many = BoatDockVector(2), BoatDockVector(2, action_format="tuple")
+    for env in (single, nested):
+        env.reset(seed=0, options=layout)
+    for env in (many, nested_many):
+        env.reset(seed=0, options={name: np.stack([point, point]) for name, point in layout.items()})
+    duration = np.array([0.1, 0.4, 0.9], np.float32)
+    expected = single.step({"option": 1, "key": 1, "duration": duration})[0]
+    pairs, options = np.stack([duration, duration]), np.array([1, 0])
+    columns = tuple(pairs[:, [k]] for k in range(3))
+    assert same(nested.step((1, 1, tuple(duration[[k]] for k in range(3))))[0], expected)
+    rows = many.step({"option": options, "key": np.array([1, 1]), "duration": pairs})[0]
+    assert same(rows[0], expected)
+    assert not same(rows[1], expected)
+    assert same(nested_many.step((options, np.array([1, 1]), columns))[0], rows)
+
+
+GOOD = {"option": 1, "key": 1, "duration": np.full(3, 0.2)}
+BAD_ACTIONS = {
+    "nan": {**GOOD, "duration": np.array([0.1, np.nan, 0.1])},
+    "key too large": {**GOOD, "key": 3},
+    "key negative": {**GOOD, "key": -1},
+    "fractional key": {**GOOD, "key": 1.5},
+    "key of another shape": {**GOOD, "key": np.array([1])},
+    "no such option": {**GOOD, "option": 2},
+    "one duration": {**GOOD, "duration": np.array([0.1])},
+    "words": {**GOOD, "duration": ["a", "b", "c"]},
+    "ragged": {**GOOD, "duration": [0.1, [0.2], 0.3]},
+    "nothing": {**GOOD, "duration": None},
+    "no key": {"option": 1, "duration": GOOD["duration"]},
+    "another leaf": {**GOOD, "speed": 1},
+    "a number": 1,
+    "none": None,
+}
+BAD_TUPLES = {
+    "too short": (1, (0.1, 0.1, 0.1)),
+    "flat": (1, 1, np.full(3, 0.1)),
+    "two durations": (1, 1, (np.array([0.1]), np.array([0.1]))),
+    "scalars": (1, 1, (0.1, 0.1, 0.1)),
+    "nan": (1, 1, tuple(np.array([x]) for x in (0.1, np.nan, 0.1))),
+    "dict": GOOD,
+}
+
+
+@pytest.mark.parametrize(
+    ("action_format", "action"),
+    [("dict", a) for a in BAD_ACTIONS.values()] + [("tuple", a) for a in BAD_TUPLES.values()],
+    ids=[*BAD_ACTIONS, *(f"tuple {name}" for name in BAD_TUPLES)],
+)
+def test_a_bad_action_is_refused_in_one_line_and_harms_nothing(action_format, action):
+    env, untouched = (BoatDock(action_format=action_format) for _ in range(2))
+    good = press(1, 0.2, option=1) if action_format == "dict" else (1, 1, tuple(np.full((3, 1), 0.2)))
+    for each in (env, untouched):
+        each.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^step: [^\n]+$"):
+        env.step(action)
+    assert same(env.step(good)[0], untouched.step(good)[0])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"start": START},
+        {"start": START, "goal": START},
+        {"start": START, "goal": [np.nan, 0.0]},
+        {"start": START, "goal": GOAL[:1]},
+        {"start": START, "goal": GOAL, "controller": 1},
+        {"start": START, "goal": GOAL, "keymap": 1.5},
+        {"begin": START},
+    ],
+)
+@pytest.mark.parametrize("seed", [None, 9])
+def test_a_bad_reset_option_is_refused_in_one_line_and_harms_nothing(options, seed):
+    env, untouched = BoatDock(), BoatDock()
+    for each in (env, untouched):
+        each.reset(seed=0)
+    with pytest.raises(ValueError, match=r"^reset: [^\n]+$"):
+        env.reset(seed=seed, options=options)
+    assert same(env.step(GOOD)[0], untouched.step(GOOD)[0])
+    assert same(env.reset()[0], untouched.reset()[0])
+
+
+def test_stepping_and_rendering_before_the_first_reset_is_refused():
+    env = BoatDock(render_mode="rgb_array")
+    for call in (lambda: env.step(GOOD), env.render, lambda: BoatDockVector(2).step(GOOD)):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            call()
+
+
+@pytest.mark.parametrize("arguments", [{"action_format": "list"}, {"render_mode": "human"}, {"slip": 2.0}], ids=str)
+def test_a_bad_argument_is_refused_by_name(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        BoatDock(**arguments)
+
+
+def layouts(num: int) -> dict[str, np.ndarray]:
+    """Draw layouts from which boats reach different ends."""
+    angle = np.linspace(0.0, 6.0, num)[:, None]
+    around = np.concatenate([np.cos(angle), np.sin(angle)], 1)
+    return {"start": START + 20.0 * around, "goal": START + 90.0 * around[::-1]}
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_the_vector_does_what_gymnasium_makes_of_single_boats(mode):
+    num = 12
+    ours = gymnasium.make_vec(
+        ID, num, vectorization_mode="vector_entry_point", controller="congruent", autoreset_mode=mode
+    )
+    theirs = SyncVectorEnv([lambda: BoatDock(controller="congruent")] * num, autoreset_mode=mode)
+    assert ours.metadata["autoreset_mode"] is AutoresetMode(mode)
+    assert (ours.action_space, ours.observation_space) == (theirs.action_space, theirs.observation_space)
+    given = layouts(num)
+    assert same(ours.reset(seed=0, options=given)[1], theirs.reset(seed=0)[1])
+    for row, env in enumerate(theirs.envs):
+        env.reset(options={name: points[row] for name, points in given.items()})
+    ours.action_space.seed(0)
+    fresh = ended = np.zeros(num, bool)
+    # New episodes are of other seeds, so that the comparison ends with the first of them.
+    while not fresh.any() and not (mode == "Disabled" and ended.any()):
+        actions = ours.action_space.sample()
+        actions["duration"] *= 0.6
+        (seen, *flags, infos), (expected, *expected_flags, expected_infos) = ours.step(actions), theirs.step(actions)
+        fresh, ended = infos["presses"] == 0, flags[1] | flags[2]
+        assert np.allclose(seen[~fresh], expected[~fresh], atol=1e-5)
+        assert all(np.allclose(one, other, atol=1e-5) for one, other in zip(flags, expected_flags, strict=True))
+        assert [flag.dtype for flag in flags] == [flag.dtype for flag in expected_flags]
+        assert same(infos, expected_infos)
+    assert num > fresh.sum() + ended.sum() > 0
+
+
+def test_the_next_step_after_the_end_ignores_the_action_and_starts_anew():
+    env = BoatDockVector(2, controller="congruent")
+    env.reset(seed=0, options={"start": np.stack([START] * 2), "goal": np.stack([GOAL] * 2)})
+    actions = {"key": np.array([0, 1]), "duration": np.array([[0.1] * 3, [2.0] * 3])}
+    _, _, terminations, _, infos = env.step(actions)
+    assert terminations.tolist() == [False, True]
+    assert infos["outcome"].tolist() == ["sailing", "too_fast"]
+    assert infos["_score"].tolist() == [False, True]
+    actions = {"key": np.array([0, 7]), "duration": np.array([[0.1] * 3, [np.nan] * 3])}
+    observations, rewards, terminations, _, infos = env.step(actions)
+    assert not terminations.any()
+    assert rewards[1] == 0.0
+    assert infos["presses"].tolist() == [2, 0]
+    assert "score" not in infos
+    again = BoatDockVector(2, controller="congruent")
+    again.reset(seed=0)
+    assert same(again.reset()[0][1], observations[1])
+
+
+def test_a_reset_mask_starts_only_its_boats():
+    env = BoatDockVector(3, controller="congruent", autoreset_mode="Disabled")
+    env.reset(seed=0)
+    before = env.step({"key": np.zeros(3, int), "duration": np.full((3, 3), 0.1)})[0]
+    observations, infos = env.reset(options={"reset_mask": np.array([False, True, False])})
+    assert np.array_equal(observations[[0, 2]], before[[0, 2]])
+    assert infos["_presses"].tolist() == [False, True, False]
+    for mask in ([True, False, False], np.zeros(3, bool), np.ones(2, bool), np.ones(3)):
+        with pytest.raises(ValueError, match="reset_mask"):
+            env.reset(options={"reset_mask": mask})
+
+
+def test_frames_show_the_episode():
+    env = BoatDock(controller="incongruent", render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    assert before.shape == (480, 480, 3) and before.dtype == np.uint8
+    assert np.array_equal(before, env.render())
+    env.step(press(2, 0.7))
+    after = env.render()
+    assert not np.array_equal(before, after)
+    env.reset()
+    assert not np.array_equal(after, env.render())
+
+
+def test_before_a_controller_is_chosen_no_key_has_a_direction():
+    chosen = [draw(Scene((-50, 0), (50, 0), (-50, 0), controller=number), 240) for number in (-1, 0, 1)]
+    background = chosen[0][2, 2]
+    corner = [frame[170:222, :60] for frame in chosen]
+    marks = [(np.abs(c.astype(int) - background).sum(-1) > 200).sum() for c in corner]
+    assert marks[0] == 0
+    assert min(marks[1:]) > 40
+
+
+def test_a_frame_takes_milliseconds():
+    legs = tuple(Leg((-60 + 10 * i, -40), (-50 + 10 * i, -40), 0.5) for i in range(10))
+    scene = Scene((-60, -40), (60, 40), (40, -40), (1, 0), legs, 0.5, 10, 1, 1, "out_of_fuel", -1.0)
+    times = []
+    for _ in range(10):
+        began = time.perf_counter()
+        assert draw(scene).shape == (480, 480, 3)
+        times.append(time.perf_counter() - began)
+    assert min(times) < 0.015

@@ -1,0 +1,190 @@
+"""Layouts, controllers and the counters behind them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hpamdp.env import counter_rng, episode, harbour, physics
+from hpamdp.env.harbour import CONGRUENT, INCONGRUENT, Layout
+
+NUM = 200_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def counter(num: int) -> torch.Tensor:
+    return torch.arange(num, dtype=torch.int32)
+
+
+def keys_for(num: int, stream: int = counter_rng.TRAINING, seed: int = 0, episode: int = 0) -> torch.Tensor:
+    """Return the keys of the environments 0 to num - 1, `[num]`."""
+    return counter_rng.key_for(
+        counter_rng.seed_tensor(seed), stream, counter(num), torch.full_like(counter(num), episode)
+    )
+
+
+def distance_between_distributions(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the Kolmogorov-Smirnov statistic; under 0.006 in 99.9 % of cases when 200,000 are alike."""
+    both = np.sort(np.concatenate([a, b]))
+    cumulative = [np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (a, b)]
+    return float(np.abs(cumulative[0] - cumulative[1]).max())
+
+
+@pytest.fixture(scope="module")
+def layouts() -> Layout:
+    return harbour.draw_layout(keys_for(NUM))
+
+
+@pytest.fixture(scope="module")
+def redrawn_layouts() -> np.ndarray:
+    """Draw pairs in the square, keep those in the disc and 30 px apart: `[NUM, 4]`."""
+    rng = np.random.default_rng(1)
+    pairs = rng.uniform(-110.0, 110.0, (3 * NUM, 2, 2))
+    pairs = pairs[(np.hypot(*pairs.T).T < 110.0).all(1)]
+    pairs = pairs[np.hypot(*(pairs[:, 0] - pairs[:, 1]).T) >= 30.0]
+    return pairs[:NUM].reshape(-1, 4)
+
+
+def test_starts_and_goals_lie_in_the_disc_and_30_px_apart(layouts):
+    assert torch.hypot(layouts.start_x, layouts.start_y).max() < 110.0 + 1e-3
+    assert torch.hypot(layouts.goal_x, layouts.goal_y).max() < 110.0 + 1e-3
+    assert harbour.separation(layouts).min() > 30.0 - 1e-3
+
+
+def test_layouts_are_distributed_as_pairs_redrawn_until_far_enough_apart(layouts, redrawn_layouts):
+    for ours, theirs in zip(layouts, redrawn_layouts.T, strict=True):
+        assert distance_between_distributions(ours.numpy(), theirs) < 0.006
+    drawn = [layout.numpy() for layout in layouts], redrawn_layouts.T
+    for measure in (
+        lambda x, y, *_: np.hypot(x, y),
+        lambda *point: np.hypot(*point[2:]),
+        lambda x, y, goal_x, goal_y: np.hypot(goal_x - x, goal_y - y),
+        lambda x, y, goal_x, goal_y: np.arctan2(goal_y - y, goal_x - x),
+    ):
+        assert distance_between_distributions(*(measure(*points) for points in drawn)) < 0.006
+
+
+@pytest.mark.parametrize("keymap", [1, 2])
+@pytest.mark.parametrize("key", [0, 1, 2])
+def test_direction_follows_the_table(key, keymap):
+    key, keymap = torch.tensor([key]), torch.tensor([keymap])
+    for controller, row in ((INCONGRUENT, keymap.item() - 1), (CONGRUENT, 2)):
+        direction = torch.cat(harbour.direction(torch.tensor([controller]), keymap, key))
+        assert direction.tolist() == pytest.approx(harbour.DIRECTIONS[row][key.item()], abs=1e-6)
+
+
+def test_an_environments_layouts_depend_neither_on_the_batch_nor_on_the_others_resets():
+    seed, rules = counter_rng.seed_tensor(5), episode.Rules(controller="random", keymap="random")
+
+    def blank(num: int) -> episode.BoatState:
+        return episode.BoatState(
+            *[torch.zeros(num)] * 9, *[counter(num)] * 4, episode=torch.full_like(counter(num), -1)
+        )
+
+    def reset(state: episode.BoatState, *rows: int) -> episode.BoatState:
+        mask = torch.zeros(len(state.x), dtype=torch.bool)
+        mask[list(rows)] = True
+        return episode.reset(state, mask, seed, counter(len(state.x)), rules)
+
+    small = reset(reset(reset(blank(3), 0, 1, 2), 1), 1)
+    large = reset(reset(reset(reset(blank(10), *range(10)), 0, 1, 7), 0, 2), 1, 9)
+    assert small.episode.tolist() == [0, 2, 0]
+    assert large.episode[1] == 2
+    for one, other in zip(small, large, strict=True):
+        torch.testing.assert_close(one[1], other[1])
+    again = reset(blank(1), 0)
+    for one, other in zip(again, small, strict=True):
+        torch.testing.assert_close(one[0], other[0])
+
+
+def test_bearing_offset_is_0_along_a_congruent_direction_and_60_along_an_incongruent_one():
+    for bearing, offset in ((30, 0), (150, 0), (270, 0), (90, 60), (210, 60), (330, 60), (0, 30), (60, 30), (40, 10)):
+        goal = [torch.tensor([50.0 * f(math.radians(bearing))]) for f in (math.cos, math.sin)]
+        start = torch.tensor([7.0]), torch.tensor([-3.0])
+        layout = Layout(*start, start[0] + goal[0], start[1] + goal[1])
+        assert harbour.bearing_offset(layout).item() == pytest.approx(offset, abs=1e-3)
+    for controller, offset in ((2, 0), (0, 60), (1, 60)):
+        for x, y in harbour.DIRECTIONS[controller]:
+            layout = Layout(*(torch.tensor([value]) for value in (0.0, 0.0, 40.0 * x, 40.0 * y)))
+            assert harbour.bearing_offset(layout).item() == pytest.approx(offset, abs=1e-3)
+
+
+def test_evaluation_layouts_are_fixed_by_their_seed_and_met_in_no_training_of_that_seed():
+    evaluation = torch.stack(harbour.fixed_layouts(1000, seed=3), -1)
+    assert torch.equal(evaluation[:10], torch.stack(harbour.fixed_layouts(10, seed=3), -1))
+    assert not torch.equal(evaluation, torch.stack(harbour.fixed_layouts(1000, seed=4), -1))
+    training = {
+        tuple(row) for e in range(20) for row in torch.stack(harbour.draw_layout(keys_for(1000, 0, 3, e)), -1).tolist()
+    }
+    assert len(training) == 20_000
+    assert not training & {tuple(row) for row in evaluation.tolist()}
+
+
+def test_a_controller_and_a_keymap_are_drawn_evenly_and_apart_from_the_layout():
+    rules = episode.Rules(controller="random", keymap="random")
+    num = 100_000
+    blank = episode.BoatState(*[torch.zeros(num)] * 9, *[counter(num)] * 4, episode=torch.full_like(counter(num), -1))
+    state = episode.reset(blank, counter(num) >= 0, counter_rng.seed_tensor(0), counter(num), rules)
+    columns = torch.stack(
+        [state.controller, state.keymap - 1, state.start_x, state.start_y, state.goal_x, state.goal_y]
+    )
+    assert set(state.controller.tolist()) == {0, 1}
+    assert set(state.keymap.tolist()) == {1, 2}
+    assert (columns[:2].mean(1) - 0.5).abs().max() < 0.006
+    assert columns.corrcoef()[:2].sub(torch.eye(2, 6)).abs().max() < 0.012
+
+
+def test_uniform_numbers_are_even_and_independent_of_every_counter():
+    key = keys_for(NUM)
+    numbers = [counter_rng.uniform(key, draw) for draw in (0, 1, 2, 15, 400)]
+    numbers += [counter_rng.uniform(keys_for(NUM, *at), 0) for at in ((1,), (2,), (0, 1), (0, 0, 1), (0, 0, 2))]
+    for number in numbers:
+        assert number.dtype == torch.float32
+        assert number.min() > 0.0
+        assert number.max() < 1.0
+        assert distance_between_distributions(number.numpy(), (np.arange(NUM) + 0.5) / NUM) < 0.006
+    between = torch.stack([*numbers, numbers[0].roll(1)]).corrcoef() - torch.eye(len(numbers) + 1)
+    assert between.abs().max() < 0.012
+    per_row = counter_rng.uniform(key, torch.full_like(key, 15))
+    assert torch.equal(per_row, numbers[3])
+
+
+@pytest.mark.parametrize("bits", [0, -1])
+def test_uniform_numbers_stay_inside_the_open_interval_even_at_the_ends(bits, monkeypatch):
+    monkeypatch.setattr(counter_rng, "_mix", lambda h: torch.full_like(h, bits))
+    number = counter_rng.uniform(counter(1), 0).item()
+    assert 0.0 < number < 1.0
+
+
+def test_normal_numbers_have_the_moments_of_the_normal_distribution():
+    key = keys_for(NUM)
+    first, second = counter_rng.normal(key, 0), counter_rng.normal(key, 1)
+    for number in (first, second):
+        moments = [number.double().pow(k).mean().item() for k in (1, 2, 3, 4)]
+        assert moments == pytest.approx([0.0, 1.0, 0.0, 3.0], abs=0.06)
+        assert moments[:2] == pytest.approx([0.0, 1.0], abs=0.015)
+        assert (number.abs() < 1.0).float().mean().item() == pytest.approx(0.6827, abs=0.005)
+    assert torch.stack([first, second]).corrcoef()[0, 1].abs() < 0.012
+
+
+def test_seeds_of_any_size_fit_and_those_of_32_bits_differ():
+    for seed in (-1, 2**32, 2**63 - 1, 12345678901234567890):
+        assert counter_rng.seed_tensor(seed).dtype == torch.int32
+    seeds = [0, 1, 2**16, 2**31 - 1, 2**31, 2**32 - 1]
+    assert len({counter_rng.seed_tensor(seed).item() for seed in seeds}) == len(seeds)
+
+
+def test_the_score_is_five_times_the_fuel_on_success_and_minus_one_otherwise():
+    outcome = torch.arange(len(physics.OUTCOMES))
+    score = harbour.score(outcome, harbour.fuel_fraction(torch.full((len(outcome),), 4.5)))
+    assert score.tolist() == [-1.0, 3.75, -1.0, -1.0, -1.0, -1.0]

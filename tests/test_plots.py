@@ -1,0 +1,144 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from hpamdp import plots
+from hpamdp.plots import draw_all
+
+ALL = ["learning_curves.png", "trajectories.png", "choices.png"]
+
+
+def write_evaluation(folder, num=30, without=(), **changed):
+    rng = np.random.default_rng(0)
+    start, goal = rng.uniform(-70, 70, (2, num, 2))
+    path = np.full((num, 5, 2), np.nan)
+    path[:, 0], path[:, 1] = start, goal
+    option = rng.integers(0, 2, num)
+    outcome = rng.integers(1, 6, num)
+    arrays = {
+        "start": start,
+        "goal": goal,
+        "option": option,
+        "controller": option,
+        "outcome": outcome,
+        "fuel": rng.uniform(0, 1, num),
+        "score": np.where(outcome == 1, rng.uniform(0, 4, num), -1.0),
+        "presses": np.ones(num, dtype=int),
+        "path": path,
+        "optimum": rng.uniform(2, 4, (num, 2)),
+        "bearing_offset": rng.uniform(0, 60, num),
+        **changed,
+    }
+    np.savez(folder / "evaluation.npz", **{name: array for name, array in arrays.items() if name not in without})
+
+
+def write_metrics(folder, columns=("eval/score", "eval/success", "train/score"), num=5):
+    lines = [",".join(["frames", "wall_s", *columns])]
+    lines += [",".join(str(0.1 * i) for _ in range(2 + len(columns))) for i in range(num)]
+    (folder / "metrics.csv").write_text("\n".join(lines) + "\n")
+
+
+def names(folder):
+    paths = draw_all(folder)
+    for path in paths:
+        with Image.open(path) as image:
+            assert min(image.size) > 300 and len(np.unique(np.asarray(image))) > 10
+    return [path.name for path in paths]
+
+
+def test_all_figures_come_from_complete_files(tmp_path):
+    write_evaluation(tmp_path)
+    write_metrics(tmp_path, ("eval/score", "eval/success", "train/option_congruent", "eval/oracle_agreement"))
+    (tmp_path / "summary.json").write_text(json.dumps({"references": {"random": -0.9, "ceiling": 3.6}}))
+    assert names(tmp_path) == ALL
+
+
+def test_an_empty_folder_gives_no_figure(tmp_path):
+    assert draw_all(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "frames,eval/score\n", "frames,eval/score\n1,2", "frames,loss\n1,2\n"],
+)
+def test_metrics_without_a_curve_give_no_figure(tmp_path, text):
+    (tmp_path / "metrics.csv").write_text(text)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.parametrize("columns", [("eval/score",), ("train/success",), ("train/score", "eval/oracle_agreement")])
+def test_learning_curves_come_from_whatever_columns_there_are(tmp_path, columns):
+    write_metrics(tmp_path, columns, num=1)
+    assert names(tmp_path) == ["learning_curves.png"]
+
+
+def test_a_truncated_metrics_file_with_holes_gives_a_figure(tmp_path):
+    (tmp_path / "metrics.csv").write_text(
+        "frames,wall_s,eval/score,eval/success\n1,1,nan,nan\n2,,,\n3,3,inf,0.5\n,4,1.0,0.5\n5,nan,1.5,x\n6,6,1.7"
+    )
+    assert names(tmp_path) == ["learning_curves.png"]
+
+
+def test_a_metrics_file_of_nothing_but_nan_gives_a_figure(tmp_path):
+    (tmp_path / "metrics.csv").write_text("frames,eval/score,eval/success\n1,nan,nan\n")
+    (tmp_path / "summary.json").write_text(json.dumps({"references": {"human": None, "ceiling": None}}))
+    assert names(tmp_path) == ["learning_curves.png"]
+
+
+def test_an_evaluation_without_a_choice_gives_trajectories_only(tmp_path):
+    write_evaluation(tmp_path, option=np.full(30, -1), optimum=np.full((30, 2), np.nan))
+    assert names(tmp_path) == ["trajectories.png"]
+
+
+def test_the_summary_says_whether_an_evaluation_without_options_is_of_choices(tmp_path):
+    write_evaluation(tmp_path, without=("option",))
+    write_metrics(tmp_path, ("eval/option_congruent",))
+    (tmp_path / "summary.json").write_text('{"controller": "chosen"}')
+    assert names(tmp_path) == ALL
+    (tmp_path / "summary.json").write_text('{"controller": "random"}')
+    assert names(tmp_path) == ["trajectories.png"]
+
+
+@pytest.mark.parametrize("num", [1, 7])
+def test_few_episodes_make_a_smaller_sheet(tmp_path, num):
+    write_evaluation(tmp_path, num=num)
+    assert names(tmp_path) == ALL[1:]
+
+
+def test_missing_arrays_leave_out_only_what_needs_them(tmp_path):
+    write_evaluation(tmp_path, without=("optimum", "controller", "fuel", "presses", "start"))
+    assert names(tmp_path) == ALL[1:]
+    write_evaluation(tmp_path, without=("path",))
+    assert names(tmp_path) == ["choices.png"]
+
+
+def test_broken_files_leave_their_figures_out_with_a_warning(tmp_path, capsys):
+    write_metrics(tmp_path)
+    write_evaluation(tmp_path)
+    whole = (tmp_path / "evaluation.npz").read_bytes()
+    (tmp_path / "evaluation.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "summary.json").write_text('{"references": {"rand')
+    assert names(tmp_path) == ["learning_curves.png"]
+    assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+def test_labels_stand_apart_near_their_lines_and_in_order():
+    heights = [0.1, 0.9, 0.95, 0.96, 0.97, 1.0]
+    placed = plots._apart(heights, 0.06)
+    assert np.diff(placed).min() > 0.06 - 1e-9
+    assert placed[0] == 0.1 and placed[-1] <= 1.02
+    assert plots._apart([0.3, 0.5], 0.06) == [0.3, 0.5]
+
+
+def test_the_best_possible_score_is_of_both_boats_only_where_the_agent_chose():
+    evaluation = {"score": np.array([2.0]), "controller": np.array([1]), "optimum": np.array([[3.5, 3.0]])}
+    assert plots._episode_title({**evaluation, "option": np.array([1])}, 0) == "2.00 / 3.50  C"
+    assert plots._episode_title({**evaluation, "option": np.array([-1])}, 0) == "2.00 / 3.00  C"
+
+
+def test_error_bars_stay_within_zero_and_one():
+    share, num = np.array([0.0, 0.3, 1.0]), np.array([5, 10, 5])
+    below, above = plots._wilson(share, num)
+    assert (share - below > -1e-9).all() and (share + above < 1 + 1e-9).all() and (below + above > 0.2).all()

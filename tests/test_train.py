@@ -1,0 +1,135 @@
+"""A run from start to end: what it leaves behind, that it can be stopped, resumed and scored again."""
+
+import csv
+import json
+import os
+import signal
+import threading
+
+import numpy as np
+import pytest
+import torch
+from conftest import compose_config
+
+from hpamdp import checkpoint
+from hpamdp.config import ConfigError
+from hpamdp.train import run
+
+SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
+FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkpoint.zip"}
+PICTURES = {"learning_curves.png", "trajectories.png", "choices.png"}
+
+
+def start(output_dir, *overrides):
+    return run(compose_config([*SMALL, *overrides]), output_dir, list(overrides))
+
+
+def rows_of(folder):
+    with (folder / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys):
+    assert start(tmp_path, "high=uniform", "low=random") == 0
+    assert {file.name for file in tmp_path.iterdir()} >= FILES | PICTURES
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert {"score", "success", "too_fast", "presses", "option_congruent", "oracle_agreement", "optimality_gap"} <= {
+        *summary
+    }
+    assert {"frames", "wall_s", "seed", "versions", "ceiling"} <= {*summary}
+    assert summary["frames"] == 1024 and summary["episodes"] == 20
+    printed = capsys.readouterr().out
+    assert "score" in printed and "ceiling" in printed and str(tmp_path) in printed
+
+
+def test_the_planner_under_the_oracle_reaches_the_ceiling_with_nothing_to_learn(tmp_path):
+    start(tmp_path, "high=oracle", "low=planner", "total_frames=128", "eval.layouts=50")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["optimality_gap"] == pytest.approx(0.0, abs=1e-3)
+    assert summary["oracle_agreement"] == 1.0 and summary["success"] == 1.0
+
+
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path):
+    learner = ["low=hyar", "low.warmup_frames=256", "low.codec_pretrain_updates=5", "low.updates_per_frame=0.02"]
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        start(tmp_path / name, *learner, f"seed={seed}")
+    first, second, third = (rows_of(tmp_path / name) for name in "abc")
+    for one, other in zip(first, second, strict=True):
+        assert {k: v for k, v in one.items() if k != "wall_s"} == {k: v for k, v in other.items() if k != "wall_s"}
+    assert first[-1] != third[-1]
+
+
+def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
+    start(tmp_path / "often", "low=random", "eval.every=128")
+    start(tmp_path / "seldom", "low=random", "eval.every=512")
+    often, seldom = (rows_of(tmp_path / name)[-1] for name in ("often", "seldom"))
+    assert often["eval/score"] == seldom["eval/score"]
+    states = []
+    for name in ("often", "seldom"):
+        file = checkpoint.find(tmp_path / name, "resume")
+        cfg = compose_config([*SMALL, "low=random"])
+        from hpamdp.assemble import assemble
+        from hpamdp.config import run_config
+
+        parts = assemble(cfg, run_config(cfg), tmp_path)
+        states.append(checkpoint.load(file, parts.agent, torch.device("cpu"), with_training=True))
+    assert all(torch.equal(states[0][column], states[1][column]) for column in states[0])
+
+
+def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys):
+    timer = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    assert start(tmp_path / "stopped", "low=random", "total_frames=100_000_000", "eval.every=0") == 130
+    assert f"resume={tmp_path / 'stopped'}" in capsys.readouterr().out
+    stopped = json.loads((tmp_path / "stopped" / "summary.json").read_text())
+    assert 0 < stopped["frames"] < 100_000_000
+    total = stopped["frames"] + 2048
+    more = [f"resume={tmp_path / 'stopped'}", f"total_frames={total}"]
+    assert run(compose_config(more), tmp_path / "resumed", more) == 0
+    resumed = json.loads((tmp_path / "resumed" / "summary.json").read_text())
+    assert resumed["frames"] >= total and resumed["wall_s"] > stopped["wall_s"]
+    before, after = rows_of(tmp_path / "stopped"), rows_of(tmp_path / "resumed")
+    assert [row["frames"] for row in after][: len(before)] == [row["frames"] for row in before]
+    assert float(after[-1]["frames"]) == resumed["frames"]
+
+
+def test_a_saved_agent_is_scored_again_with_the_same_result(tmp_path):
+    start(tmp_path / "run", "low=random", "high=uniform")
+    words = ["mode=eval", f"checkpoint={tmp_path / 'run'}"]
+    assert run(compose_config(words), tmp_path / "scored", words) == 0
+    again, first = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("scored", "run"))
+    assert again["score"] == first["score"] and again["high"] == "uniform" and again["low"] == "random"
+    assert (tmp_path / "scored" / "trajectories.png").is_file()
+    words.append("eval.layouts=33")
+    run(compose_config(words), tmp_path / "more", words)
+    assert len(np.load(tmp_path / "more" / "evaluation.npz")["score"]) == 33
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["env.controller=congruent"], "high=none"),
+        (["high=none"], "env.controller"),
+        (["high=fixed", "high.option=sideways"], "incongruent, congruent"),
+        (["resume=/nowhere"], "no checkpoint"),
+        (["mode=eval", "checkpoint=/nowhere"], "no checkpoint"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line_before_anything_is_written(tmp_path, words, complaint):
+    with pytest.raises(ConfigError, match=complaint) as error:
+        start(tmp_path / "out", *words)
+    assert "\n" not in str(error.value)
+
+
+def test_a_resumed_run_keeps_its_agent(tmp_path):
+    start(tmp_path / "run", "low=random", "high=uniform")
+    words = [f"resume={tmp_path / 'run'}", "low=planner"]
+    with pytest.raises(ConfigError, match="takes the agent from"):
+        run(compose_config(words), tmp_path / "out", words)
+
+
+def test_a_foreign_file_is_no_checkpoint(tmp_path):
+    file = tmp_path / "checkpoint.zip"
+    file.write_bytes(b"PK\x03\x04 not a checkpoint")
+    with pytest.raises(ConfigError, match="not a checkpoint"):
+        checkpoint.find(file, "resume")
