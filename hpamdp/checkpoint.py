@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState, StateDictCheckpointAdapter
+from torchrl.data import ReplayBuffer
 
 from hpamdp.config import ConfigError
 from hpamdp.policies.agent import HierarchicalAgent
@@ -44,9 +45,16 @@ def _components(agent: HierarchicalAgent, columns: _Columns) -> Checkpoint:
     checkpoint = Checkpoint()
     for name, part in {"agent": agent, "rng": GlobalRNGState(), "env": columns, **agent.stateful()}.items():
         # One file a component; replay buffers have a format of their own.
-        adapter = None if hasattr(part, "dumps") else StateDictCheckpointAdapter("torch")
+        adapter = None if isinstance(part, ReplayBuffer) else StateDictCheckpointAdapter("torch")
         checkpoint.register(name, part, adapter=adapter)
     return checkpoint
+
+
+def _filled(agent: HierarchicalAgent) -> set[str]:
+    """Return the components that can be saved: TorchRL refuses a replay buffer that never held anything."""
+    parts = agent.stateful().items()
+    empty = {name for name, part in parts if isinstance(part, ReplayBuffer) and len(part) == 0}
+    return {"agent", "rng", "env", *agent.stateful()} - empty
 
 
 def save(path: Path, agent: HierarchicalAgent, env_state: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
@@ -58,7 +66,9 @@ def save(path: Path, agent: HierarchicalAgent, env_state: Mapping[str, Tensor], 
         env_state: the environment's columns.
         progress: JSON values to read back with `progress_of`: the resolved config, the frames so far.
     """
-    _components(agent, _Columns(env_state)).save(path, format="archive", metadata=progress)
+    _components(agent, _Columns(env_state)).save(
+        path, components=_filled(agent), format="archive", metadata=progress
+    )
 
 
 def progress_of(file: Path) -> dict[str, Any]:
@@ -77,7 +87,9 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_traini
     """
     columns = _Columns({})
     checkpoint = _components(agent, columns)
-    wanted = None if with_training else ["agent"]
+    # What was empty when it was saved stays empty; anything else that is missing is an error.
+    saved = set(Checkpoint.manifest(file)["components"])
+    wanted = (saved | _filled(agent)) if with_training else {"agent"}
     try:
         checkpoint.load(file, components=wanted, map_location=device)
     except (CheckpointError, RuntimeError, OSError) as error:

@@ -203,14 +203,10 @@ def name_of(node: Mapping[str, Any]) -> str:
     return "none" if node[_TARGET] is None else node[_TARGET].split(".")[-2]
 
 
-def class_name(node: Mapping[str, Any]) -> str:
-    """Return the name of the class that a group's part of the config describes, or `none`."""
-    return str(node.get(_TARGET) or "none").rpartition(".")[2]
-
-
-def options_of(node: Mapping[str, Any]) -> list[str]:
-    """Return the names of the options in a group's part of the config."""
-    return [name for name in node if name not in (_TARGET, _BUDGET)]
+def no_such_option(node: Mapping[str, Any], name: str, file: str) -> str:
+    """Return that the class which a group's part of the config describes has no such option."""
+    cls = str(node.get(_TARGET) or "none").rpartition(".")[2]
+    return no_such(f"option of {cls} ({file})", name, [option for option in node if option not in (_TARGET, _BUDGET)])
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:
@@ -249,21 +245,23 @@ def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what
         # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
         return model.model_validate_json(json.dumps(values, default=str))
     except ValidationError as error:
-        complaints: dict[str, list[str]] = {}
+        unknown: list[str] = []
+        wrong: dict[str, dict[str, None]] = {}
         for problem in error.errors(include_url=False):
             path, value = _locate(problem["loc"], values)
-            key, kind = prefix + ".".join(path), problem["type"]
-            if kind == "extra_forbidden":
-                subject, complaint = key, no_such(what, path[-1], _fields(model, path[:-1]))
-            elif kind == "missing":
-                subject, complaint = key, f"missing ({where})"
+            key = prefix + ".".join(path)
+            if problem["type"] == "extra_forbidden":
+                unknown.append(f"{key}: {no_such(what, path[-1], _fields(model, path[:-1]))}")
+            elif problem["type"] == "missing":
+                wrong[key] = {"missing": None}
             else:
-                message = re.sub("^(Input|String|List) should", "must", problem["msg"].removeprefix("Value error, "))
-                subject, complaint = f"{key}={_written(value)}", f"{message} ({where})"
-            complaints.setdefault(subject, []).append(complaint)
-        # A union complains once for each of its types.
-        lines = [f"{subject}: {' or '.join(dict.fromkeys(found))}" for subject, found in complaints.items()]
-        raise ConfigError("; ".join(lines)) from error
+                message = problem["msg"].removeprefix("Value error, ").replace("valid array", "list")
+                message = re.sub("^(Input|String|List) should", "must", message)
+                # A union complains once for each of its types.
+                wrong.setdefault(f"{key}={_written(value)}", {})[message] = None
+        raise ConfigError(
+            "; ".join([*unknown, *(f"{key}: {' or '.join(wrong[key])} ({where})" for key in wrong)])
+        ) from error
 
 
 def _locate(location: tuple[int | str, ...], values: dict[str, Any]) -> tuple[list[str], Any]:

@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.config import GROUPS, RUN_FILE, ConfigError, class_name, no_such, options_of
+from hpamdp.config import GROUPS, RUN_FILE, ConfigError, no_such, no_such_option
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
@@ -84,8 +84,8 @@ def main() -> None:
         hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
     except ConfigError as error:
         _exit_with(str(error))
-    except (HydraException, OmegaConfBaseException, yaml.YAMLError) as error:
-        if has_started:
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError) as error:
+        if has_started:  # then it is not about the command line
             raise
         _exit_with(_explain(error, conf, arguments))
     except KeyboardInterrupt:
@@ -93,7 +93,7 @@ def main() -> None:
 
 
 def help_page(conf: Path) -> str:
-    """Return the text of `--help`: the groups as the folders have them, the run's values as conf/config.yaml has them."""
+    """Return the text of `--help`: the groups as the folders have them, the run's values as config.yaml has them."""
     groups = {folder.name: _choices(folder) for folder in sorted(conf.iterdir()) if folder.is_dir()}
     values = re.search(r"^# [^\n]*\nmode:.*?(?=^hydra:)", (conf / "config.yaml").read_text(), re.DOTALL | re.MULTILINE)
     return _HELP.format(
@@ -165,7 +165,7 @@ def _run_job(cfg: DictConfig) -> None:
 
 
 def _exit_with(mistake: str) -> NoReturn:
-    print(mistake, file=sys.stderr)
+    print(" ".join(mistake.splitlines()), file=sys.stderr)
     sys.exit(_MISTAKE)
 
 
@@ -235,5 +235,5 @@ def _no_such_key(cfg: DictConfig, path: list[str], name: str, node: dict[str, An
         return no_such(f"group or value of the run ({RUN_FILE})", name, known)
     if len(path) == 1 and path[0] in GROUPS:
         file = f"conf/{path[0]}/{cfg.hydra.runtime.choices[path[0]]}.yaml"
-        return no_such(f"option of {class_name(node)} ({file})", name, options_of(node))
+        return no_such_option(node, name, file)
     return no_such(f"value of {'.'.join(path)}", name, node)

@@ -30,7 +30,7 @@ def make(high: str, low: str, tmp_path):
     return assemble(cfg, run_config(cfg), tmp_path)
 
 
-@pytest.mark.parametrize(("high", "low"), itertools.product(choices("high"), choices("low")))
+@pytest.mark.parametrize(("high", "low"), list(itertools.product(choices("high"), choices("low"))))
 def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
     monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import time
@@ -16,6 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import hpamdp
+from hpamdp.env import counter_rng
 from hpamdp.env.gymnasium import BoatDock, BoatDockVector
 from hpamdp.env.rendering import Leg, Scene, draw
 
@@ -79,6 +81,17 @@ def test_observations_stay_in_their_space_whatever_is_pressed():
         env.action_space.seed(0)
         seen = [env.reset(seed=0)[0], *(env.step(env.action_space.sample())[0] for _ in range(15))]
         assert all(batch in env.observation_space for batch in seen)
+
+
+@pytest.mark.parametrize("observation", ["scaled", "pixels"])
+@pytest.mark.parametrize("largest", [-5.8, 5.8])
+def test_the_space_holds_the_largest_noise_at_the_rim(observation, largest, monkeypatch):
+    env = BoatDock(controller="congruent", observation=observation, sensor_noise=30.0)
+    signs = itertools.cycle([1, -1, -1, 1, -1, 1])
+    monkeypatch.setattr(counter_rng, "normal", lambda key, draw: torch.full(key.shape, largest * next(signs)))
+    rim = np.array([119.9, 0.0])
+    assert env.reset(seed=0, options={"start": START + rim, "goal": START - rim})[0] in env.observation_space
+    assert env.step(press(1, 0.1))[0] in env.observation_space
 
 
 def test_a_seed_fixes_the_layouts_and_a_reset_without_one_goes_on_to_the_next():

@@ -162,8 +162,8 @@ def test_uniform_numbers_are_even_and_independent_of_every_counter():
 @pytest.mark.parametrize("bits", [0, -1])
 def test_uniform_numbers_stay_inside_the_open_interval_even_at_the_ends(bits, monkeypatch):
     monkeypatch.setattr(counter_rng, "_mix", lambda h: torch.full_like(h, bits))
-    number = counter_rng.uniform(counter(1), 0).item()
-    assert 0.0 < number < 1.0
+    assert 0.0 < counter_rng.uniform(counter(1), 0).item() < 1.0
+    assert abs(counter_rng.normal(counter(1), 0).item()) < 5.8
 
 
 def test_normal_numbers_have_the_moments_of_the_normal_distribution():

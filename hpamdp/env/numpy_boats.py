@@ -74,32 +74,25 @@ class NumpyBoats:
         if action_format not in ("dict", "tuple"):
             raise ValueError(f"BoatDock: action_format={action_format!r}, but must be dict or tuple")
         self.env = env
-        self._last: TensorDictBase | None = None
+        self.is_reset = False
         self.action_space = action_space(env.has_choice, action_format)
         self.observation_space = observation_space(env.rules)
         self._batch = batch
         self._is_tuple = action_format == "tuple"
         self._leaf_names = ("option", "key", "duration") if env.has_choice else ("key", "duration")
 
-    @property
-    def is_reset(self) -> bool:
-        """Whether an episode was ever started."""
-        return self._last is not None
-
     def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
         """Start new episodes (in the rows of `mask`, default all) and return the observations `[N, obs]`."""
         given = self._layout(options or {})
         if mask is not None:
-            # TorchRL fills the other rows from the tensordict that it is given.
-            given.update(self._last)
             given["_reset"] = torch.from_numpy(mask.copy()).to(self.env.device).unsqueeze(-1)
         if seed is not None:
             if options:
                 # Refuses a bad layout while the boats are still as they were.
                 self.env.reset(given.clone())
             self.env.set_seed(seed, static_seed=True)
-        self._last = self.env.reset(given).exclude("_reset", *_OPTION_SHAPES)
-        return to_numpy(self._last[keys.OBSERVATION])
+        self.is_reset = True
+        return to_numpy(self.env.reset(given)[keys.OBSERVATION])
 
     def step(self, action: Any, ignored: np.ndarray | None = None) -> TensorDictBase:
         """Press a key in every boat and return what BoatDockEnv does; in `ignored` rows any action passes."""
@@ -112,9 +105,7 @@ class NumpyBoats:
         n = self.env.num_envs
         option = {keys.OPTION: leaves["option"]} if self.env.has_choice else {}
         press = TensorDict(key=leaves["key"], duration=leaves["duration"], batch_size=[n])
-        after = self.env.step(TensorDict({**option, keys.ACTION: press}, batch_size=[n], device=self.env.device))
-        self._last = after["next"].exclude(keys.REWARD)
-        return after["next"]
+        return self.env.step(TensorDict({**option, keys.ACTION: press}, batch_size=[n], device=self.env.device))["next"]
 
     def infos(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Return the info values, `[N]` each (`score` means nothing before the end), and which boats are done."""

@@ -1,0 +1,136 @@
+"""How many presses a second the environment makes on one core; writes results.csv and prints a table.
+
+Run: python experiments/throughput/throughput.py [--seconds 2] [--device cpu]
+
+Three ways to step are timed, each with automatic resets and random actions drawn beforehand (a pool of eight):
+- physics: `episode.step` and `episode.reset` as one function, nothing observed;
+- env: `BoatDockEnv.step_and_maybe_reset`, observations and TorchRL's bookkeeping included;
+- gymnasium: `BoatDockVector.step`, NumPy in and out; and Gymnasium's own vectorised CartPole beside it as a yardstick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import gymnasium
+import torch
+from torch import Tensor
+
+import hpamdp  # also registers the Gymnasium ids
+from hpamdp import keys
+from hpamdp.env import counter_rng, episode, physics
+from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.episode import BoatState, Rules
+
+SIZES = (1, 1_024, 16_384, 131_072)
+POOL = 8
+
+
+def rate(step: Callable[[], object], num_envs: int, seconds: float) -> float:
+    """Return the presses a second of the fastest of five stretches that take `seconds` together."""
+    for _ in range(POOL + 2):
+        step()
+    started, count = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds / 20:
+        step()
+        count += 1
+    best = 0.0
+    for _ in range(5):
+        started = time.perf_counter()
+        for _ in range(4 * count):
+            step()
+        best = max(best, 4 * count * num_envs / (time.perf_counter() - started))
+    return best
+
+
+def random_actions(env: BoatDockEnv) -> Iterator[dict[str, Tensor]]:
+    """Cycle through a pool of random actions."""
+    pool = [env.rand_action(env.reset()).select(keys.OPTION, keys.ACTION) for _ in range(POOL)]
+    return itertools.cycle(pool)
+
+
+def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], object]:
+    """Return one press with resets as a function of nothing."""
+    rules = Rules()
+    seed = counter_rng.seed_tensor(0, torch.device(device))
+    environment = torch.arange(num_envs, dtype=torch.int32, device=device)
+
+    def press(state: BoatState, option: Tensor, key: Tensor, durations: Tensor) -> tuple[BoatState, Tensor, Tensor]:
+        moved, reward, _ = episode.step(state, option, key, durations, seed, environment, rules)
+        over = moved.outcome != physics.SAILING
+        return episode.reset(moved, over, seed, environment, rules), reward, moved.outcome
+
+    if is_compiled:
+        press = torch.compile(press, fullgraph=True, dynamic=False)
+    env = BoatDockEnv(num_envs, device=device)
+    actions = random_actions(env)
+    env.reset()
+    state = env.state
+
+    def step() -> None:
+        nonlocal state
+        action = next(actions)
+        state, _, _ = press(state, action[keys.OPTION], action[keys.KEY], action[keys.DURATION])
+
+    return step
+
+
+def env_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], object]:
+    """Return one `step_and_maybe_reset` as a function of nothing."""
+    env = BoatDockEnv(num_envs, compile_physics=is_compiled, device=device)
+    actions = random_actions(env)
+    td = env.reset()
+
+    def step() -> None:
+        nonlocal td
+        _, td = env.step_and_maybe_reset(td.update(next(actions)))
+
+    return step
+
+
+def gymnasium_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
+    """Return one step of a Gymnasium vector environment as a function of nothing."""
+    env = gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point")
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = itertools.cycle([env.action_space.sample() for _ in range(POOL)])
+    return lambda: env.step(next(actions))
+
+
+def main() -> None:
+    """Measure everything and write results.csv beside this file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=2.0, help="for each figure")
+    parser.add_argument("--device", default="cpu")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    print(f"hpamdp {hpamdp.__version__}, torch {torch.__version__}, one thread, {arguments.device}")
+    rows = []
+    for num_envs in SIZES:
+        steppers = {
+            "physics eager": lambda n=num_envs: physics_stepper(n, False, arguments.device),
+            "physics compiled": lambda n=num_envs: physics_stepper(n, True, arguments.device),
+            "env eager": lambda n=num_envs: env_stepper(n, False, arguments.device),
+            "env compiled": lambda n=num_envs: env_stepper(n, True, arguments.device),
+            "gymnasium": lambda n=num_envs: gymnasium_stepper("hpamdp/BoatDock-v0", n),
+            "gymnasium CartPole-v1": lambda n=num_envs: gymnasium_stepper("CartPole-v1", n),
+        }
+        for what, make in steppers.items():
+            torch.compiler.reset()
+            presses = rate(make(), num_envs, arguments.seconds)
+            rows.append({"what": what, "num_envs": num_envs, "million_presses_per_s": round(presses / 1e6, 4)})
+            print(f"{what:<22} {num_envs:>8,} environments {presses / 1e6:9.3f} million presses/s", flush=True)
+    name = "results.csv" if arguments.device == "cpu" else f"results_{arguments.device}.csv"
+    with (Path(__file__).parent / name).open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
