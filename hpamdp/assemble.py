@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from torchrl.envs import TransformedEnv
 
 from hpamdp import checkpoint
-from hpamdp.config import ConfigError, RunConfig, build, load_class, name_of, run_config, validate
+from hpamdp.config import ConfigError, RunConfig, build, name_of, run_config, validate
 from hpamdp.env.decisions import with_decisions
 from hpamdp.evaluate import Evaluation
 from hpamdp.policies.agent import HierarchicalAgent
@@ -20,9 +20,12 @@ from hpamdp.policies.base import Learner, Selector
 from hpamdp.specs import PAMDPSpecs
 
 # What the builder supplies; the rest of a constructor's arguments is the yaml's.
-_ENV_CONTEXT = ("num_envs", "device", "seed", "oracle")
-_AGENT_CONTEXT = ("specs", "device")
-_LOGGER_CONTEXT = ("output_dir", "config")
+CONTEXT = {
+    "env": ("num_envs", "device", "seed", "oracle"),
+    "high": ("specs", "device"),
+    "low": ("specs", "device"),
+    "logger": ("output_dir", "config"),
+}
 
 
 @dataclass
@@ -42,14 +45,10 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
     Raises:
         ConfigError: the first wrong value or impossible pair found.
     """
-    has_selector = cfg.high._target_ is not None
-    groups = {"env": _ENV_CONTEXT, "low": _AGENT_CONTEXT, "logger": _LOGGER_CONTEXT}
-    if has_selector:
-        groups["high"] = _AGENT_CONTEXT
-    for group, context in groups.items():
-        validate(group, cfg[group], context)
+    classes = {group: validate(group, cfg[group], context)[0] for group, context in CONTEXT.items()}
+    has_selector = classes["high"] is not None
+    needs_oracle = classes["low"].needs_oracle or (has_selector and classes["high"].needs_oracle)
     device = settings.resolve_device()
-    needs_oracle = [g for g in ("high", "low") if g in groups and load_class(cfg[g]._target_).needs_oracle]
     env = _make_env(cfg, settings.num_envs, settings.seed, device, needs_oracle)
     specs = PAMDPSpecs.from_env(env)
     _check_choice(cfg, specs, has_selector)
@@ -60,9 +59,7 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
     return Parts(env, evaluation, agent, build("logger", cfg.logger, output_dir=output_dir, config=config), device)
 
 
-def _make_env(
-    cfg: DictConfig, num_envs: int, seed: int, device: torch.device, needs_oracle: list[str]
-) -> TransformedEnv:
+def _make_env(cfg: DictConfig, num_envs: int, seed: int, device: torch.device, needs_oracle: bool) -> TransformedEnv:
     context: dict[str, Any] = {"num_envs": num_envs, "seed": seed, "device": device}
     if needs_oracle:
         context["oracle"] = True
@@ -85,7 +82,7 @@ def _check_choice(cfg: DictConfig, specs: PAMDPSpecs, has_selector: bool) -> Non
 def _make_agent(
     cfg: DictConfig, settings: RunConfig, specs: PAMDPSpecs, selector: Selector | None, device: torch.device
 ) -> HierarchicalAgent:
-    is_shared = settings.sharing == "shared" and specs.num_options > 0
+    is_shared = settings.agent.sharing == "shared" and specs.num_options > 0
     learner_specs, num_learners = specs, max(1, specs.num_options)
     if is_shared:
         learner_specs, num_learners = specs.with_option_observed(), 1

@@ -66,9 +66,7 @@ def save(path: Path, agent: HierarchicalAgent, env_state: Mapping[str, Tensor], 
         env_state: the environment's columns.
         progress: JSON values to read back with `progress_of`: the resolved config, the frames so far.
     """
-    _components(agent, _Columns(env_state)).save(
-        path, components=_filled(agent), format="archive", metadata=progress
-    )
+    _components(agent, _Columns(env_state)).save(path, components=_filled(agent), format="archive", metadata=progress)
 
 
 def progress_of(file: Path) -> dict[str, Any]:

@@ -63,6 +63,14 @@ class EvalConfig(BaseModel):
     seed: Seed
 
 
+class AgentConfig(BaseModel):
+    """How the two levels are put together."""
+
+    model_config = _STRICT
+
+    sharing: Literal["per_option", "shared"]
+
+
 class RunConfig(BaseModel):
     """The run's own values, each explained in conf/config.yaml."""
 
@@ -72,7 +80,7 @@ class RunConfig(BaseModel):
     seed: Seed
     device: Annotated[str, AfterValidator(_check_device)]
     threads: Annotated[int, Field(ge=1, le=1024)]
-    sharing: Literal["separate", "shared"]
+    agent: AgentConfig
     total_frames: PositiveInt
     num_envs: PositiveInt
     steps_per_batch: PositiveInt

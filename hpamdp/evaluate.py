@@ -37,8 +37,8 @@ class Evaluation:
     def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
         """Play every episode greedily; return one array an attribute, first dimension the episode.
 
-        `outcome` int, `fuel` (fraction), `score`, `return`, `presses`, `controller` (0 incongruent, 1 congruent), `path`
-        `[N, P + 1, 2]` (px from the harbour's centre, NaN past the end), and the layouts' `start`, `goal`,
+        `outcome` int, `fuel` (fraction), `score`, `return`, `presses`, `controller` (0 incongruent, 1 congruent),
+        `path` `[N, P + 1, 2]` (px from the harbour's centre, NaN past the end), and the layouts' `start`, `goal`,
         `bearing_offset`, `optimum`.
         """
         device = self.env.device

@@ -1,4 +1,4 @@
-"""The sizes and bounds of a parameterised-action problem, which is all that learners and selectors get to know of it."""
+"""The sizes and bounds of a parameterised-action problem: all that learners and selectors get to know of it."""
 
 from __future__ import annotations
 

@@ -5,15 +5,13 @@ import torch
 from torchrl.envs import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env import planner
 from hpamdp.env.boatdock import BoatDockEnv
 from hpamdp.env.choice import ControllerChoiceEnv
 from hpamdp.env.decisions import with_decisions
-from hpamdp.evaluate import Evaluation
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Learner
 from hpamdp.policies.high_level.fixed import Fixed
 from hpamdp.policies.low_level.random import RandomPolicy
-from hpamdp.policies.base import Learner
 from hpamdp.specs import PAMDPSpecs
 
 

@@ -14,16 +14,10 @@ from omegaconf.errors import ConfigAttributeError
 from pydantic import Field, PositiveInt
 
 from hpamdp import train
+from hpamdp.assemble import CONTEXT
 from hpamdp.config import GROUPS, ConfigError, build, load_class, name_of, run_config, validate
 from hpamdp.main import main
 
-# What `assemble` gives to constructors, and so no yaml does.
-CONTEXT = {
-    "env": {"num_envs", "device", "seed", "oracle"},
-    "high": {"specs", "device"},
-    "low": {"specs", "device"},
-    "logger": {"output_dir", "config"},
-}
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
 
 
@@ -150,7 +144,7 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
     assert set(options) == in_yaml
     if cls is not None:
         arguments = set(list(inspect.signature(cls.__init__).parameters)[1:])
-        assert in_yaml == arguments - CONTEXT[group] - {"args", "kwargs"}
+        assert in_yaml == arguments - {*CONTEXT[group]} - {"args", "kwargs"}
     if group in ("high", "low"):
         assert name == name_of(cfg[group])
     assert ("budget" in cfg[group]) == (group == "low")
@@ -216,7 +210,7 @@ MISTAKES = [
     # A choice that isn't there, a group that isn't there.
     (["high=foo"], "high=foo: no such choice; conf/high has fixed, "),
     (["high=3"], "high=3: no such choice; conf/high has fixed, "),
-    (["low=null"], "low=null: no such choice; conf/low has hyar, "),
+    (["low=null"], "low=null: no such choice; conf/low has "),
     (["experiment=foo"], "experiment=foo: no such choice; conf/experiment has quickstart"),
     (["hihg=ucb"], "hihg: no such group or value of the run (conf/config.yaml); did you mean high? It has "),
     (["~low"], "low: nothing chosen; set low=NAME"),
@@ -349,7 +343,7 @@ def test_help_shows_groups_values_with_comments_and_examples(command):
         assert f"  {group:<12}{', '.join(choices(group))}\n" in out
     cfg = OmegaConf.load(CONF / "config.yaml")
     lines = out.splitlines()
-    for name in set(cfg) - {"defaults", "hydra", "eval"}:
+    for name in set(cfg) - {"defaults", "hydra", "eval", "agent"}:
         place = next(i for i, line in enumerate(lines) if line.startswith(f"  {name}:"))
         assert lines[place - 1].startswith("  # ")
     assert out.count("  python run.py ") >= 3

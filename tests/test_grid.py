@@ -56,7 +56,7 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
     other = make(high, low, tmp_path)
     torch.manual_seed(99)
     env_state = checkpoint.load(file, other.agent, other.device, with_training=True)
-    other.env.state = type(other.env.state)(**env_state)
+    other.env.base_env.state = type(other.env.state)(**env_state)
     assert checkpoint.progress_of(file) == {"frames": 320}
     results = []
     for one in (other, parts):

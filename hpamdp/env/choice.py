@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
@@ -16,12 +16,12 @@ from hpamdp.env.episode import MAX_PRESSES
 class ControllerChoiceEnv(EnvBase):
     """Choose a controller, see the episode's return: an ordinary environment with one discrete action.
 
-    The action is `option` int64 `[N]`; every step plays the episode to its end with the low-level policy and is terminal.
-    Reward is the episode's return (`outcome` and `fuel` say how it ended).
+    The action is `option` int64 `[N]`; every step plays the episode to its end with the low-level policy and is
+    terminal. Reward is the episode's return (`outcome` and `fuel` say how it ended).
 
     Args:
-        low_policy: writes the action leaves from `observation` and `option`; it is called under the exploration type and
-            gradient mode of the caller.
+        low_policy: writes the action leaves from `observation` and `option`; it is called under the exploration type
+            and gradient mode of the caller.
         env: the boats, with `controller="choose"`.
 
     Raises:

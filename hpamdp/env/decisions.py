@@ -14,8 +14,8 @@ class DecisionTracker(Transform):
     """Write where an option is due and the semi-MDP view of the option that runs.
 
     At the root of a step `is_decision` `[*B, 1]` says that the agent chooses an option there. Under `next` it says that
-    the option ended with this step, so the rows where `("next", "is_decision")` are the semi-MDP's transitions, with the
-    discounted return `option_return` `[*B, 1]`, the length `option_steps` `[*B, 1]` and the observation
+    the option ended with this step, so the rows where `("next", "is_decision")` are the semi-MDP's transitions, with
+    the discounted return `option_return` `[*B, 1]`, the length `option_steps` `[*B, 1]` and the observation
     `decision_observation` `[*B, observation_dim]` at which the option was chosen. Options last an episode. All state
     travels in the tensordict, so an option that spans two collected batches is accounted right.
 

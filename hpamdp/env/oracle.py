@@ -52,7 +52,7 @@ class BoatDockOracle:
         return planner.best_plan(boats.x, boats.y, boats.goal_x, boats.goal_y, boats.fuel, held, boats.keymap)
 
     def read(self, state: BoatState) -> TensorDict:
-        """Return `option` `[N]` and, for each option (one where there is no choice), the next press's `key` and `duration`."""
+        """Return `option` `[N]` and each option's next press, `key` and `duration` `[N, num_options]`."""
         pressed = state.presses.long()
         if self.rules.motor_noise > 0.0 or self.rules.slip > 0.0:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))

@@ -16,8 +16,8 @@ from hpamdp.specs import PAMDPSpecs
 class Selector(TensorDictModuleBase):
     """Chooses an option where a decision is due and holds it until the next one.
 
-    A subclass writes `select` and, if it learns, `learn`; what it remembers lives in buffers, so that a checkpoint holds
-    it. Its `__init__` takes `specs` and its options as keyword arguments, which are the schema of its yaml.
+    A subclass writes `select` and, if it learns, `learn`; what it remembers lives in buffers, so that a checkpoint
+    holds it. Its `__init__` takes `specs` and its options as keyword arguments, which are the schema of its yaml.
     """
 
     needs_oracle: ClassVar[bool] = False  # whether it reads what only an environment with a planner writes
@@ -33,8 +33,11 @@ class Selector(TensorDictModuleBase):
         raise NotImplementedError
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Learn from finished decisions `[N]`: their `option`, and under `next` their `option_return`, `option_steps` and
-        `decision_observation`. Return scalars to log."""
+        """Learn from finished decisions `[N]`, oldest first; return scalars to log.
+
+        A decision is its last step: `option`, and under `next` its `option_return`, `option_steps` and
+        `decision_observation`.
+        """
         return {}
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +34,7 @@ class EnsembleMLP(nn.Module):
         super().__init__()
         dims = [in_dim, *hidden_dims, out_dim]
         self.num_members = num_members
-        self.layers = nn.ModuleList(EnsembleLinear(num_members, i, o) for i, o in zip(dims, dims[1:], strict=False))
+        self.layers = nn.ModuleList(EnsembleLinear(num_members, i, o) for i, o in pairwise(dims))
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply all members."""
@@ -47,6 +48,6 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     """Return a ReLU network with linear output."""
     dims = [in_dim, *hidden_dims]
     layers: list[nn.Module] = []
-    for i, o in zip(dims, dims[1:], strict=False):
+    for i, o in pairwise(dims):
         layers += [nn.Linear(i, o), nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim))

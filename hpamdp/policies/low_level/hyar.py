@@ -11,8 +11,8 @@ Differs from the source:
   those alone;
 - the state change is predicted in units of its own standard deviation over the warm-up data, so that no entry's scale
   swamps the reconstruction;
-- random warm-up and epsilon-random presses have no latent of their own: they are encoded when they are sampled, which is
-  what the representation-shift correction does for outdated ones.
+- random warm-up and epsilon-random presses have no latent of their own: they are encoded when they are sampled, which
+  is what the representation-shift correction does for outdated ones.
 """
 
 from __future__ import annotations
@@ -258,10 +258,10 @@ class HyAR(Learner):
             losses.setdefault(name, []).append(value.detach())
 
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Return latent actions `[B, key_dim + latent_dim]` that mean today what was pressed then, and which were redone.
+        """Return latents `[B, key_dim + latent_dim]` that mean today what was pressed then, and which were redone.
 
-        Representation-shift correction: e is replaced by the key's embedding where it no longer decodes to the key; z is
-        encoded anew where the state change that it predicts is off by more than the threshold (scaled mean square).
+        Representation-shift correction: e is replaced by the key's embedding where it no longer decodes to the key; z
+        is encoded anew where the state change that it predicts is off by more than the threshold (scaled mean square).
         """
         state, key, latent = batch["state"], batch["key"], batch["latent"]
         with torch.no_grad():

@@ -1,0 +1,89 @@
+"""What a run tells while it goes on and when it ends: rows of metrics, evaluations, the summary, the pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+
+from hpamdp import keys, plots
+from hpamdp.assemble import Parts, random_policy
+from hpamdp.env.physics import SUCCESS
+from hpamdp.evaluate import measure
+from hpamdp.metrics import MetricsFile, closing_table
+from hpamdp.summary import summarise
+
+
+class Recorder:
+    """Collects a run's figures and writes them to its output folder and its logger.
+
+    Args:
+        cfg: the resolved config.
+        parts: the run's environment, agent, evaluation and logger.
+        output_dir: where `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures go.
+    """
+
+    def __init__(self, cfg: DictConfig, parts: Parts, output_dir: Path) -> None:
+        self.cfg, self.parts, self.output_dir = cfg, parts, output_dir
+        self.metrics = MetricsFile(output_dir / "metrics.csv")
+        self._ended: list[TensorDictBase] = []
+        self._scalars: dict[str, float] = {}
+        self._random = self._measure(parts.evaluation.run(random_policy(parts)))
+
+    def resume_from(self, folder: Path, frames: int) -> None:
+        """Start the metrics with those that the run in `folder` had written by then."""
+        self.metrics = MetricsFile(self.metrics.path, folder / "metrics.csv", frames)
+
+    def take(self, batch: TensorDictBase, scalars: dict[str, float]) -> None:
+        """Take note of a collected batch `[N, T]` and of what the agent said while learning from it."""
+        is_end = batch.get(("next", keys.DONE)).squeeze(-1)
+        ended = batch.get("next").select(keys.OUTCOME, keys.FUEL, keys.OPTION_RETURN, keys.OPTION_STEPS)[is_end]
+        if keys.OPTION in batch.keys():
+            ended.set(keys.OPTION, batch.get(keys.OPTION)[is_end])
+        self._ended.append(ended)
+        self._scalars |= scalars
+
+    def log(self, frames: int, wall_s: float, is_evaluated: bool) -> dict[str, float]:
+        """Write a row, with an evaluation if asked for, and return it."""
+        row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
+        if is_evaluated:
+            measured = self._measure(self.parts.evaluation.run(self.parts.agent.policy))
+            row |= {f"eval/{name}": value for name, value in measured.items()}
+        self.metrics.append(row)
+        self.parts.logger.log(row, frames)
+        self._ended, self._scalars = [], {}
+        return row
+
+    def finish(self, frames: int, wall_s: float) -> str:
+        """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
+        played = self.parts.evaluation.run(self.parts.agent.policy)
+        np.savez_compressed(self.output_dir / "evaluation.npz", **played)
+        summary = summarise(self.cfg, self._measure(played), self._random, frames, wall_s)
+        (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        logger = self.parts.logger
+        logger.images(plots.draw_all(self.output_dir))
+        logger.summary(summary)
+        logger.close()
+        return closing_table(summary)
+
+    def _measure(self, played: dict[str, np.ndarray]) -> dict[str, float]:
+        return measure(played, has_choice=self.parts.agent.selector is not None)
+
+    def _training_scores(self) -> dict[str, float]:
+        """Return the means over the exploring episodes that ended since the last row."""
+        if not sum(len(ended) for ended in self._ended):
+            return {}
+        ended = torch.cat(self._ended)
+        scores = {
+            "train/score": self.parts.env.score(ended).mean().item(),
+            "train/success": (ended[keys.OUTCOME] == SUCCESS).float().mean().item(),
+            "train/return": ended[keys.OPTION_RETURN].mean().item(),
+            "train/presses": ended[keys.OPTION_STEPS].float().mean().item(),
+        }
+        for i, name in enumerate(self.parts.agent.specs.option_names):
+            scores[f"train/option_{name}"] = (ended[keys.OPTION] == i).float().mean().item()
+        return scores
