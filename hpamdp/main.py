@@ -74,6 +74,8 @@ def main() -> None:
 
     # Hydra then raises what it would print, in several lines, itself.
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    # TorchRL tells of every replay buffer that it fills.
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     try:
         arguments = _parse()
         conf = conf_dir()

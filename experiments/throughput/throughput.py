@@ -27,7 +27,7 @@ from hpamdp.env import counter_rng, episode, physics
 from hpamdp.env.boatdock import BoatDockEnv
 from hpamdp.env.episode import BoatState, Rules
 
-SIZES = (1, 1_024, 16_384, 131_072)
+SIZES = (1, 1_024, 16_384, 65_536, 131_072)
 POOL = 8
 
 
