@@ -9,6 +9,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
+from hpamdp.specs import PAMDPSpecs
+
 
 class EnsembleLinear(nn.Module):
     """`num_members` linear layers side by side: `[E, B, in]` -> `[E, B, out]` in one batched product."""
@@ -51,3 +53,34 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     for i, o in pairwise(dims):
         layers += [nn.Linear(i, o), nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim))
+
+
+class KeyCritics(nn.Module):
+    """`num_members` independent Q(s, k, x) of every key k.
+
+    With `is_multipass`, key k's value comes from a pass that sees only x_k, the other parameters being 0.
+    Shapes: states `[B, observation_dim]`, parameters `[B, num_parameters]` in [-1, 1].
+    """
+
+    def __init__(self, specs: PAMDPSpecs, num_members: int, hidden_dims: Sequence[int], is_multipass: bool) -> None:
+        super().__init__()
+        self.is_multipass = is_multipass
+        input_dim = specs.observation_dim + specs.num_parameters
+        self.net = EnsembleMLP(num_members, input_dim, hidden_dims, specs.num_keys)
+        self.register_buffer("mask", specs.parameter_mask.float())
+
+    def forward(self, state: Tensor, unit: Tensor) -> Tensor:
+        """Return the values of all keys, `[E, B, num_keys]`."""
+        if not self.is_multipass:
+            return self.net(torch.cat([state, unit], -1))
+        num, num_keys = state.shape[0], self.mask.shape[0]
+        own = unit.unsqueeze(1) * self.mask
+        passes = torch.cat([state.unsqueeze(1).expand(-1, num_keys, -1), own], -1)
+        q = self.net(passes.flatten(0, 1))
+        return q.unflatten(1, (num, num_keys)).diagonal(dim1=-2, dim2=-1)
+
+    def of_key(self, state: Tensor, key: Tensor, unit: Tensor) -> Tensor:
+        """Return the values `[E, B]` of the keys `[B]`."""
+        own = unit * self.mask[key] if self.is_multipass else unit
+        q = self.net(torch.cat([state, own], -1))
+        return q.gather(-1, key.expand(q.shape[0], -1).unsqueeze(-1)).squeeze(-1)

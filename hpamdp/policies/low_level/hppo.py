@@ -1,0 +1,286 @@
+"""H-PPO: proximal policy optimisation with a discrete actor for the key and a continuous actor for its parameters.
+
+Both actors stand on one encoder, one critic V(s) serves both, and each has a clipped surrogate with its own ratio. Only
+the parameters of the key that was pressed have a likelihood.
+
+Source: Fan, Su, Zhang and Yu, *Hybrid Actor-Critic Reinforcement Learning in Parameterized Action Space*, 2019, arXiv
+1903.01344, section 4; PPO: Schulman, Wolski, Dhariwal, Radford and Klimov 2017, arXiv 1707.06347, equation 7; GAE:
+Schulman, Moritz, Levine, Jordan and Abbeel 2016, arXiv 1506.02438, equation 16.
+
+Differs from the source:
+- the heads' surrogates are computed here and not by TorchRL's ClipPPOLoss, which multiplies the ratios of all heads and
+  clips the product; the advantages are TorchRL's;
+- a Gaussian in the units [-1, 1] of the bounds gives the parameters; the raw sample is kept for the ratio and clipped
+  only where it is pressed, which spares the likelihood of a squashed one its poles at the bounds;
+- the Gaussian's deviation has a floor, for ratios explode where it shrinks faster than the steps of its mean; floor,
+  learning rate and entropy bonus fall over `anneal_frames` presses of the whole run.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.objectives.value.functional import generalized_advantage_estimate
+
+from hpamdp import keys
+from hpamdp.policies.base import Learner
+from hpamdp.specs import PAMDPSpecs
+
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+
+# What the ratio needs of a press: the parameters as they were drawn, in units of their bounds, and the log-likelihoods.
+RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB = "raw_parameters", "key_log_prob", "parameter_log_prob"
+
+
+class HybridDistribution(NamedTuple):
+    """A categorical over keys and a Gaussian for each of their parameters.
+
+    Shapes: log-probabilities of the keys `[*B, num_keys]`, mean and log-deviation `[*B, num_parameters]`, the mask of
+    each key's own parameters `[num_keys, num_parameters]`.
+    """
+
+    key_log_probs: Tensor
+    mean: Tensor
+    log_scale: Tensor
+    parameter_mask: Tensor
+
+    def sample(self) -> tuple[Tensor, Tensor]:
+        """Draw keys `[*B]` and unbounded parameters `[*B, num_parameters]`, those of the other keys too."""
+        # The largest of log-probability + Gumbel noise is a draw, faster than torch.multinomial.
+        gumbel = -torch.empty_like(self.key_log_probs).exponential_().log()
+        raw = self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
+        return (self.key_log_probs + gumbel).argmax(-1), raw
+
+    def mode(self) -> tuple[Tensor, Tensor]:
+        """Return the likeliest key `[*B]` and the mean parameters `[*B, num_parameters]`."""
+        return self.key_log_probs.argmax(-1), self.mean
+
+    def log_prob(self, key: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the log-likelihoods `[*B]` of the key and of its own parameters, 0 where it has none."""
+        normal = (
+            -0.5 * ((raw - self.mean) / self.log_scale.exp()).square() - self.log_scale - 0.5 * math.log(2 * math.pi)
+        )
+        of_key = self.key_log_probs.gather(-1, key.unsqueeze(-1)).squeeze(-1)
+        return of_key, (normal * self.parameter_mask[key]).sum(-1)
+
+    def entropy(self) -> tuple[Tensor, Tensor]:
+        """Return the entropies `[*B]` of the key and, in the mean over keys, of a key's own parameters."""
+        probability = self.key_log_probs.exp()
+        normal = self.log_scale + 0.5 * math.log(2 * math.pi * math.e)
+        return -(probability * self.key_log_probs).sum(-1), ((probability @ self.parameter_mask) * normal).sum(-1)
+
+
+class HybridActor(nn.Module):
+    """The discrete and the continuous actor on one encoder."""
+
+    def __init__(
+        self, specs: PAMDPSpecs, hidden_dims: Sequence[int], scale_range: tuple[float, float], initial_scale: float
+    ) -> None:
+        super().__init__()
+        self.encoder = _encoder(specs.observation_dim, hidden_dims)
+        self.key_head = nn.Linear(hidden_dims[-1], specs.num_keys)
+        self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters)
+        low, high = (math.log(scale) for scale in scale_range)
+        self.register_buffer("log_min_scale", torch.tensor(low))
+        self.log_max_scale = high
+        share = (math.log(initial_scale) - low) / (high - low)
+        with torch.no_grad():
+            # Near-uniform keys and mid-range means to begin with.
+            for head in (self.key_head, self.parameter_head):
+                head.weight.mul_(0.01)
+                head.bias.zero_()
+            self.parameter_head.bias[specs.num_parameters :] = math.log(share / (1.0 - share))
+        self.register_buffer("parameter_mask", specs.parameter_mask.float())
+
+    def forward(self, observation: Tensor) -> HybridDistribution:
+        """Return the distribution of the next press for observations `[*B, observation_dim]`."""
+        hidden = self.encoder(observation)
+        mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
+        log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
+        return HybridDistribution(self.key_head(hidden).log_softmax(-1), mean, log_scale, self.parameter_mask)
+
+    def set_min_scale(self, min_scale: float) -> None:
+        """Move the lower end of the range in which the Gaussian's deviation is learned."""
+        self.log_min_scale.fill_(math.log(min_scale))
+
+
+class HPPOPolicy(TensorDictModuleBase):
+    """Draws the press from the actor, or takes its likeliest one when greedy."""
+
+    def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
+        super().__init__()
+        self.in_keys = [keys.OBSERVATION]
+        self.out_keys = [keys.KEY, keys.DURATION, RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB]
+        self.actor, self.specs = actor, specs
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write key `[*B]`, parameters `[*B, num_parameters]` and what the ratio needs of them."""
+        greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
+        with torch.no_grad():
+            distribution = self.actor(td.get(keys.OBSERVATION))
+            key, raw = distribution.mode() if greedy else distribution.sample()
+            key_log_prob, parameter_log_prob = distribution.log_prob(key, raw)
+            duration = self.specs.from_unit(raw.clamp(-1.0, 1.0))
+        written = {RAW: raw, KEY_LOG_PROB: key_log_prob, PARAMETER_LOG_PROB: parameter_log_prob}
+        return td.update({**written, keys.ACTION: {"key": key, "duration": duration}})
+
+
+class HPPO(Learner):
+    """Clipped policy-gradient updates of both actors from the presses just collected."""
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
+        critic_hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
+        initial_scale: PositiveFloat,
+        min_scale: PositiveFloat,
+        min_scale_final: PositiveFloat,
+        max_scale: PositiveFloat,
+        epochs: PositiveInt,
+        minibatch_size: PositiveInt,
+        clip: PositiveFloat,
+        gamma: Fraction,
+        gae_lambda: Fraction,
+        lr: PositiveFloat,
+        lr_final: NonNegativeFloat,
+        critic_weight: PositiveFloat,
+        key_entropy: NonNegativeFloat,
+        parameter_entropy: NonNegativeFloat,
+        entropy_final: Fraction,
+        anneal_frames: PositiveInt,
+        max_grad_norm: PositiveFloat,
+    ) -> None:
+        if not min_scale < initial_scale < max_scale:
+            raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
+        super().__init__(specs)
+        self.epochs, self.minibatch_size, self.clip, self.critic_weight = epochs, minibatch_size, clip, critic_weight
+        self.gamma, self.gae_lambda, self.max_grad_norm = gamma, gae_lambda, max_grad_norm
+        self.key_entropy, self.parameter_entropy, self.entropy_final = key_entropy, parameter_entropy, entropy_final
+        self.min_scale, self.min_scale_final = min_scale, min_scale_final
+        self.lr, self.lr_final, self.anneal_frames = lr, lr_final, anneal_frames
+        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), initial_scale)
+        self.critic = nn.Sequential(
+            _encoder(specs.observation_dim, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
+        )
+        self.policy = HPPOPolicy(self.actor, specs)
+        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self.waiting: list[TensorDict] = []
+        self.to(device)
+        self.optimiser = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
+
+    def stateful(self) -> dict[str, Any]:
+        """Return the optimiser."""
+        return {"optimiser": self.optimiser}
+
+    def get_extra_state(self) -> list[dict[str, Tensor]]:
+        """Return the rows that wait for the next update, for the state dict."""
+        return [dict(rows.items()) for rows in self.waiting]
+
+    def set_extra_state(self, state: list[dict[str, Tensor]]) -> None:
+        """Take the rows back from a state dict."""
+        self.waiting = [TensorDict(rows, batch_size=rows["advantage"].shape) for rows in state]
+
+    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
+        """Estimate the own rows' advantages; from a minibatch of rows on, make `epochs` passes over them.
+
+        Fewer rows, as of an option that is seldom chosen, wait for more; the policy that drew them stays until then.
+        """
+        progress = min(1.0, self.frames.item() / self.anneal_frames)
+        self.frames += batch.numel()
+        if not mask.any():
+            return {}
+        self.waiting.append(self._rows(batch, mask))
+        if sum(len(rows) for rows in self.waiting) < self.minibatch_size:
+            return {}
+        rows, self.waiting = torch.cat(self.waiting), []
+        advantage = rows["advantage"]
+        rows["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.lr + progress * (self.lr_final - self.lr)
+        entropy_weight = 1.0 + progress * (self.entropy_final - 1.0)
+        losses: list[dict[str, Tensor]] = []
+        num_minibatches = rows.shape[0] // self.minibatch_size
+        for _ in range(self.epochs):
+            order = torch.randperm(rows.shape[0], device=rows.device).tensor_split(num_minibatches)
+            losses += [self._update(rows[indices], entropy_weight) for indices in order]
+        self.actor.set_min_scale(self.min_scale * (self.min_scale_final / self.min_scale) ** progress)
+        return {name: torch.stack([step[name] for step in losses]).mean().item() for name in losses[0]}
+
+    def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the generalised advantages and the targets of V, each `[*B, T]`; they count in the rows of `mask`.
+
+        Bootstrapping stops where an episode terminated, the trace where it is done, which is also where another
+        option's rows can begin; those rows are zeros here.
+        """
+        with torch.no_grad():
+            value, next_value, reward = torch.zeros(3, *mask.shape, 1, device=mask.device)
+            value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
+            next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
+            reward[mask] = batch.get(("next", keys.REWARD))[mask]
+            done, terminated = batch.get(("next", keys.DONE)), batch.get(("next", keys.TERMINATED))
+            advantage, target = generalized_advantage_estimate(
+                self.gamma, self.gae_lambda, value, next_value, reward, done, terminated
+            )
+        return advantage.squeeze(-1), target.squeeze(-1)
+
+    def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
+        advantage, target = (each[mask] for each in self.advantages(batch, mask))
+        own = {name: batch.get(name)[mask] for name in (keys.OBSERVATION, RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB)}
+        own |= {"key": batch.get(keys.KEY)[mask], "advantage": advantage, "target": target}
+        return TensorDict(own, batch_size=advantage.shape)
+
+    def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
+        """Return the clipped surrogate of one actor, `[B]`."""
+        ratio = log_ratio.exp()
+        return torch.minimum(ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage)
+
+    def _update(self, rows: TensorDictBase, entropy_weight: float) -> dict[str, Tensor]:
+        distribution = self.actor(rows[keys.OBSERVATION])
+        key_log_prob, parameter_log_prob = distribution.log_prob(rows["key"], rows[RAW])
+        key_log_ratio = key_log_prob - rows[KEY_LOG_PROB]
+        parameter_log_ratio = parameter_log_prob - rows[PARAMETER_LOG_PROB]
+        gain = self.surrogate(key_log_ratio, rows["advantage"]) + self.surrogate(parameter_log_ratio, rows["advantage"])
+        key_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
+        bonus = self.key_entropy * key_entropy + self.parameter_entropy * parameter_entropy
+        critic_loss = F.mse_loss(self.critic(rows[keys.OBSERVATION]).squeeze(-1), rows["target"])
+        loss = self.critic_weight * critic_loss - gain.mean() - entropy_weight * bonus
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
+        self.optimiser.step()
+        with torch.no_grad():
+            # exp(x) - 1 - x, an estimate of the divergence that is never negative.
+            ratios = (key_log_ratio, parameter_log_ratio)
+            key_kl, parameter_kl = ((ratio.expm1() - ratio).mean() for ratio in ratios)
+            clipped = [ratio.expm1().abs() > self.clip for ratio in ratios]
+            return {
+                "critic": critic_loss.detach(),
+                "key_entropy": key_entropy.detach(),
+                "scale": distribution.log_scale.mean().exp(),
+                "key_kl": key_kl,
+                "parameter_kl": parameter_kl,
+                "key_clipped": clipped[0].float().mean(),
+                "parameter_clipped": clipped[1].float().mean(),
+            }
+
+
+def _encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for i, o in zip([in_dim, *hidden_dims], hidden_dims, strict=False):
+        linear = nn.Linear(i, o)
+        nn.init.orthogonal_(linear.weight, math.sqrt(2.0))
+        nn.init.zeros_(linear.bias)
+        layers += [linear, nn.ReLU()]
+    return nn.Sequential(*layers)

@@ -1,0 +1,258 @@
+"""P-DQN and MP-DQN: a deep Q-network over the keys, whose parameters a deterministic network chooses.
+
+One network gives the parameters x(s) of all keys, another Q(s, k, x) of every key; the key with the highest Q is
+pressed, and x ascends the sum of Q over the keys.
+
+Source: Xiong et al., *Parametrized Deep Q-Networks Learning: Reinforcement Learning with Discrete-Continuous Hybrid
+Action Space*, 2018, arXiv 1810.06394, algorithm 1. Multi-pass: Bester, James and Konidaris, *Multi-Pass Q-Networks for
+Deep Reinforcement Learning with Parameterised Action Spaces*, 2019, arXiv 1905.04388. Twin critics, target smoothing,
+delayed actor: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477 (TD3). Double Q: van Hasselt, Guez and Silver 2016,
+arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.04143.
+
+Differs from the source:
+- target networks, with a rate each, and uniform replay, as in Bester et al.; one learner instead of asynchronous ones;
+- only the pass of the pressed key is computed where the others' values do not matter;
+- with twin critics, Q is their minimum everywhere: in targets, in the parameters' ascent and in choosing the key;
+- exploration adds Gaussian noise to the parameters beside the epsilon-random presses.
+
+TorchRL's DQNLoss does not fit: it takes one discrete action and a value of the observation alone, while both Q and its
+target here are functions of parameters that another network, with a target and a loss of its own, gives for every key.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from hpamdp import keys
+from hpamdp.policies.base import Learner
+from hpamdp.policies.nets import KeyCritics, mlp
+from hpamdp.specs import PAMDPSpecs
+
+Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
+
+
+class InvertingGradients(torch.autograd.Function):
+    """Clip to [-1, 1]; scale the gradient by the room left in its direction, so that it turns back past a bound."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor) -> Tensor:
+        """Return the clipped parameters."""
+        ctx.save_for_backward(raw)
+        return raw.clamp(-1.0, 1.0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        """Return the gradient of a loss, which a descent follows upwards where it is negative."""
+        (raw,) = ctx.saved_tensors
+        return gradient * torch.where(gradient < 0.0, 1.0 - raw, 1.0 + raw) * 0.5
+
+
+class ParameterActor(nn.Module):
+    """The parameters of all keys, `[*B, observation_dim]` -> `[*B, num_parameters]` in [-1, 1]."""
+
+    def __init__(self, specs: PAMDPSpecs, hidden_dims: list[int], bounding: str) -> None:
+        super().__init__()
+        self.net = mlp(specs.observation_dim, hidden_dims, specs.num_parameters)
+        self.is_inverting = bounding == "inverting_gradients"
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Return the bounded parameters."""
+        raw = self.net(state)
+        return InvertingGradients.apply(raw) if self.is_inverting else raw.tanh()
+
+
+class PDQNPolicy(TensorDictModuleBase):
+    """The key with the highest Q and its parameters; explores with random presses and noise on the parameters."""
+
+    def __init__(self, actor: ParameterActor, critics: KeyCritics, specs: PAMDPSpecs, noise: float) -> None:
+        super().__init__()
+        self.in_keys = [keys.OBSERVATION]
+        self.out_keys = [keys.KEY, keys.DURATION]
+        self.actor, self.critics, self.specs, self.noise = actor, critics, specs, noise
+        self.register_buffer("epsilon", torch.ones(()))
+
+    @torch.no_grad()
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write key `[*B]` and parameters `[*B, num_parameters]`."""
+        state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
+        unit = self.actor(state)
+        key = self.critics(state, unit).amin(0).argmax(-1)
+        if exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+            is_random = torch.rand(key.shape, device=key.device) < self.epsilon
+            noisy = (unit + self.noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
+            unit = torch.where(is_random.unsqueeze(-1), 2.0 * torch.rand_like(unit) - 1.0, noisy)
+            key = torch.where(is_random, torch.randint_like(key, self.specs.num_keys), key)
+        td.set(keys.KEY, key.reshape(td.batch_size))
+        return td.set(keys.DURATION, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+
+
+class PDQN(Learner):
+    """Q-learning over the keys and gradient ascent on their parameters, from a replay buffer of its own."""
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        multipass: bool,
+        twin_q: bool,
+        double_q: bool,
+        target_smoothing: NonNegativeFloat,
+        target_smoothing_clip: NonNegativeFloat,
+        policy_delay: PositiveInt,
+        n_step: PositiveInt,
+        bounding: Literal["tanh", "inverting_gradients"],
+        hidden_dims: list[PositiveInt],
+        warmup_frames: NonNegativeInt,
+        buffer_size: PositiveInt,
+        batch_size: PositiveInt,
+        updates_per_frame: PositiveFloat,
+        gamma: Fraction,
+        actor_lr: PositiveFloat,
+        critic_lr: PositiveFloat,
+        actor_tau: Fraction,
+        critic_tau: Fraction,
+        max_grad_norm: PositiveFloat | None,
+        parameter_noise: NonNegativeFloat,
+        epsilon_final: Annotated[float, Field(ge=0.0, le=1.0)],
+        epsilon_frames: NonNegativeInt,
+    ) -> None:
+        super().__init__(specs)
+        self.double_q, self.policy_delay, self.n_step = double_q, policy_delay, n_step
+        self.target_smoothing, self.target_smoothing_clip = target_smoothing, target_smoothing_clip
+        self.warmup_frames, self.batch_size, self.updates_per_frame = warmup_frames, batch_size, updates_per_frame
+        self.gamma, self.actor_tau, self.critic_tau = gamma, actor_tau, critic_tau
+        self.max_grad_norm = max_grad_norm
+        self.epsilon_final, self.epsilon_frames = epsilon_final, epsilon_frames
+
+        self.actor = ParameterActor(specs, hidden_dims, bounding)
+        self.critics = KeyCritics(specs, 2 if twin_q else 1, hidden_dims, multipass)
+        self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.policy = PDQNPolicy(self.actor, self.critics, specs, parameter_noise)
+        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
+        self.to(device)
+        self.optimisers = {
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
+        }
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+
+    def stateful(self) -> dict[str, Any]:
+        """Return the optimisers and the replay buffer."""
+        return {**self.optimisers, "buffer": self.buffer}
+
+    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
+        """Store the batch's transitions; once the warm-up is over, update critics and actor."""
+        rows = self._transitions(batch)[mask]
+        if rows.shape[0] == 0:
+            return {}
+        self.buffer.extend(rows)
+        before, self.frames = int(self.frames), self.frames + rows.shape[0]
+        frames = int(self.frames)
+        if frames < self.warmup_frames:
+            return {}
+        progress = (frames - self.warmup_frames) / max(1, self.epsilon_frames)
+        self.policy.epsilon.fill_(1.0 + (self.epsilon_final - 1.0) * min(1.0, progress))
+        due = int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
+        losses: dict[str, list[Tensor]] = {}
+        if due:
+            # One draw for all updates: the buffer's own overhead is as long as a forward pass.
+            for sample in self.buffer.sample(due * self.batch_size).split(self.batch_size):
+                self._update(sample, losses)
+        scalars = {name: torch.stack(values).mean().item() for name, values in losses.items()}
+        return {**scalars, "epsilon": self.policy.epsilon.item(), "updates": self.updates.item()}
+
+    def _transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return what is stored of a batch `[*B, T]`: every row with its n-step return and the state after it."""
+        done = batch["next", keys.DONE].squeeze(-1)
+        reward, last = n_step_returns(batch["next", keys.REWARD].squeeze(-1), done, self.n_step, self.gamma)
+        steps = last - torch.arange(done.shape[-1], device=last.device) + 1
+        goes_on = ~batch["next", keys.TERMINATED].squeeze(-1).gather(-1, last)
+        next_state = batch["next", keys.OBSERVATION]
+        return TensorDict(
+            {
+                "state": batch[keys.OBSERVATION],
+                "key": batch[keys.KEY],
+                "unit": self.specs.to_unit(batch[keys.DURATION]),
+                "reward": reward,
+                "next_state": next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state)),
+                "discount": self.gamma**steps * goes_on,
+            },
+            batch_size=batch.shape,
+        )
+
+    def _update(self, batch: TensorDictBase, losses: dict[str, list[Tensor]]) -> None:
+        self.updates += 1
+        state = batch["state"]
+        q = self.critics.of_key(state, batch["key"], batch["unit"])
+        critic_loss = (q - self._target(batch)).square().mean(-1).sum()
+        self._step("critics", self.critics, critic_loss)
+        recorded = {"critic": critic_loss, "q": q.mean()}
+        if self.updates % self.policy_delay == 0:
+            recorded["actor"] = self._update_actor(state)
+            for target, source, tau in (
+                (self.target_actor, self.actor, self.actor_tau),
+                (self.target_critics, self.critics, self.critic_tau),
+            ):
+                for t, s in zip(target.parameters(), source.parameters(), strict=True):
+                    t.lerp_(s.detach(), tau)
+        for name, value in recorded.items():
+            losses.setdefault(name, []).append(value.detach())
+
+    def _update_actor(self, state: Tensor) -> Tensor:
+        """Let the parameters of all keys ascend the sum of their values; return the loss."""
+        self.critics.requires_grad_(False)
+        loss = -self.critics(state, self.actor(state)).amin(0).sum(-1).mean()
+        self._step("actor", self.actor, loss)
+        self.critics.requires_grad_(True)
+        return loss
+
+    def _target(self, batch: TensorDictBase) -> Tensor:
+        """Return r + discount max_k Q'(s', k, x'(s')), `[B]`, where the discount is 0 after a termination."""
+        state = batch["next_state"]
+        with torch.no_grad():
+            unit = self.target_actor(state)
+            if self.target_smoothing > 0.0:
+                bound = self.target_smoothing_clip
+                noise = (self.target_smoothing * torch.randn_like(unit)).clamp(-bound, bound)
+                unit = (unit + noise).clamp(-1.0, 1.0)
+            q = self.target_critics(state, unit).amin(0)
+            choosing = self.critics(state, unit).amin(0) if self.double_q else q
+            best = q.gather(-1, choosing.argmax(-1, keepdim=True)).squeeze(-1)
+            return batch["reward"] + batch["discount"] * best
+
+    def _step(self, name: str, module: nn.Module, loss: Tensor) -> None:
+        optimiser = self.optimisers[name]
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        if self.max_grad_norm is not None:
+            nn.utils.clip_grad_norm_(module.parameters(), self.max_grad_norm)
+        optimiser.step()
+
+
+def n_step_returns(reward: Tensor, done: Tensor, n: int, gamma: float) -> tuple[Tensor, Tensor]:
+    """Return the discounted sums of the next `n` rewards and the times of the last of them, each `[*B, T]`.
+
+    Sums end early with their episode or with the batch. `reward` and `done` (bool) are `[*B, T]`.
+    """
+    num_steps = reward.shape[-1]
+    time = torch.arange(num_steps, device=reward.device).expand_as(done)
+    total, last, is_over = reward, time, done
+    for i in range(1, min(n, num_steps)):
+        following = (time + i).clamp(max=num_steps - 1)
+        is_over = is_over | (time + i >= num_steps)
+        total = torch.where(is_over, total, total + gamma**i * reward.gather(-1, following))
+        last = torch.where(is_over, last, following)
+        is_over = is_over | done.gather(-1, following)
+    return total, last

@@ -1,0 +1,226 @@
+"""H-PPO: the ratios, the advantages, whose rows count, and that the whole learns a problem with a known optimum."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch.distributions import Categorical, Normal
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import keys
+from hpamdp.policies.low_level.hppo import HPPO, KEY_LOG_PROB, PARAMETER_LOG_PROB, RAW
+from hpamdp.specs import PAMDPSpecs
+
+SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
+
+OPTIONS = dict(
+    hidden_dims=[32, 32], critic_hidden_dims=[32, 32], initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
+    max_scale=1.0, epochs=4, minibatch_size=256, clip=0.2, gamma=0.9, gae_lambda=0.8, lr=3e-3, lr_final=3e-4,
+    critic_weight=0.5, key_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_frames=40_000,
+    max_grad_norm=1.0,
+)  # fmt: skip
+
+
+def make(specs: PAMDPSpecs = SPECS, **changes) -> HPPO:
+    torch.manual_seed(0)
+    return HPPO(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+
+
+def one_step_rows(learner: HPPO, num: int) -> TensorDict:
+    """Play a problem of one step, `[num, 1]`: only key 1 pays, most where its parameters are (s0, -s1)/2."""
+    td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1]))
+    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
+    error = (unit[..., 1] - 0.5 * state[..., 0]).square() + (unit[..., 2] + 0.5 * state[..., 1]).square()
+    is_end = torch.ones(num, 1, 1, dtype=torch.bool)
+    td["next"] = {
+        keys.OBSERVATION: torch.zeros_like(state),
+        keys.REWARD: torch.where(td[keys.KEY] == 1, 1.0 - error, -0.5).unsqueeze(-1),
+        keys.DONE: is_end,
+        keys.TERMINATED: is_end,
+    }
+    return td
+
+
+def random_rows(learner: HPPO, num: int, steps: int) -> TensorDict:
+    """Draw transitions `[num, steps]`; the policy pressed the keys, the rest is noise."""
+    td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(num, steps, 4)}, [num, steps]))
+    done = torch.rand(num, steps, 1) < 0.3
+    td["next"] = {
+        keys.OBSERVATION: torch.randn(num, steps, 4),
+        keys.REWARD: torch.randn(num, steps, 1),
+        keys.DONE: done,
+        keys.TERMINATED: done & (torch.rand(num, steps, 1) < 0.5),
+    }
+    return td
+
+
+def everything(td: TensorDict) -> torch.Tensor:
+    return torch.ones(td.shape, dtype=torch.bool)
+
+
+def test_the_log_ratios_are_those_of_the_key_and_of_its_own_parameters():
+    learner = make()
+    td = random_rows(learner, 50, 2)
+    key, raw = td[keys.KEY], td[RAW]
+    with torch.no_grad():
+        learner.actor.key_head.bias.add_(torch.tensor([0.3, -0.2, 0.1]))
+        learner.actor.parameter_head.bias.add_(0.2 * torch.arange(6))
+        now = learner.actor(td[keys.OBSERVATION])
+        of_key, of_parameters = now.log_prob(key, raw)
+    torch.testing.assert_close(of_key, Categorical(logits=now.key_log_probs).log_prob(key))
+    single = Normal(now.mean, now.log_scale.exp()).log_prob(raw)
+    own = {0: single[..., 0], 1: single[..., 1] + single[..., 2], 2: torch.zeros(50, 2)}
+    for k, expected in own.items():
+        torch.testing.assert_close(of_parameters[key == k], expected[key == k])
+    before = td[PARAMETER_LOG_PROB]
+    assert (before[key == 2] == 0).all() and (of_parameters - before)[key != 2].abs().min() > 0
+
+
+def test_the_parameters_of_other_keys_move_nothing():
+    learner = make()
+    td = random_rows(learner, 50, 2)
+    other = ~SPECS.parameter_mask[td[keys.KEY]]
+    changed = td[RAW] + 7.0 * other
+    now = learner.actor(td[keys.OBSERVATION])
+    torch.testing.assert_close(now.log_prob(td[keys.KEY], changed), now.log_prob(td[keys.KEY], td[RAW]))
+
+
+def test_the_ratios_are_one_before_the_first_update():
+    learner = make()
+    td = random_rows(learner, 50, 4)
+    of_key, of_parameters = learner.actor(td[keys.OBSERVATION].flatten(0, 1)).log_prob(
+        td[keys.KEY].flatten(), td[RAW].flatten(0, 1)
+    )
+    torch.testing.assert_close(of_key, td[KEY_LOG_PROB].flatten(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(of_parameters, td[PARAMETER_LOG_PROB].flatten(), atol=1e-5, rtol=0)
+
+
+def test_the_surrogate_stops_rewarding_beyond_the_clip():
+    ratio, advantage = torch.tensor([0.5, 1.0, 1.5, 0.5, 1.5]), torch.tensor([1.0, 1.0, 1.0, -1.0, -1.0])
+    expected = torch.tensor([0.5, 1.0, 1.2, -0.8, -1.5])
+    torch.testing.assert_close(make().surrogate(ratio.log(), advantage), expected)
+
+
+def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():
+    learner = make()
+    td = random_rows(learner, 3, 4)
+    # Terminated in the middle; truncated there; going on. The second half of row 0 is another option's.
+    done = torch.tensor([[0, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=torch.bool).unsqueeze(-1)
+    td["next", keys.DONE], td["next", keys.TERMINATED] = done, done.clone()
+    td["next", keys.TERMINATED][1:] = False
+    mask = everything(td)
+    mask[0, 2:] = False
+    advantage, target = learner.advantages(td, mask)
+    with torch.no_grad():
+        value = learner.critic(td[keys.OBSERVATION]).squeeze(-1)
+        next_value = learner.critic(td["next", keys.OBSERVATION]).squeeze(-1)
+    reward = td["next", keys.REWARD].squeeze(-1)
+    for row in range(3):
+        trace = 0.0
+        for t in (3, 2, 1, 0):
+            is_terminated, is_done = (td["next", name][row, t, 0] for name in (keys.TERMINATED, keys.DONE))
+            delta = reward[row, t] + 0.9 * next_value[row, t] * ~is_terminated - value[row, t]
+            trace = delta + 0.9 * 0.8 * trace * ~is_done
+            if mask[row, t]:
+                torch.testing.assert_close(advantage[row, t], trace)
+                torch.testing.assert_close(target[row, t], trace + value[row, t])
+
+
+def test_what_others_did_changes_nothing():
+    learners = make(minibatch_size=64), make(minibatch_size=64)
+    td = random_rows(learners[0], 64, 6)
+    starts = td["next", keys.DONE].squeeze(-1).cumsum(1).roll(1, 1)
+    starts[:, 0] = 0
+    mask = starts % 2 == 0
+    other = td.clone()
+    for leaf in (keys.OBSERVATION, RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB, keys.DURATION):
+        other[leaf][~mask] = 1e3
+        other["next", keys.OBSERVATION][~mask] = torch.nan
+    other["next", keys.REWARD][~mask] = torch.nan
+    for learner, batch in zip(learners, (td, other), strict=True):
+        torch.manual_seed(1)
+        assert learner.learn(batch, mask)
+    for one, two in zip(*(learner.parameters() for learner in learners), strict=True):
+        assert one.isfinite().all() and torch.equal(one, two)
+
+
+def test_the_learner_finds_the_key_and_parameters_that_pay():
+    learner = make()
+    for _ in range(40):
+        td = one_step_rows(learner, 1000)
+        scalars = learner.learn(td, everything(td))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        td = one_step_rows(learner, 1000)
+    assert (td[keys.KEY] == 1).float().mean() > 0.99
+    assert td["next", keys.REWARD].mean() > 0.98, "random presses earn about -0.3, the optimum 1"
+    assert scalars["scale"] < 0.5
+
+
+def test_parameters_stay_in_bounds_and_the_greedy_policy_draws_nothing():
+    learner = make()
+    td = TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500])
+    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
+    duration = learner.policy(td.clone())[keys.DURATION]
+    assert (duration >= low).all() and (duration <= high).all()
+    state = torch.get_rng_state()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        acted = learner.policy(td.clone())
+    assert torch.equal(torch.get_rng_state(), state)
+    with torch.no_grad():
+        now = learner.actor(td[keys.OBSERVATION])
+    assert torch.equal(acted[keys.KEY], now.key_log_probs.argmax(-1)) and torch.equal(acted[RAW], now.mean)
+    assert set(learner.policy.out_keys) <= set(acted.keys(include_nested=True, leaves_only=True))
+
+
+def test_keys_are_drawn_with_their_probability_and_parameters_with_their_deviation():
+    learner = make()
+    with torch.no_grad():
+        learner.actor.key_head.bias.copy_(torch.tensor([0.6, 0.3, 0.1]).log())
+    td = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(20_000, 4)}, [20_000]))
+    share = td[keys.KEY].bincount(minlength=3) / 20_000
+    torch.testing.assert_close(share, torch.tensor([0.6, 0.3, 0.1]), atol=0.02, rtol=0)
+    torch.testing.assert_close(td[RAW].std(0), torch.full((3,), 0.5), atol=0.02, rtol=0)
+
+
+def test_keys_without_parameters_are_learned_like_others():
+    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()))
+    for _ in range(15):
+        td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(512, 1, 4)}, [512, 1]))
+        is_end = torch.ones(512, 1, 1, dtype=torch.bool)
+        reward = (td[keys.KEY] == 1).float().unsqueeze(-1)
+        td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward}
+        td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
+        learner.learn(td, everything(td))
+    assert td[keys.DURATION].shape == (512, 1, 0) and reward.mean() > 0.95
+
+
+def test_rates_fall_with_the_presses_of_the_whole_run():
+    learner = make(anneal_frames=200, minibatch_size=2)
+    td = random_rows(learner, 50, 2)
+    mask = everything(td)
+    mask[1:] = False
+    rates, scales = [], []
+    for _ in range(4):
+        learner.learn(td, mask)
+        rates.append(learner.optimiser.param_groups[0]["lr"])
+        scales.append(learner.actor.log_min_scale.exp().item())
+    assert rates == pytest.approx([3e-3, 1.65e-3, 3e-4, 3e-4])
+    assert scales == pytest.approx([0.05, 0.0005**0.5, 0.01, 0.01])
+
+
+def test_too_few_rows_wait_for_more_and_survive_a_state_dict():
+    learner, other = make(minibatch_size=150), make(minibatch_size=150)
+    first, second = random_rows(learner, 50, 2), random_rows(learner, 50, 2)
+    before = learner.actor.key_head.weight.clone()
+    assert learner.learn(first, everything(first)) == {}
+    assert torch.equal(learner.actor.key_head.weight, before)
+    other.load_state_dict(learner.state_dict())
+    for one in (learner, other):
+        torch.manual_seed(1)
+        assert one.learn(second, everything(second)) and not one.waiting
+    assert not torch.equal(learner.actor.key_head.weight, before)
+    assert torch.equal(learner.actor.key_head.weight, other.actor.key_head.weight)
+
+
+def test_a_scale_outside_its_range_is_refused():
+    with pytest.raises(ValueError, match=r"initial_scale=2.0: must lie between min_scale=0.05 and max_scale=1.0"):
+        make(initial_scale=2.0)

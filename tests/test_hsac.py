@@ -1,0 +1,218 @@
+"""Hybrid SAC: densities, soft targets, actor loss, temperatures, and a problem with a known optimum."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.modules import TanhNormal
+
+from hpamdp import keys
+from hpamdp.policies.low_level.hsac import HSAC, HybridDistribution
+from hpamdp.specs import PAMDPSpecs
+
+SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
+
+OPTIONS = dict(
+    hidden_dims=[64, 64], min_scale=0.01, max_scale=1.0, key_temperature=0.05, parameter_temperature=0.03,
+    tune_key_temperature=True, tune_parameter_temperature=True, key_target_entropy=0.1, parameter_target_entropy=-1.5,
+    temperature_lr=3e-3, warmup_frames=1000, buffer_size=20_000, batch_size=64, updates_per_frame=0.12,
+    policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
+)  # fmt: skip
+
+
+def make(specs: PAMDPSpecs = SPECS, **changes) -> HSAC:
+    return HSAC(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+
+
+def states(num: int) -> TensorDict:
+    return TensorDict({keys.OBSERVATION: torch.rand(num, 4) * 2 - 1}, [num])
+
+
+def one_step_rows(learner: HSAC, num: int) -> TensorDict:
+    """Play a problem of one step: key 1 pays the more the nearer its parameters are to (s0, -s1), key 2 a bit."""
+    td = learner.policy(states(num))
+    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
+    error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
+    payoff = torch.stack([torch.full_like(error, -0.5), 1.0 - error, torch.full_like(error, 0.2)], -1)
+    is_end = torch.ones(num, 1, dtype=torch.bool)
+    reward = payoff.gather(-1, td[keys.KEY].unsqueeze(-1))
+    td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.TERMINATED: is_end}
+    return td
+
+
+def sample(num: int = 32) -> TensorDict:
+    """Return transitions as they come out of the replay buffer."""
+    return TensorDict(
+        {
+            "state": torch.randn(num, 4),
+            "key": torch.randint(3, (num,)),
+            "unit": torch.rand(num, 3) * 2 - 1,
+            "reward": torch.randn(num),
+            "next_state": torch.randn(num, 4),
+            "terminated": torch.zeros(num),
+        },
+        [num],
+    )
+
+
+def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Tensor) -> float:
+    """Return the value of a single state `[1, 4]` for the parameters that the generator as it stands would draw."""
+    key_log_probs, mean, scale = learner.actor(state)
+    raw = mean + scale * torch.randn_like(mean)
+    pi, unit = key_log_probs.exp()[0], raw.tanh()[0].tolist()
+    gaussian = torch.distributions.Normal(mean, scale).log_prob(raw)[0].tolist()
+    log_density = [g - math.log(1.0 - x * x) for g, x in zip(gaussian, unit, strict=True)]
+    value = 0.0
+    for k, own in enumerate([[0], [1, 2], []]):
+        seen = torch.tensor([[x if i in own else 0.0 for i, x in enumerate(unit)]])
+        q = min(member[0, k].item() for member in critics.net(torch.cat([state, seen], -1)))
+        q -= OPTIONS["key_temperature"] * key_log_probs[0, k].item()
+        q -= OPTIONS["parameter_temperature"] * sum(log_density[i] for i in own)
+        value += pi[k].item() * q
+    return value
+
+
+def test_the_learner_finds_the_key_and_parameters_that_pay():
+    torch.manual_seed(0)
+    learner = make()
+    for _ in range(40):
+        learner.learn(one_step_rows(learner, 200), torch.ones(200, dtype=torch.bool))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rows = one_step_rows(learner, 1000)
+    assert (rows[keys.KEY] == 1).float().mean() > 0.98
+    assert rows["next", keys.REWARD].mean() > 0.9, "random presses earn about -0.2, key 2 alone 0.2, the optimum 1"
+
+
+def test_densities_are_those_of_torchrls_squashed_gaussian_and_finite_at_the_bounds():
+    mean, scale = torch.randn(64, 3), torch.rand(64, 3) + 0.1
+    unit, log_density = HybridDistribution(torch.zeros(64, 2), mean, scale).draw_parameters()
+    expected = TanhNormal(mean, scale, event_dims=0).log_prob(unit)
+    torch.testing.assert_close(log_density, expected, rtol=1e-3, atol=1e-3)
+    far = HybridDistribution(torch.zeros(1, 2), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1))
+    assert far.draw_parameters()[1].isfinite().all()
+
+
+def test_keys_are_drawn_with_their_probabilities():
+    torch.manual_seed(0)
+    pi = torch.tensor([0.5, 0.3, 0.2])
+    drawn = HybridDistribution(pi.log().expand(20_000, 3), torch.zeros(()), torch.ones(())).draw_keys()
+    torch.testing.assert_close(drawn.bincount() / 20_000, pi, rtol=0.0, atol=0.015)
+
+
+def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone():
+    learner, batch = make(), sample(1)
+    learner.target_critics.load_state_dict(make().critics.state_dict())
+    torch.manual_seed(3)
+    target = learner._target(batch)
+    torch.manual_seed(3)
+    value = soft_value_by_hand(learner, learner.target_critics, batch["next_state"])
+    # A truncated transition is one that is not terminated.
+    torch.testing.assert_close(target, batch["reward"] + OPTIONS["gamma"] * value)
+    batch["terminated"] = torch.ones(1)
+    torch.testing.assert_close(learner._target(batch), batch["reward"])
+
+
+def test_stored_rows_keep_termination_and_drop_truncation_and_the_rows_of_others():
+    learner = make(warmup_frames=10_000)
+    rows = one_step_rows(learner, 4)
+    rows["next", keys.TERMINATED] = torch.tensor([[True], [False], [False], [True]])
+    rows["next", keys.TRUNCATED] = torch.tensor([[False], [True], [False], [False]])
+    rows["next", keys.DONE] = rows["next", keys.TERMINATED] | rows["next", keys.TRUNCATED]
+    learner.learn(rows, torch.tensor([True, True, True, False]))
+    assert learner.frames == 3 and learner.buffer[:]["terminated"].tolist() == [1.0, 0.0, 0.0]
+
+
+def test_the_actor_loss_equals_that_computed_by_hand_and_leaves_the_critics_alone():
+    learner, state = make(), torch.randn(1, 4)
+    torch.manual_seed(4)
+    expected = -soft_value_by_hand(learner, learner.critics, state)
+    before = {name: value.clone() for name, value in learner.state_dict().items()}
+    torch.manual_seed(4)
+    loss = learner._update_actor(state)["actor"]
+    assert loss.item() == pytest.approx(expected, rel=1e-4, abs=1e-5)
+    moved = {name for name, value in learner.state_dict().items() if not torch.equal(value, before[name])}
+    assert moved and all(name.startswith(("actor.", "policy.actor.")) for name in moved)
+    assert all(p.grad is None and p.requires_grad for p in learner.critics.parameters())
+
+
+@pytest.mark.parametrize("key", [0, 1, 2])
+def test_only_the_executed_keys_parameters_count_in_the_entropy(key):
+    learner, state = make(), torch.randn(64, 4)
+    with torch.no_grad():
+        learner.actor.net[-1].bias[:3] = 50.0 * torch.eye(3)[key]
+    torch.manual_seed(5)
+    log_density = learner.actor(state).draw_parameters()[1]
+    torch.manual_seed(5)
+    _, key_excess, parameter_excess = learner.soft_value(learner.critics, state)
+    own = [[0], [1, 2], []][key]
+    target = OPTIONS["parameter_target_entropy"] * len(own)
+    torch.testing.assert_close(parameter_excess, -log_density[:, own].sum(-1) - target)
+    torch.testing.assert_close(key_excess, torch.full((64,), -OPTIONS["key_target_entropy"] * math.log(3.0)))
+
+
+@pytest.mark.parametrize("excess", [0.5, -0.5])
+@pytest.mark.parametrize("is_tuned", [True, False])
+def test_a_temperature_falls_above_its_target_rises_below_and_stays_where_it_is_fixed(excess, is_tuned):
+    learner = make(tune_parameter_temperature=is_tuned)
+    learner._update_temperatures(torch.tensor(-excess), torch.tensor(excess))
+    key_weight, parameter_weight = (weight.item() for weight in learner.temperatures())
+    assert (key_weight > OPTIONS["key_temperature"]) == (excess > 0.0)
+    change = parameter_weight / OPTIONS["parameter_temperature"] - 1.0
+    assert change * excess < -1e-6 if is_tuned else abs(change) < 1e-6
+
+
+def test_with_both_temperatures_fixed_updates_leave_them_as_they_are():
+    learner = make(tune_key_temperature=False, tune_parameter_temperature=False, policy_delay=1)
+    before = learner.temperatures()
+    learner._update(sample(), {})
+    assert learner.temperatures() == before
+
+
+def test_the_greedy_policy_draws_nothing_and_the_exploring_one_is_uniform_in_the_warm_up_alone():
+    learner, td = make(), states(2000)
+    before = torch.get_rng_state()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        greedy = learner.policy(td.clone())
+    assert torch.equal(torch.get_rng_state(), before)
+    distribution = learner.actor(td[keys.OBSERVATION])
+    assert torch.equal(greedy[keys.KEY], distribution.key_log_probs.argmax(-1))
+    torch.testing.assert_close(SPECS.to_unit(greedy[keys.DURATION]), distribution.mean.tanh())
+    random = SPECS.to_unit(learner.policy(td.clone())[keys.DURATION])
+    torch.testing.assert_close(random.std(0), torch.full((3,), 3.0**-0.5), rtol=0.05, atol=0.0)
+    learner.policy.is_random.fill_(False)
+    with torch.no_grad():
+        learner.actor.net[-1].bias[-3:] = -50.0  # the smallest deviation
+    drawn = SPECS.to_unit(learner.policy(td.clone())[keys.DURATION])
+    assert (drawn - SPECS.to_unit(greedy[keys.DURATION])).std() < 0.02
+
+
+def test_keys_without_parameters_work():
+    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
+    td = learner.policy(states(200))
+    assert td[keys.DURATION].shape == (200, 0)
+    is_end = torch.ones(200, 1, dtype=torch.bool)
+    reward = td[keys.KEY].float().unsqueeze(-1)
+    td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward, keys.TERMINATED: is_end}
+    for _ in range(4):
+        learner.learn(td, is_end.squeeze(-1))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert (learner.policy(states(100))[keys.KEY] == 1).all()
+
+
+@pytest.mark.parametrize("is_random", [True, False])
+def test_a_policy_takes_any_batch_shape_and_stays_in_bounds(is_random):
+    learner = make()
+    learner.policy.is_random.fill_(is_random)
+    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
+    for shape in ((), (3,), (3, 200)):
+        td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(*shape, 4) * 30}, shape))
+        duration = td[keys.DURATION]
+        assert td[keys.KEY].shape == shape and duration.shape == (*shape, 3)
+        assert (duration >= low).all() and (duration <= high).all()
+
+
+def test_a_range_of_deviations_that_is_empty_is_refused():
+    with pytest.raises(ValueError, match="min_scale"):
+        make(min_scale=1.0)

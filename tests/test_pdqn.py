@@ -1,0 +1,232 @@
+"""P-DQN and MP-DQN: who sees which parameters, targets, n-step returns, and a problem with a known optimum."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import keys
+from hpamdp.policies.low_level.pdqn import PDQN, InvertingGradients
+from hpamdp.specs import PAMDPSpecs
+
+SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
+
+OPTIONS = dict(
+    multipass=True, twin_q=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
+    n_step=1, bounding="tanh", hidden_dims=[64, 64], warmup_frames=1000, buffer_size=20_000, batch_size=64,
+    updates_per_frame=0.12, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
+    max_grad_norm=None, parameter_noise=0.1, epsilon_final=0.1, epsilon_frames=3000,
+)  # fmt: skip
+PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
+
+
+def make(specs: PAMDPSpecs = SPECS, **changes) -> PDQN:
+    return PDQN(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+
+
+def states(num: int) -> TensorDict:
+    return TensorDict({keys.OBSERVATION: torch.rand(num, 4) * 2 - 1}, [num])
+
+
+def one_step_rows(learner: PDQN, num: int) -> TensorDict:
+    """Play a problem of one step: key 1 pays the more the nearer its parameters are to (s0, -s1), key 2 a bit."""
+    td = learner.policy(states(num))
+    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
+    error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
+    payoff = torch.stack([torch.full_like(error, -0.5), 1.0 - error, torch.full_like(error, 0.2)], -1)
+    is_end = torch.ones(num, 1, dtype=torch.bool)
+    reward = payoff.gather(-1, td[keys.KEY].unsqueeze(-1))
+    td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.DONE: is_end, keys.TERMINATED: is_end}
+    return td.unsqueeze(-1)
+
+
+def learn(learner: PDQN, num_batches: int, size: int = 200) -> None:
+    for _ in range(num_batches):
+        learner.learn(one_step_rows(learner, size), torch.ones(size, 1, dtype=torch.bool))
+
+
+def sample(learner: PDQN, num: int = 32) -> TensorDict:
+    """Return transitions as they come out of the replay buffer."""
+    return TensorDict(
+        {
+            "state": torch.randn(num, 4),
+            "key": torch.randint(3, (num,)),
+            "unit": torch.rand(num, 3) * 2 - 1,
+            "reward": torch.randn(num),
+            "next_state": torch.randn(num, 4),
+            "discount": torch.rand(num),
+        },
+        [num],
+    )
+
+
+@pytest.mark.parametrize("changes", [{}, PUBLISHED, {"bounding": "inverting_gradients", "double_q": True}])
+def test_the_learner_finds_the_key_and_parameters_that_pay(changes):
+    torch.manual_seed(0)
+    learner = make(**changes)
+    learn(learner, 40)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        rows = one_step_rows(learner, 1000)
+    assert (rows[keys.KEY] == 1).float().mean() > 0.98
+    assert rows["next", keys.REWARD].mean() > 0.9, "random presses earn about -0.2, key 2 alone 0.2, the optimum 1"
+
+
+@pytest.mark.parametrize("multipass", [True, False])
+def test_a_keys_value_depends_on_its_own_parameters_alone_only_with_multipass(multipass):
+    learner = make(multipass=multipass)
+    unit = (torch.rand(8, 3) * 2 - 1).requires_grad_()
+    q = learner.critics(torch.randn(8, 4), unit)
+    for k in range(3):
+        (gradient,) = torch.autograd.grad(q[..., k].sum(), unit, retain_graph=True)
+        is_seen = (gradient != 0.0).any(0)
+        assert torch.equal(is_seen, SPECS.parameter_mask[k] if multipass else torch.ones(3, dtype=torch.bool))
+
+
+@pytest.mark.parametrize("multipass", [True, False])
+def test_the_value_of_the_pressed_key_is_that_of_the_full_pass(multipass):
+    learner, batch = make(multipass=multipass), sample(make())
+    full = learner.critics(batch["state"], batch["unit"])
+    expected = full[:, torch.arange(32), batch["key"]]
+    torch.testing.assert_close(learner.critics.of_key(batch["state"], batch["key"], batch["unit"]), expected)
+
+
+def test_the_parameter_update_moves_the_actor_and_leaves_the_critics_alone():
+    learner = make()
+    before = {name: value.clone() for name, value in learner.state_dict().items()}
+    learner._update_actor(torch.randn(32, 4))
+    moved = {name for name, value in learner.state_dict().items() if not torch.equal(value, before[name])}
+    assert moved and all(name.startswith(("actor.", "policy.actor.")) for name in moved)
+    assert all(p.grad is None and p.requires_grad for p in learner.critics.parameters())
+
+
+@pytest.mark.parametrize("twin_q", [True, False])
+@pytest.mark.parametrize("double_q", [True, False])
+def test_targets_equal_those_computed_by_hand(twin_q, double_q):
+    torch.manual_seed(0)
+    learner, other = make(twin_q=twin_q, double_q=double_q, target_smoothing=0.0), make(twin_q=twin_q)
+    learner.target_actor.load_state_dict(other.actor.state_dict())
+    learner.target_critics.load_state_dict(other.critics.state_dict())
+    batch = sample(learner, 200)
+    target = learner._target(batch)
+    choices = set()
+    for i in range(200):
+        state = batch["next_state"][i : i + 1]
+        unit = learner.target_actor(state)
+        # `[E][K]`: every member's value of every key.
+        online, slow = (net(state, unit)[:, 0].tolist() for net in (learner.critics, learner.target_critics))
+        lowest = [min(values) for values in zip(*slow, strict=True)]
+        judge = [min(values) for values in zip(*online, strict=True)] if double_q else lowest
+        choices.add(judge.index(max(judge)) == lowest.index(max(lowest)))
+        expected = batch["reward"][i] + batch["discount"][i] * lowest[judge.index(max(judge))]
+        torch.testing.assert_close(target[i], expected)
+    assert choices == ({True, False} if double_q else {True}), "the two choices of the key must differ somewhere"
+
+
+def test_target_smoothing_is_bounded():
+    batch = sample(make())
+    learner = make(multipass=False, target_smoothing=100.0, target_smoothing_clip=0.0)
+    smooth = learner._target(batch)
+    learner.target_smoothing = 0.0
+    torch.testing.assert_close(learner._target(batch), smooth)
+    learner.target_smoothing, learner.target_smoothing_clip = 0.5, 0.5
+    assert not torch.allclose(learner._target(batch), smooth)
+
+
+def test_returns_over_several_steps_end_with_episodes_and_bootstrap_where_they_should():
+    learner = make(n_step=3, warmup_frames=10_000)
+    # Environment 0: an episode terminated by its third step, then another; environment 1: truncated by its second.
+    reward = torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0], [1.0, 2.0, 4.0, 8.0, 16.0]])
+    terminated = torch.tensor([[0, 0, 1, 0, 0], [0, 0, 0, 0, 0]], dtype=torch.bool)
+    done = terminated | torch.tensor([[0, 0, 0, 0, 0], [0, 1, 0, 0, 0]], dtype=torch.bool)
+    state = torch.arange(10.0).reshape(2, 5, 1).expand(2, 5, 4)
+    batch = TensorDict(
+        {
+            keys.OBSERVATION: state,
+            keys.ACTION: {"key": torch.zeros(2, 5, dtype=torch.long), "duration": torch.ones(2, 5, 3)},
+            "next": {
+                keys.OBSERVATION: state + 100.0,
+                keys.REWARD: reward.unsqueeze(-1),
+                keys.DONE: done.unsqueeze(-1),
+                keys.TERMINATED: terminated.unsqueeze(-1),
+            },
+        },
+        [2, 5],
+    )
+    # Another option's learner has environment 1's first episode.
+    mask = torch.ones(2, 5, dtype=torch.bool)
+    mask[1, :2] = False
+    learner.learn(batch, mask)
+    stored = learner.buffer[:]
+    assert stored["state"][:, 0].tolist() == [0, 1, 2, 3, 4, 7, 8, 9]
+    g = 0.9
+    expected = [1 + 2 * g + 4 * g**2, 2 + 4 * g, 4, 8 + 16 * g, 16, 4 + 8 * g + 16 * g**2, 8 + 16 * g, 16]
+    torch.testing.assert_close(stored["reward"], torch.tensor(expected))
+    torch.testing.assert_close(stored["discount"], torch.tensor([0, 0, 0, g**2, g, g**3, g**2, g]))
+    assert stored["next_state"][:, 0].tolist() == [102, 102, 102, 104, 104, 109, 109, 109]
+    truncated = learner._transitions(batch)[1, :2]
+    torch.testing.assert_close(truncated["reward"], torch.tensor([1 + 2 * g, 2]))
+    torch.testing.assert_close(truncated["discount"], torch.tensor([g**2, g]))
+    assert truncated["next_state"][:, 0].tolist() == [106, 106]
+
+
+def test_inverting_gradients_follow_the_formula_and_turn_back_past_the_bounds():
+    raw = torch.tensor([-1.5, -1.0, 0.0, 0.5, 1.0, 1.5], requires_grad=True)
+    clipped = InvertingGradients.apply(raw)
+    assert clipped.tolist() == [-1.0, -1.0, 0.0, 0.5, 1.0, 1.0]
+    # Ascending 2x: the gradient times (upper - x) / (upper - lower); descending: times (x - lower) / (upper - lower).
+    (up,) = torch.autograd.grad(-2.0 * clipped.sum(), raw, retain_graph=True)
+    torch.testing.assert_close(-up, 2.0 * (1.0 - raw.detach()) / 2.0)
+    (down,) = torch.autograd.grad(2.0 * clipped.sum(), raw)
+    torch.testing.assert_close(down, 2.0 * (raw.detach() + 1.0) / 2.0)
+
+
+@pytest.mark.parametrize("bounding", ["tanh", "inverting_gradients"])
+def test_parameters_stay_in_bounds(bounding):
+    learner = make(bounding=bounding, parameter_noise=1.0)
+    learner.policy.epsilon.fill_(0.1)
+    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
+    duration = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500]))[keys.DURATION]
+    assert (duration >= low).all() and (duration <= high).all()
+
+
+def test_the_greedy_policy_draws_nothing_and_the_exploring_one_moves_key_and_parameters():
+    learner, td = make(), states(500)
+    before = torch.get_rng_state()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        greedy = learner.policy(td.clone())
+    assert torch.equal(torch.get_rng_state(), before)
+    random = learner.policy(td.clone())
+    assert random[keys.KEY].unique().tolist() == [0, 1, 2]
+    learner.policy.epsilon.zero_()
+    noisy = learner.policy(td.clone())
+    assert torch.equal(noisy[keys.KEY], greedy[keys.KEY])
+    moved = SPECS.to_unit(noisy[keys.DURATION]) - SPECS.to_unit(greedy[keys.DURATION])
+    assert 0.08 < moved.std() < 0.12
+
+
+def test_keys_without_parameters_work():
+    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
+    td = learner.policy(states(200))
+    assert td[keys.DURATION].shape == (200, 0)
+    is_end = torch.ones(200, 1, dtype=torch.bool)
+    reward = td[keys.KEY].float().unsqueeze(-1)
+    td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward}
+    td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
+    for _ in range(4):
+        learner.learn(td.unsqueeze(-1), is_end)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert (learner.policy(states(100))[keys.KEY] == 1).all()
+
+
+def test_a_policy_takes_any_batch_shape():
+    learner = make()
+    for shape in ((), (3,), (3, 2)):
+        td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(*shape, 4)}, shape))
+        assert td[keys.KEY].shape == shape and td[keys.DURATION].shape == (*shape, 3)
+
+
+def test_clipped_gradients_have_at_most_the_norm_asked_for():
+    learner = make(max_grad_norm=1e-3)
+    learner._update(sample(learner), {})
+    norm = torch.stack([p.grad.norm() for p in learner.critics.parameters()]).norm()
+    assert norm <= 1.001e-3
