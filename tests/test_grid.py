@@ -14,10 +14,15 @@ from hpamdp.train import run
 
 # What makes a learner's training short; a learner that is not named needs nothing.
 SHORT = {
+    "dlpa": [
+        *("low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16", "low.hidden_dims=[16,16]"),
+        *("low.num_samples=16", "low.num_elites=4", "low.num_iterations=2"),
+    ],
     "hppo": ["low.minibatch_size=16"],
     "hsac": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "hyar": ["low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
+    "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
 SMALL = ["num_envs=16", "steps_per_batch=4", "total_frames=256", "eval.layouts=10", "eval.every=0", "log_every=0"]
 

@@ -40,7 +40,7 @@ class BoatDockEnv(EnvBase):
         motor_noise: standard deviation of the log of the executed duration.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_physics: compile the pure step, reset and observation functions (the first steps take about a minute).
+        compile_physics: compile the pure step, reset and observation functions (takes two or three minutes).
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `key`, `duration` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.

@@ -83,12 +83,14 @@ def draw_layout(key: Tensor) -> Layout:
         squared = start + goal - 2.0 * (start * goal).sqrt() * turn.cos()
         return squared < (MIN_SEPARATION / LAYOUT_RADIUS) ** 2
 
-    start, goal, turn = attempt(0)
-    for i in range(1, _TRIES):
-        near = is_near(start, goal, turn)
-        start, goal, turn = (torch.where(near, n, o) for n, o in zip(attempt(3 * i), (start, goal, turn), strict=True))
-    near = is_near(start, goal, turn)
-    goal, turn = torch.where(near, 0.25, goal), torch.where(near, math.pi, turn)
+    # Each try is judged on its own and the first good one taken: a chain in which every try depends on the one before
+    # takes the compiler minutes.
+    tries = [attempt(3 * i) for i in range(_TRIES)]
+    near = [is_near(*each) for each in tries]
+    start, goal, turn = tries[-1]
+    goal, turn = torch.where(near[-1], 0.25, goal), torch.where(near[-1], math.pi, turn)
+    for each, is_too_near in zip(tries[-2::-1], near[-2::-1], strict=True):
+        start, goal, turn = (torch.where(is_too_near, o, n) for n, o in zip(each, (start, goal, turn), strict=True))
 
     angle = 2.0 * math.pi * counter_rng.uniform(key, _DRAW_ANGLE)
     start, goal = LAYOUT_RADIUS * start.sqrt(), LAYOUT_RADIUS * goal.sqrt()

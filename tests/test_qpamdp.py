@@ -1,0 +1,268 @@
+"""Q-PAMDP: both halves by themselves against known answers, and how they take turns."""
+
+import itertools
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import keys
+from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, SarsaLambda, fourier_coefficients
+from hpamdp.specs import PAMDPSpecs
+
+# Two keys with a parameter each and one without.
+SPECS = PAMDPSpecs(2, (), (1, 1, 0), (0.0, -2.0), (2.0, 2.0))
+
+OPTIONS = dict(
+    features=None, phi_order=1, phi_max_coupled=2, psi_order=1, psi_max_coupled=1, warmup_frames=100,
+    initial_episodes=100, relearning_episodes=100, gamma=0.9, trace_decay=0.5, step_size=1.0, temperature=0.5,
+    parameter_updates=3, patience=2, rollouts=100, natural_step_size=1.0, max_divergence=1.0, ridge=1e-6,
+    initial_mean=0.0, sigma=0.2, sigma_final=0.1, sigma_decay=0.9,
+)  # fmt: skip
+
+GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)
+
+
+def make(specs: PAMDPSpecs = SPECS, **changes) -> QPAMDP:
+    return QPAMDP(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+
+
+def play(learner: QPAMDP, num_envs: int = 64, num_steps: int = 2) -> TensorDict:
+    """Play episodes of one press: the nearer key 0's parameter is to -.4 and key 1's to .6, the higher the reward."""
+    td = TensorDict({keys.OBSERVATION: torch.rand(num_envs, num_steps, learner.specs.observation_dim)})
+    td.batch_size = [num_envs, num_steps]
+    td = learner.policy(td)
+    optimum = torch.tensor([-0.4, 0.6])[: learner.specs.num_parameters]
+    own = learner.specs.parameter_mask[td[keys.KEY]]
+    error = ((learner.specs.to_unit(td[keys.DURATION]) - optimum).square() * own).sum(-1, keepdim=True)
+    done = torch.ones(num_envs, num_steps, 1, dtype=torch.bool)
+    td["next"] = {
+        keys.OBSERVATION: torch.rand_like(td[keys.OBSERVATION]),
+        keys.REWARD: 1.0 + 0.2 * td[keys.KEY].unsqueeze(-1) - error,
+        keys.TERMINATED: done,
+        keys.DONE: done.clone(),
+    }
+    return td
+
+
+def learn(learner: QPAMDP, num_batches: int, **sizes: int) -> dict[str, float]:
+    for _ in range(num_batches):
+        batch = play(learner, **sizes)
+        scalars = learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
+    return scalars
+
+
+def ready(**changes) -> QPAMDP:
+    learner = make(**changes)
+    learn(learner, 1)
+    return learner
+
+
+@pytest.mark.parametrize(
+    ("num_inputs", "order", "max_coupled"), [(1, 3, 1), (3, 2, 1), (3, 2, 2), (3, 2, 3), (2, 4, 9)]
+)
+def test_the_fourier_basis_has_every_term_that_couples_few_enough_inputs(num_inputs, order, max_coupled):
+    rows = fourier_coefficients(num_inputs, order, max_coupled).long().tolist()
+    everything = itertools.product(range(order + 1), repeat=num_inputs)
+    expected = [row for row in everything if sum(c > 0 for c in row) <= max_coupled]
+    assert sorted(map(tuple, rows)) == sorted(expected) and rows[0] == [0] * num_inputs
+
+
+def test_features_are_cosines_of_the_entries_that_vary_scaled_to_their_range():
+    learner = make(phi_order=2, phi_max_coupled=1, warmup_frames=4)
+    batch = play(learner, 2, 2)
+    batch[keys.OBSERVATION] = torch.tensor([[[3.0, 7.0], [5.0, 7.0]], [[4.0, 7.0], [3.5, 7.0]]])
+    learner.learn(batch, torch.ones(2, 2, dtype=torch.bool))
+    features = learner.policy.phi(torch.tensor([[3.0, 0.0], [3.5, 0.0], [5.0, 0.0]]))
+    expected = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.5**0.5, 0.0], [1.0, -1.0, 1.0]])
+    torch.testing.assert_close(features, expected, atol=1e-6, rtol=0.0)
+
+
+def test_entries_that_are_not_there_are_refused():
+    with pytest.raises(ValueError, match="entries 0 to 1"):
+        make(features=[0, 2])
+
+
+def sarsa_rows(phi, next_phi, key, reward, terminated, done) -> TensorDict:
+    rows = {"phi": torch.tensor(phi), "next_phi": torch.tensor(next_phi), "key": torch.tensor(key)}
+    rows |= {"reward": torch.tensor(reward), "terminated": torch.tensor(terminated), "done": torch.tensor(done)}
+    return TensorDict({**rows, "mask": torch.ones(2, len(key[0]), dtype=torch.bool)}, [2, len(key[0])])
+
+
+def test_sarsa_does_what_a_computation_by_hand_gives():
+    # One feature, two keys, gamma .5, lambda .5, a step too small for the bound to matter.
+    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.1, temperature=1.0)
+    w = torch.tensor([[1.0], [2.0]])
+    # Environment 0 goes on, environment 1 ends its episode with the first press.
+    phi, next_phi = [[[1.0], [2.0]], [[1.0], [1.0]]], [[[2.0], [1.0]], [[9.0], [2.0]]]
+    ends = [[False, True], [True, False]]
+    first = sarsa_rows(phi, next_phi, [[0, 1], [1, 0]], [[1.0, 0.0], [0.0, 1.0]], ends, ends)
+    got, _ = sarsa.update(w, first)
+    # Press 1: errors 1 + .5 * (2 * 2) - 1 = 2 along key 0's trace 1; 0 - 2 = -2 along key 1's trace 1.
+    w1 = [1.0 + 0.1 * 0.5 * 2.0, 2.0 - 0.1 * 0.5 * 2.0]
+    # Press 2: environment 0 ends: traces (.25, 2), error -2 w[1]; 1: traces (1, 0), next key unknown.
+    q = torch.tensor(w1) * 2.0
+    error_0, error_1 = -2.0 * w1[1], 1.0 + 0.5 * float((q.softmax(0) * q).sum()) - w1[0]
+    w2 = [w1[0] + 0.05 * (0.25 * error_0 + error_1), w1[1] + 0.05 * 2.0 * error_0]
+    torch.testing.assert_close(got, torch.tensor(w2).unsqueeze(-1))
+    torch.testing.assert_close(sarsa.traces.squeeze(-1), torch.tensor([[0.0, 0.0], [1.0, 0.0]]))
+
+    # The next batch: environment 1's trace goes on, environment 0 begins anew; both end.
+    ends = [[True], [True]]
+    second = sarsa_rows([[[1.0]], [[2.0]]], [[[0.0]], [[0.0]]], [[0], [1]], [[1.0], [1.0]], ends, ends)
+    got, _ = sarsa.update(torch.tensor(w2).unsqueeze(-1), second)
+    error_0, error_1 = 1.0 - w2[0], 1.0 - 2.0 * w2[1]
+    w3 = [w2[0] + 0.05 * (error_0 + 0.25 * error_1), w2[1] + 0.05 * 2.0 * error_1]
+    torch.testing.assert_close(got, torch.tensor(w3).unsqueeze(-1))
+    assert (sarsa.traces == 0.0).all()
+
+
+def test_the_bound_shortens_sarsas_step_to_one_that_cancels_the_error():
+    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=1.0, temperature=1.0)
+    ends = [[True], [True]]
+    rows = sarsa_rows([[[3.0]], [[3.0]]], [[[0.0]], [[0.0]]], [[0], [0]], [[6.0], [6.0]], ends, ends)
+    got, error = sarsa.update(torch.zeros(2, 1), rows)
+    torch.testing.assert_close(got, torch.tensor([[2.0], [0.0]]))
+    assert error == 36.0
+
+
+def test_the_natural_gradient_leads_to_the_optimum():
+    torch.manual_seed(0)
+    learner = ready(
+        initial_episodes=100, parameter_updates=1000, rollouts=2000, natural_step_size=10.0, max_divergence=10.0
+    )
+    learn(learner, 60, num_envs=500)
+    mean = learner.policy.psi(torch.rand(200, 2)) @ learner.policy.theta.T
+    torch.testing.assert_close(mean, torch.tensor([-0.4, 0.6]).expand(200, 2), atol=0.08, rtol=0.0)
+
+
+def test_the_regression_is_least_squares_on_whole_episodes_that_span_batches():
+    learner = ready(parameter_updates=1000, rollouts=10_000, ridge=0.0, initial_episodes=1)
+    learn(learner, 1)
+    assert learner.phase == PARAMETERS
+    batches = [play(learner, 40, 3) for _ in range(6)]
+    generator = torch.Generator().manual_seed(1)
+    done = torch.rand(40, 18, generator=generator) < 0.4
+    enac = learner.enac
+    enac.restart(enac.regressors.shape[1], torch.arange(40) % 2 == 0)
+    for i, batch in enumerate(batches):
+        batch["next", keys.DONE] = done[:, 3 * i : 3 * i + 3].unsqueeze(-1)
+        learner.learn(batch, torch.ones(40, 3, dtype=torch.bool))
+    x, y = [], []
+    rows = learner._rows(torch.cat(batches, 1), torch.ones(40, 18, dtype=torch.bool))
+    for env in range(40):
+        start = 0 if env % 2 == 0 else None
+        for end in done[env].nonzero().flatten().tolist():
+            if start is not None:
+                gradient = rows["gradient"][env, start : end + 1].sum(0)
+                x.append(torch.cat([gradient, rows["phi"][env, start]]))
+                y.append(rows["reward"][env, start : end + 1].sum())
+            start = end + 1
+    solution = torch.linalg.lstsq(torch.stack(x).double(), torch.stack(y).double().unsqueeze(-1)).solution.squeeze(-1)
+    num_weights = learner.policy.theta.numel()
+    assert enac.num_episodes == len(x)
+    torch.testing.assert_close(
+        enac.natural_gradient(num_weights)[0].double(), solution[:num_weights], atol=1e-3, rtol=1e-3
+    )
+
+
+def test_the_phases_take_turns_and_freeze_the_other_half():
+    torch.manual_seed(0)
+    learner = ready()
+    phases = []
+    for _ in range(25):
+        phase, w, theta = int(learner.phase), learner.policy.w.clone(), learner.policy.theta.clone()
+        updates = int(learner.updates)
+        learn(learner, 1, num_envs=50)
+        assert torch.equal(w, learner.policy.w) == (phase == PARAMETERS)
+        assert torch.equal(theta, learner.policy.theta) == (updates == learner.updates)
+        phases.append(phase)
+    # 100 episodes a batch: one of Sarsa, three updates of a batch each, and again.
+    assert phases == ([SARSA] + 3 * [PARAMETERS]) * 6 + [SARSA]
+    assert learner.updates == 18
+
+
+def test_without_a_number_of_updates_a_turn_lasts_until_the_return_sets_no_more_records():
+    torch.manual_seed(0)
+    learner = ready(parameter_updates=None, patience=4, rollouts=400, max_divergence=0.05)
+    turns = [0]
+    for _ in range(150):
+        phase = int(learner.phase)
+        learn(learner, 1, num_envs=200)
+        turns[-1] += 1
+        if learner.phase != phase:
+            turns.append(0)
+    assert len(turns) > 4 and turns[1] > 5, "the first parameter phase has the most to gain"
+    assert (learner.policy.theta[:, 0] - torch.tensor([-0.4, 0.6])).abs().max() < 0.1
+
+
+def test_sigma_is_the_standard_deviation_of_the_parameters():
+    torch.manual_seed(0)
+    learner = make(sigma=0.3, initial_mean=0.1)
+    td = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(50_000, 2)}, [50_000]))
+    torch.testing.assert_close(td[RAW].std(0), torch.full((2,), 0.3), atol=0.01, rtol=0.0)
+    torch.testing.assert_close(td[RAW].mean(0), torch.full((2,), 0.1), atol=0.01, rtol=0.0)
+    learn(learner, 2)
+    assert learner.phase == PARAMETERS
+    learn(learner, 20)
+    assert learner.policy.sigma == pytest.approx(0.1), "decayed to its lower limit"
+
+
+@pytest.mark.parametrize("dims", [(0, 0), (0, 2, 1)])
+def test_keys_of_any_number_of_parameters_work(dims):
+    torch.manual_seed(0)
+    specs = PAMDPSpecs(2, (), dims, (0.0,) * sum(dims), (1.0,) * sum(dims))
+    learner = make(specs, step_size=0.5)
+    for _ in range(30):
+        td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(64, 2, 2)}, [64, 2]))
+        done = torch.ones(64, 2, 1, dtype=torch.bool)
+        reward = (td[keys.KEY] == 1).float().unsqueeze(-1)
+        td["next"] = {
+            keys.OBSERVATION: torch.rand(64, 2, 2),
+            keys.REWARD: reward,
+            keys.TERMINATED: done,
+            keys.DONE: done,
+        }
+        learner.learn(td, torch.ones(64, 2, dtype=torch.bool))
+    assert learner.updates > 0 and learner.policy.theta.isfinite().all()
+    with GREEDY:
+        td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(64, 2)}, [64]))
+    assert (td[keys.KEY] == 1).all() and td[keys.DURATION].shape == (64, sum(dims))
+
+
+def test_the_greedy_policy_draws_nothing_and_stays_in_bounds():
+    learner = ready(sigma=3.0)
+    td = TensorDict({keys.OBSERVATION: torch.rand(100, 2)}, [100])
+    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
+    duration = learner.policy(td.clone())[keys.DURATION]
+    assert (duration >= low).all() and (duration <= high).all()
+    state = torch.get_rng_state()
+    with GREEDY:
+        td = learner.policy(td)
+    assert torch.equal(state, torch.get_rng_state())
+    torch.testing.assert_close(td[RAW], learner.policy.psi(td[keys.OBSERVATION]) @ learner.policy.theta.T)
+
+
+def test_rows_of_another_learner_change_nothing():
+    learners = [ready(), ready()]
+    learners[1].load_state_dict(learners[0].state_dict())
+    batch, mask = play(learners[0], 20, 2), (torch.arange(20) < 10).unsqueeze(-1).expand(20, 2)
+    other = batch.clone()
+    other["next", keys.REWARD][10:] = 100.0
+    for learner, rows in zip(learners, (batch, other), strict=True):
+        learner.learn(rows, mask)
+    assert torch.equal(learners[0].policy.w, learners[1].policy.w)
+    assert learners[0].window_episodes == 20
+
+
+def test_a_saved_state_fits_a_new_learner_and_goes_on_the_same():
+    torch.manual_seed(0)
+    learner, other = make(), make()
+    learn(learner, 5)
+    other.load_state_dict(learner.state_dict())
+    batch = play(learner, num_envs=64)
+    for one in (learner, other):
+        one.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
+    for name, value in learner.state_dict().items():
+        torch.testing.assert_close(value, other.state_dict()[name])
