@@ -66,7 +66,7 @@ def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[
         return episode.reset(moved, over, seed, environment, rules), reward, moved.outcome
 
     if is_compiled:
-        press = torch.compile(press, fullgraph=True, dynamic=False)
+        press = torch.compile(press, **episode.COMPILE_ARGUMENTS)
     env = BoatDockEnv(num_envs, device=device)
     actions = random_actions(env)
     env.reset()

@@ -40,7 +40,7 @@ class BoatDockEnv(EnvBase):
         motor_noise: standard deviation of the log of the executed duration.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_physics: compile the pure step, reset and observation functions (takes two or three minutes).
+        compile_physics: compile the pure step, reset and observation functions (takes about half a minute).
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `key`, `duration` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
@@ -78,7 +78,7 @@ class BoatDockEnv(EnvBase):
         self._pure_step, self._pure_reset, self._pure_read = episode.step, episode.reset, episode.read
         if compile_physics:
             self._pure_step, self._pure_reset, self._pure_read = (
-                torch.compile(function, fullgraph=True, dynamic=False)
+                torch.compile(function, **episode.COMPILE_ARGUMENTS)
                 for function in (episode.step, episode.reset, episode.read)
             )
         self._environment = torch.arange(num_envs, dtype=torch.int32, device=self.device)

@@ -25,6 +25,14 @@ OBSERVATION_NAMES = (
 )
 SCALED_NAMES = (*OBSERVATION_NAMES, "to_goal_x", "to_goal_y")
 
+# How to compile the functions of this file. Every step of the random numbers' hash reads its input twice, so inlining
+# the steps into one another, as the compiler does by default, takes it minutes; these thresholds make it seconds.
+COMPILE_ARGUMENTS = {
+    "fullgraph": True,
+    "dynamic": False,
+    "options": {"realize_opcount_threshold": 8, "realize_reads_threshold": 2},
+}
+
 # A press takes 16 draws of its episode's noise key; Gaussian number i takes draws 2i and 2i + 1.
 _DRAWS_A_PRESS = 16
 _SLIP, _SLIPPED_KEY, _MOTOR, _SENSOR = 0, 1, 1, 2

@@ -83,8 +83,7 @@ def draw_layout(key: Tensor) -> Layout:
         squared = start + goal - 2.0 * (start * goal).sqrt() * turn.cos()
         return squared < (MIN_SEPARATION / LAYOUT_RADIUS) ** 2
 
-    # Each try is judged on its own and the first good one taken: a chain in which every try depends on the one before
-    # takes the compiler minutes.
+    # Each try is judged on its own, and the first good one is taken.
     tries = [attempt(3 * i) for i in range(_TRIES)]
     near = [is_near(*each) for each in tries]
     start, goal, turn = tries[-1]
