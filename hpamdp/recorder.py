@@ -32,6 +32,8 @@ class Recorder:
         self.metrics = MetricsFile(output_dir / "metrics.csv")
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
+        # The last evaluation, as long as the agent has not learned since.
+        self._played: dict[str, np.ndarray] | None = None
         self._random = self._measure(parts.evaluation.run(random_policy(parts)))
 
     def resume_from(self, folder: Path, frames: int) -> None:
@@ -46,12 +48,13 @@ class Recorder:
             ended.set(keys.OPTION, batch.get(keys.OPTION)[is_end])
         self._ended.append(ended)
         self._scalars |= scalars
+        self._played = None
 
     def log(self, frames: int, wall_s: float, is_evaluated: bool) -> dict[str, float]:
         """Write a row, with an evaluation if asked for, and return it."""
         row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
         if is_evaluated:
-            measured = self._measure(self.parts.evaluation.run(self.parts.agent.policy))
+            measured = self._measure(self._play())
             row |= {f"eval/{name}": value for name, value in measured.items()}
         self.metrics.append(row)
         self.parts.logger.log(row, frames)
@@ -60,7 +63,7 @@ class Recorder:
 
     def finish(self, frames: int, wall_s: float) -> str:
         """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
-        played = self.parts.evaluation.run(self.parts.agent.policy)
+        played = self._play()
         np.savez_compressed(self.output_dir / "evaluation.npz", **played)
         summary = summarise(self.cfg, self._measure(played), self._random, frames, wall_s)
         (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
@@ -69,6 +72,11 @@ class Recorder:
         logger.summary(summary)
         logger.close()
         return closing_table(summary)
+
+    def _play(self) -> dict[str, np.ndarray]:
+        if self._played is None:
+            self._played = self.parts.evaluation.run(self.parts.agent.policy)
+        return self._played
 
     def _measure(self, played: dict[str, np.ndarray]) -> dict[str, float]:
         return measure(played, has_choice=self.parts.agent.selector is not None)

@@ -40,9 +40,9 @@ class BoatDockOracle:
         """Plan for the boats of `rows` bool `[N]` from where they are."""
         boats = BoatState(*(column[rows] for column in state))
         plans = [self._plan_with(boats, controller) for controller in range(_num_plans(self.rules))]
-        self.option[rows] = torch.stack([plan.score for plan in plans], -1).argmax(-1)
-        self.keys[rows] = torch.stack([plan.keys for plan in plans], 1)
-        self.durations[rows] = torch.stack([plan.durations for plan in plans], 1)
+        stacked = planner.Plan(*(torch.stack(fields, 1) for fields in zip(*plans, strict=True)))
+        self.option[rows] = planner.better_option(stacked)
+        self.keys[rows], self.durations[rows] = stacked.keys, stacked.durations
 
     def _plan_with(self, boats: BoatState, controller: int) -> planner.Plan:
         if self.rules.controller == "choose":

@@ -55,6 +55,12 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim))
 
 
+def move_towards(target: nn.Module, source: nn.Module, tau: float) -> None:
+    """Move a target network's parameters the share `tau` of the way to those of the learned one."""
+    for t, s in zip(target.parameters(), source.parameters(), strict=True):
+        t.lerp_(s.detach(), tau)
+
+
 class KeyCritics(nn.Module):
     """`num_members` independent Q(s, k, x) of every key k.
 

@@ -36,7 +36,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
-from hpamdp.policies.nets import KeyCritics, mlp
+from hpamdp.policies.nets import KeyCritics, mlp, move_towards
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -228,7 +228,7 @@ class HSAC(Learner):
         if self.updates % self.policy_delay == 0:
             recorded |= self._update_actor(batch["state"])
             self._update_temperatures(recorded["key_excess"], recorded["parameter_excess"])
-        torch._foreach_lerp_(list(self.target_critics.parameters()), list(self.critics.parameters()), self.tau)
+        move_towards(self.target_critics, self.critics, self.tau)
         for name, value in recorded.items():
             losses.setdefault(name, []).append(value.detach())
 

@@ -31,7 +31,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
-from hpamdp.policies.nets import EnsembleMLP, mlp
+from hpamdp.policies.nets import EnsembleMLP, mlp, move_towards
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -291,9 +291,8 @@ class HyAR(Learner):
             _step(self.optimisers["actor"], actor_loss)
             self.critics.requires_grad_(True)
             recorded["actor"] = actor_loss
-            for target, source in ((self.target_actor, self.actor), (self.target_critics, self.critics)):
-                for t, s in zip(target.parameters(), source.parameters(), strict=True):
-                    t.lerp_(s.detach(), self.tau)
+            move_towards(self.target_actor, self.actor, self.tau)
+            move_towards(self.target_critics, self.critics, self.tau)
         if self.updates % self.codec_every == 0:
             self._update_codec(batch, losses)
             if self.updates % (100 * self.codec_every) == 0:

@@ -34,7 +34,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
-from hpamdp.policies.nets import KeyCritics, mlp
+from hpamdp.policies.nets import KeyCritics, mlp, move_towards
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -201,12 +201,8 @@ class PDQN(Learner):
         recorded = {"critic": critic_loss, "q": q.mean()}
         if self.updates % self.policy_delay == 0:
             recorded["actor"] = self._update_actor(state)
-            for target, source, tau in (
-                (self.target_actor, self.actor, self.actor_tau),
-                (self.target_critics, self.critics, self.critic_tau),
-            ):
-                for t, s in zip(target.parameters(), source.parameters(), strict=True):
-                    t.lerp_(s.detach(), tau)
+            move_towards(self.target_actor, self.actor, self.actor_tau)
+            move_towards(self.target_critics, self.critics, self.critic_tau)
         for name, value in recorded.items():
             losses.setdefault(name, []).append(value.detach())
 
