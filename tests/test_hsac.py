@@ -51,7 +51,7 @@ def sample(num: int = 32) -> TensorDict:
             "unit": torch.rand(num, 3) * 2 - 1,
             "reward": torch.randn(num),
             "next_state": torch.randn(num, 4),
-            "terminated": torch.zeros(num),
+            "discount": torch.full((num,), OPTIONS["gamma"]),
         },
         [num],
     )
@@ -108,20 +108,20 @@ def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone
     target = learner._target(batch)
     torch.manual_seed(3)
     value = soft_value_by_hand(learner, learner.target_critics, batch["next_state"])
-    # A truncated transition is one that is not terminated.
     torch.testing.assert_close(target, batch["reward"] + OPTIONS["gamma"] * value)
-    batch["terminated"] = torch.ones(1)
+    batch["discount"] = torch.zeros(1)
     torch.testing.assert_close(learner._target(batch), batch["reward"])
 
 
-def test_stored_rows_keep_termination_and_drop_truncation_and_the_rows_of_others():
+def test_stored_rows_are_discounted_by_0_at_termination_alone_and_those_of_others_dropped():
     learner = make(warmup_frames=10_000)
     rows = one_step_rows(learner, 4)
     rows["next", keys.TERMINATED] = torch.tensor([[True], [False], [False], [True]])
     rows["next", keys.TRUNCATED] = torch.tensor([[False], [True], [False], [False]])
     rows["next", keys.DONE] = rows["next", keys.TERMINATED] | rows["next", keys.TRUNCATED]
     learner.learn(rows, torch.tensor([True, True, True, False]))
-    assert learner.frames == 3 and learner.buffer[:]["terminated"].tolist() == [1.0, 0.0, 0.0]
+    assert learner.frames == 3
+    torch.testing.assert_close(learner.buffer[:]["discount"], torch.tensor([0.0, 0.9, 0.9]))
 
 
 def test_the_actor_loss_equals_that_computed_by_hand_and_leaves_the_critics_alone():
@@ -166,7 +166,7 @@ def test_a_temperature_falls_above_its_target_rises_below_and_stays_where_it_is_
 def test_with_both_temperatures_fixed_updates_leave_them_as_they_are():
     learner = make(tune_key_temperature=False, tune_parameter_temperature=False, policy_delay=1)
     before = learner.temperatures()
-    learner._update(sample(), {})
+    learner.update(sample())
     assert learner.temperatures() == before
 
 

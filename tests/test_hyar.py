@@ -120,7 +120,7 @@ def test_only_its_own_rows_reach_the_learner():
 
 def test_targets_bootstrap_past_truncation_and_not_past_termination(trained):
     rows = trained.buffer.sample(64)
-    rows["terminated"] = torch.ones(64)
+    rows["discount"] = torch.zeros(64)
     torch.testing.assert_close(trained._target(rows), rows["reward"])
-    rows["terminated"] = torch.zeros(64)
+    rows["discount"] = torch.full((64,), 0.9)
     assert (trained._target(rows) - rows["reward"]).abs().mean() > 0.05

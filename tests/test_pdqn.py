@@ -163,7 +163,7 @@ def test_returns_over_several_steps_end_with_episodes_and_bootstrap_where_they_s
     torch.testing.assert_close(stored["reward"], torch.tensor(expected))
     torch.testing.assert_close(stored["discount"], torch.tensor([0, 0, 0, g**2, g, g**3, g**2, g]))
     assert stored["next_state"][:, 0].tolist() == [102, 102, 102, 104, 104, 109, 109, 109]
-    truncated = learner._transitions(batch)[1, :2]
+    truncated = learner.transitions(batch)[1, :2]
     torch.testing.assert_close(truncated["reward"], torch.tensor([1 + 2 * g, 2]))
     torch.testing.assert_close(truncated["discount"], torch.tensor([g**2, g]))
     assert truncated["next_state"][:, 0].tolist() == [106, 106]
@@ -227,6 +227,6 @@ def test_a_policy_takes_any_batch_shape():
 
 def test_clipped_gradients_have_at_most_the_norm_asked_for():
     learner = make(max_grad_norm=1e-3)
-    learner._update(sample(learner), {})
+    learner.update(sample(learner))
     norm = torch.stack([p.grad.norm() for p in learner.critics.parameters()]).norm()
     assert norm <= 1.001e-3

@@ -23,20 +23,19 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
 from hpamdp.policies.nets import KeyCritics, mlp, move_towards
+from hpamdp.policies.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -103,7 +102,7 @@ class HSACPolicy(TensorDictModuleBase):
         return td.update({keys.ACTION: {"key": key, "duration": self.specs.from_unit(unit)}})
 
 
-class HSAC(Learner):
+class HSAC(ReplayLearner):
     """Soft policy iteration over keys and their parameters, from a replay buffer of its own."""
 
     def __init__(
@@ -133,11 +132,18 @@ class HSAC(Learner):
     ) -> None:
         if not min_scale < max_scale:
             raise ValueError(f"min_scale={min_scale}: must lie below max_scale={max_scale}")
-        super().__init__(specs)
+        super().__init__(
+            specs,
+            device,
+            gamma=gamma,
+            warmup_frames=warmup_frames,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=updates_per_frame,
+        )
         self.key_target_entropy = key_target_entropy * math.log(specs.num_keys)
         self.parameter_target_entropy = parameter_target_entropy
-        self.warmup_frames, self.batch_size, self.updates_per_frame = warmup_frames, batch_size, updates_per_frame
-        self.policy_delay, self.gamma, self.tau = policy_delay, gamma, tau
+        self.policy_delay, self.tau = policy_delay, tau
 
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale))
         self.critics = KeyCritics(specs, 2, hidden_dims, is_multipass=True)
@@ -149,8 +155,6 @@ class HSAC(Learner):
             torch.tensor(math.log(parameter_temperature)), requires_grad=tune_parameter_temperature
         )
         self.policy = HSACPolicy(self.actor, specs)
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.to(device)
         temperatures = [self.log_key_temperature, self.log_parameter_temperature]
         self.optimisers = {
@@ -158,33 +162,10 @@ class HSAC(Learner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
             "temperatures": torch.optim.Adam(temperatures, lr=temperature_lr, fused=True),
         }
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
-    def stateful(self) -> dict[str, Any]:
-        """Return the optimisers and the replay buffer."""
-        return {**self.optimisers, "buffer": self.buffer}
-
-    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Store the batch's transitions; once the warm-up is over, update critics, actor and temperatures."""
-        rows = self._transitions(batch[mask])
-        if rows.shape[0] == 0:
-            return {}
-        self.buffer.extend(rows)
-        before, self.frames = int(self.frames), self.frames + rows.shape[0]
-        frames = int(self.frames)
-        if frames < self.warmup_frames:
-            return {}
+    def explore(self, frames: int) -> None:
+        """Leave the presses to the actor."""
         self.policy.is_random.fill_(False)
-        due = int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
-        losses: dict[str, list[Tensor]] = {}
-        if due:
-            # One draw for all updates: the buffer's own overhead is as long as a forward pass.
-            for sample in self.buffer.sample(due * self.batch_size).split(self.batch_size):
-                self._update(sample, losses)
-        scalars = {name: torch.stack(values).mean().item() for name, values in losses.items()}
-        key_temperature, parameter_temperature = (temperature.item() for temperature in self.temperatures())
-        scalars |= {"key_temperature": key_temperature, "parameter_temperature": parameter_temperature}
-        return {**scalars, "updates": self.updates.item()}
 
     def temperatures(self) -> tuple[Tensor, Tensor]:
         """Return the weights of the keys' and of the parameters' entropy, which carry no gradient."""
@@ -206,44 +187,32 @@ class HSAC(Learner):
         own_target = self.parameter_target_entropy * critics.mask.sum(-1)
         return (pi * q).sum(-1), key_excess, -(pi * (own_log_density + own_target)).sum(-1)
 
-    def _transitions(self, rows: TensorDictBase) -> TensorDict:
-        return TensorDict(
-            {
-                "state": rows[keys.OBSERVATION],
-                "key": rows[keys.KEY],
-                "unit": self.specs.to_unit(rows[keys.DURATION]),
-                "reward": rows["next", keys.REWARD].squeeze(-1),
-                "next_state": rows["next", keys.OBSERVATION],
-                "terminated": rows["next", keys.TERMINATED].squeeze(-1).float(),
-            },
-            batch_size=rows.shape,
-        )
-
-    def _update(self, batch: TensorDictBase, losses: dict[str, list[Tensor]]) -> None:
-        self.updates += 1
-        q = self.critics.of_key(batch["state"], batch["key"], batch["unit"])
-        critic_loss = (q - self._target(batch)).square().mean(-1).sum()
-        self._step("critics", critic_loss)
-        recorded = {"critic": critic_loss, "q": q.mean()}
+    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update the critics, now and then also actor and temperatures."""
+        q = self.critics.of_key(sample["state"], sample["key"], sample["unit"])
+        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
+        self.descend("critics", critic_loss)
+        key_temperature, parameter_temperature = self.temperatures()
+        scalars = {"critic": critic_loss, "q": q.mean()}
+        scalars |= {"key_temperature": key_temperature, "parameter_temperature": parameter_temperature}
         if self.updates % self.policy_delay == 0:
-            recorded |= self._update_actor(batch["state"])
-            self._update_temperatures(recorded["key_excess"], recorded["parameter_excess"])
+            scalars |= self._update_actor(sample["state"])
+            self._update_temperatures(scalars["key_excess"], scalars["parameter_excess"])
         move_towards(self.target_critics, self.critics, self.tau)
-        for name, value in recorded.items():
-            losses.setdefault(name, []).append(value.detach())
+        return scalars
 
     def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + gamma (1 - terminated) V'(s'), `[B]`."""
+        """Return r + discount V'(s'), `[B]`, where the discount is 0 after a termination."""
         with torch.no_grad():
             value, _, _ = self.soft_value(self.target_critics, batch["next_state"])
-            return batch["reward"] + self.gamma * (1.0 - batch["terminated"]) * value
+            return batch["reward"] + batch["discount"] * value
 
     def _update_actor(self, state: Tensor) -> dict[str, Tensor]:
         """Let the actor ascend the soft value; return the loss and the mean entropies less their targets."""
         self.critics.requires_grad_(False)
         value, key_excess, parameter_excess = self.soft_value(self.critics, state)
         loss = -value.mean()
-        self._step("actor", loss)
+        self.descend("actor", loss)
         self.critics.requires_grad_(True)
         return {"actor": loss, "key_excess": key_excess.mean(), "parameter_excess": parameter_excess.mean()}
 
@@ -252,10 +221,4 @@ class HSAC(Learner):
         loss = self.log_key_temperature * key_excess.detach()
         loss = loss + self.log_parameter_temperature * parameter_excess.detach()
         if loss.requires_grad:
-            self._step("temperatures", loss)
-
-    def _step(self, name: str, loss: Tensor) -> None:
-        optimiser = self.optimisers[name]
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
+            self.descend("temperatures", loss)

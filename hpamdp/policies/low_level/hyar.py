@@ -18,7 +18,7 @@ Differs from the source:
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -26,12 +26,11 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
 from hpamdp.policies.nets import EnsembleMLP, mlp, move_towards
+from hpamdp.policies.replay import ReplayLearner, falling_share
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -123,7 +122,7 @@ class HyARPolicy(TensorDictModuleBase):
         return key, self.codec.decode(state, key, self.codec.z_from_unit(z))[0]
 
 
-class HyAR(Learner):
+class HyAR(ReplayLearner):
     """TD3 over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
     def __init__(
@@ -157,16 +156,19 @@ class HyAR(Learner):
         epsilon_final: Annotated[float, Field(ge=0.0, le=1.0)],
         epsilon_frames: NonNegativeInt,
     ) -> None:
-        super().__init__(specs)
-        self.warmup_frames, self.codec_pretrain_updates, self.codec_every = (
-            warmup_frames,
-            codec_pretrain_updates,
-            codec_every,
+        super().__init__(
+            specs,
+            device,
+            gamma=gamma,
+            warmup_frames=warmup_frames,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=updates_per_frame,
         )
+        self.codec_pretrain_updates, self.codec_every = codec_pretrain_updates, codec_every
         self.kl_weight, self.dynamics_weight, self.latent_coverage = kl_weight, dynamics_weight, latent_coverage
-        self.correction_threshold = correction_threshold
-        self.batch_size, self.updates_per_frame, self.gamma, self.tau = batch_size, updates_per_frame, gamma, tau
-        self.policy_delay, self.target_noise, self.target_noise_clip = policy_delay, target_noise, target_noise_clip
+        self.correction_threshold, self.tau, self.policy_delay = correction_threshold, tau, policy_delay
+        self.target_noise, self.target_noise_clip = target_noise, target_noise_clip
         self.epsilon_final, self.epsilon_frames = epsilon_final, epsilon_frames
 
         action_dim = key_dim + latent_dim
@@ -176,61 +178,29 @@ class HyAR(Learner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HyARPolicy(self.actor, self.codec, specs, exploration_noise)
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimisers = {
             "codec": torch.optim.Adam(self.codec.parameters(), lr=codec_lr, fused=True),
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
-    def stateful(self) -> dict[str, Any]:
-        """Return the optimisers and the replay buffer."""
-        return {**self.optimisers, "buffer": self.buffer}
+    def explore(self, frames: int) -> None:
+        """Let the share of random presses fall."""
+        self.policy.epsilon.fill_(falling_share(frames, self.epsilon_frames, self.epsilon_final))
 
-    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Store the batch's transitions; train the codec once the warm-up is over, then codec and TD3 together."""
-        rows = self._transitions(batch[mask])
-        if rows.shape[0] == 0:
-            return {}
-        self.buffer.extend(rows)
-        before, self.frames = self.frames.clone(), self.frames + rows.shape[0]
-        if self.frames < self.warmup_frames:
-            return {}
-        losses: dict[str, list[Tensor]] = {}
-        if before < self.warmup_frames:
-            self._pretrain_codec(losses)
-        progress = float(self.frames - self.warmup_frames) / max(1, self.epsilon_frames)
-        self.policy.epsilon.fill_(1.0 + (self.epsilon_final - 1.0) * min(1.0, progress))
-        due = int(self.frames * self.updates_per_frame) - int(before * self.updates_per_frame)
-        for _ in range(due):
-            self._update(losses)
-        scalars = {name: torch.stack(values).mean().item() for name, values in losses.items()}
-        return {**scalars, "epsilon": self.policy.epsilon.item(), "updates": self.updates.item()}
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return the rows to store with the latent actions that the actor gave."""
+        return super().transitions(batch).set(LATENT, batch[LATENT])
 
-    def _transitions(self, rows: TensorDictBase) -> TensorDict:
-        return TensorDict(
-            {
-                "state": rows[keys.OBSERVATION],
-                "key": rows[keys.KEY],
-                "unit": self.specs.to_unit(rows[keys.DURATION]),
-                "latent": rows[LATENT],
-                "reward": rows["next", keys.REWARD].squeeze(-1),
-                "next_state": rows["next", keys.OBSERVATION],
-                "terminated": rows["next", keys.TERMINATED].squeeze(-1).float(),
-            },
-            batch_size=rows.shape,
-        )
-
-    def _pretrain_codec(self, losses: dict[str, list[Tensor]]) -> None:
+    def start(self) -> None:
+        """Train the codec alone."""
         seen = self.buffer[:]
         change = seen["next_state"] - seen["state"]
         # Entries that never change (the harbour's) keep a scale that makes them weigh nothing.
         self.codec.change_scale.copy_(change.std(0).clamp(min=1e-2))
         for _ in range(self.codec_pretrain_updates):
-            self._update_codec(self.buffer.sample(self.batch_size), losses)
+            self._update_codec(self.buffer.sample(self.batch_size))
         self._fit_latent_range()
 
     def _fit_latent_range(self) -> None:
@@ -243,7 +213,7 @@ class HyAR(Learner):
         self.codec.z_low.copy_(low)
         self.codec.z_high.copy_(torch.maximum(high, low + 1e-3))
 
-    def _update_codec(self, batch: TensorDictBase, losses: dict[str, list[Tensor]]) -> None:
+    def _update_codec(self, batch: TensorDictBase) -> dict[str, Tensor]:
         mean, log_variance = self.codec.encode(batch["state"], batch["key"], batch["unit"])
         z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
         unit, change = self.codec.decode(batch["state"], batch["key"], z)
@@ -253,9 +223,8 @@ class HyAR(Learner):
         target = (batch["next_state"] - batch["state"]) / self.codec.change_scale
         dynamics = F.mse_loss(change, target)
         loss = reconstruction + self.kl_weight * divergence + self.dynamics_weight * dynamics
-        _step(self.optimisers["codec"], loss)
-        for name, value in (("reconstruction", reconstruction), ("kl", divergence), ("dynamics", dynamics)):
-            losses.setdefault(name, []).append(value.detach())
+        self.descend("codec", loss)
+        return {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
 
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return latents `[B, key_dim + latent_dim]` that mean today what was pressed then, and which were redone.
@@ -276,41 +245,36 @@ class HyAR(Learner):
             z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(mean))
         return torch.cat([e, z], -1), ~(is_same_key & is_same_change)
 
-    def _update(self, losses: dict[str, list[Tensor]]) -> None:
-        batch = self.buffer.sample(self.batch_size)
-        self.updates += 1
-        latent, redone = self.corrected_latent(batch)
-        q = self.critics(torch.cat([batch["state"], latent], -1)).squeeze(-1)
-        critic_loss = (q - self._target(batch)).square().mean(-1).sum()
-        _step(self.optimisers["critics"], critic_loss)
-        recorded = {"critic": critic_loss, "redone": redone.float().mean()}
+    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update the critics, now and then also actor, targets and codec."""
+        latent, redone = self.corrected_latent(sample)
+        q = self.critics(torch.cat([sample["state"], latent], -1)).squeeze(-1)
+        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
+        self.descend("critics", critic_loss)
+        scalars = {"critic": critic_loss, "redone": redone.float().mean(), "epsilon": self.policy.epsilon}
         if self.updates % self.policy_delay == 0:
-            self.critics.requires_grad_(False)
-            action = self.actor(batch["state"]).tanh()
-            actor_loss = -self.critics(torch.cat([batch["state"], action], -1))[0].mean()
-            _step(self.optimisers["actor"], actor_loss)
-            self.critics.requires_grad_(True)
-            recorded["actor"] = actor_loss
+            scalars["actor"] = self._update_actor(sample["state"])
             move_towards(self.target_actor, self.actor, self.tau)
             move_towards(self.target_critics, self.critics, self.tau)
         if self.updates % self.codec_every == 0:
-            self._update_codec(batch, losses)
+            scalars |= self._update_codec(sample)
             if self.updates % (100 * self.codec_every) == 0:
                 self._fit_latent_range()
-        for name, value in recorded.items():
-            losses.setdefault(name, []).append(value.detach())
+        return scalars
+
+    def _update_actor(self, state: Tensor) -> Tensor:
+        """Let the latent action ascend the first critic's value; return the loss."""
+        self.critics.requires_grad_(False)
+        loss = -self.critics(torch.cat([state, self.actor(state).tanh()], -1))[0].mean()
+        self.descend("actor", loss)
+        self.critics.requires_grad_(True)
+        return loss
 
     def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + gamma (1 - terminated) min Q'(s', smoothed action of the target actor), `[B]`."""
+        """Return r + discount min Q'(s', smoothed action of the target actor), `[B]`."""
         with torch.no_grad():
             action = self.target_actor(batch["next_state"]).tanh()
             noise = self.target_noise * torch.randn_like(action)
             action = (action + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
             q = self.target_critics(torch.cat([batch["next_state"], action], -1)).squeeze(-1).amin(0)
-            return batch["reward"] + self.gamma * (1.0 - batch["terminated"]) * q
-
-
-def _step(optimiser: torch.optim.Optimizer, loss: Tensor) -> None:
-    optimiser.zero_grad(set_to_none=True)
-    loss.backward()
-    optimiser.step()
+            return batch["reward"] + batch["discount"] * q

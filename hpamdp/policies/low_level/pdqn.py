@@ -29,12 +29,11 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
 from hpamdp.policies.nets import KeyCritics, mlp, move_towards
+from hpamdp.policies.replay import ReplayLearner, falling_share
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -95,7 +94,7 @@ class PDQNPolicy(TensorDictModuleBase):
         return td.set(keys.DURATION, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
 
-class PDQN(Learner):
+class PDQN(ReplayLearner):
     """Q-learning over the keys and gradient ascent on their parameters, from a replay buffer of its own."""
 
     def __init__(
@@ -126,12 +125,18 @@ class PDQN(Learner):
         epsilon_final: Annotated[float, Field(ge=0.0, le=1.0)],
         epsilon_frames: NonNegativeInt,
     ) -> None:
-        super().__init__(specs)
+        super().__init__(
+            specs,
+            device,
+            gamma=gamma,
+            warmup_frames=warmup_frames,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=updates_per_frame,
+        )
         self.double_q, self.policy_delay, self.n_step = double_q, policy_delay, n_step
         self.target_smoothing, self.target_smoothing_clip = target_smoothing, target_smoothing_clip
-        self.warmup_frames, self.batch_size, self.updates_per_frame = warmup_frames, batch_size, updates_per_frame
-        self.gamma, self.actor_tau, self.critic_tau = gamma, actor_tau, critic_tau
-        self.max_grad_norm = max_grad_norm
+        self.actor_tau, self.critic_tau, self.max_grad_norm = actor_tau, critic_tau, max_grad_norm
         self.epsilon_final, self.epsilon_frames = epsilon_final, epsilon_frames
 
         self.actor = ParameterActor(specs, hidden_dims, bounding)
@@ -139,78 +144,45 @@ class PDQN(Learner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = PDQNPolicy(self.actor, self.critics, specs, parameter_noise)
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimisers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
-    def stateful(self) -> dict[str, Any]:
-        """Return the optimisers and the replay buffer."""
-        return {**self.optimisers, "buffer": self.buffer}
+    def explore(self, frames: int) -> None:
+        """Let the share of random presses fall."""
+        self.policy.epsilon.fill_(falling_share(frames, self.epsilon_frames, self.epsilon_final))
 
-    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Store the batch's transitions; once the warm-up is over, update critics and actor."""
-        rows = self._transitions(batch)[mask]
-        if rows.shape[0] == 0:
-            return {}
-        self.buffer.extend(rows)
-        before, self.frames = int(self.frames), self.frames + rows.shape[0]
-        frames = int(self.frames)
-        if frames < self.warmup_frames:
-            return {}
-        progress = (frames - self.warmup_frames) / max(1, self.epsilon_frames)
-        self.policy.epsilon.fill_(1.0 + (self.epsilon_final - 1.0) * min(1.0, progress))
-        due = int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
-        losses: dict[str, list[Tensor]] = {}
-        if due:
-            # One draw for all updates: the buffer's own overhead is as long as a forward pass.
-            for sample in self.buffer.sample(due * self.batch_size).split(self.batch_size):
-                self._update(sample, losses)
-        scalars = {name: torch.stack(values).mean().item() for name, values in losses.items()}
-        return {**scalars, "epsilon": self.policy.epsilon.item(), "updates": self.updates.item()}
-
-    def _transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return what is stored of a batch `[*B, T]`: every row with its n-step return and the state after it."""
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return every row with its n-step return, the state after it and the discount of that state's value."""
+        rows = super().transitions(batch)
         done = batch["next", keys.DONE].squeeze(-1)
-        reward, last = n_step_returns(batch["next", keys.REWARD].squeeze(-1), done, self.n_step, self.gamma)
+        reward, last = n_step_returns(rows["reward"], done, self.n_step, self.gamma)
         steps = last - torch.arange(done.shape[-1], device=last.device) + 1
         goes_on = ~batch["next", keys.TERMINATED].squeeze(-1).gather(-1, last)
-        next_state = batch["next", keys.OBSERVATION]
-        return TensorDict(
-            {
-                "state": batch[keys.OBSERVATION],
-                "key": batch[keys.KEY],
-                "unit": self.specs.to_unit(batch[keys.DURATION]),
-                "reward": reward,
-                "next_state": next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state)),
-                "discount": self.gamma**steps * goes_on,
-            },
-            batch_size=batch.shape,
-        )
+        next_state = rows["next_state"]
+        next_state = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
+        return rows.update({"reward": reward, "next_state": next_state, "discount": self.gamma**steps * goes_on})
 
-    def _update(self, batch: TensorDictBase, losses: dict[str, list[Tensor]]) -> None:
-        self.updates += 1
-        state = batch["state"]
-        q = self.critics.of_key(state, batch["key"], batch["unit"])
-        critic_loss = (q - self._target(batch)).square().mean(-1).sum()
-        self._step("critics", self.critics, critic_loss)
-        recorded = {"critic": critic_loss, "q": q.mean()}
+    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update the critics, now and then also the actor and the targets."""
+        state = sample["state"]
+        q = self.critics.of_key(state, sample["key"], sample["unit"])
+        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
+        self.descend("critics", critic_loss, self.max_grad_norm)
+        scalars = {"critic": critic_loss, "q": q.mean(), "epsilon": self.policy.epsilon}
         if self.updates % self.policy_delay == 0:
-            recorded["actor"] = self._update_actor(state)
+            scalars["actor"] = self._update_actor(state)
             move_towards(self.target_actor, self.actor, self.actor_tau)
             move_towards(self.target_critics, self.critics, self.critic_tau)
-        for name, value in recorded.items():
-            losses.setdefault(name, []).append(value.detach())
+        return scalars
 
     def _update_actor(self, state: Tensor) -> Tensor:
         """Let the parameters of all keys ascend the sum of their values; return the loss."""
         self.critics.requires_grad_(False)
         loss = -self.critics(state, self.actor(state)).amin(0).sum(-1).mean()
-        self._step("actor", self.actor, loss)
+        self.descend("actor", loss, self.max_grad_norm)
         self.critics.requires_grad_(True)
         return loss
 
@@ -227,14 +199,6 @@ class PDQN(Learner):
             choosing = self.critics(state, unit).amin(0) if self.double_q else q
             best = q.gather(-1, choosing.argmax(-1, keepdim=True)).squeeze(-1)
             return batch["reward"] + batch["discount"] * best
-
-    def _step(self, name: str, module: nn.Module, loss: Tensor) -> None:
-        optimiser = self.optimisers[name]
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        if self.max_grad_norm is not None:
-            nn.utils.clip_grad_norm_(module.parameters(), self.max_grad_norm)
-        optimiser.step()
 
 
 def n_step_returns(reward: Tensor, done: Tensor, n: int, gamma: float) -> tuple[Tensor, Tensor]:

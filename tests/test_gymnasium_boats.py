@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import hpamdp
 from hpamdp.env import counter_rng
-from hpamdp.env.gymnasium import BoatDock, BoatDockVector
+from hpamdp.env.gymnasium_boats import BoatDock, BoatDockVector
 from hpamdp.env.rendering import Leg, Scene, draw
 
 ID = "hpamdp/BoatDock-v0"

@@ -1,0 +1,83 @@
+"""What an environment tells the framework beyond TorchRL's own contract."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite
+from torchrl.envs import EnvBase
+
+from hpamdp import keys
+
+
+class PAMDPEnv(EnvBase):
+    """`num_envs` copies of a problem with parameterised actions, in one batch dimension.
+
+    A subclass has the specs: `observation` float32 `[N, observation_dim]`; the action leaves `("action", "key")` int64
+    `[N]` and `("action", "duration")` float32 `[N, num_parameters]`, the bounded parameters of all keys side by side,
+    of which only the pressed key's count; where the agent chooses options, the leaf `option` int64 `[N]`; `reward`,
+    `done`, `terminated`, `truncated` `[N, 1]`, where a time limit is `truncated` only. A step leaves an episode that is
+    over as it is and earns 0.
+    """
+
+    option_names: tuple[str, ...] = ()  # of the options, where there are some
+    parameter_dims: tuple[int, ...]  # how many parameters each key takes
+    max_steps: int  # presses in the longest episode
+    result_keys: ClassVar[tuple[str, ...]] = ()  # leaves of an episode's last step that `results` reads
+
+    @property
+    def has_choice(self) -> bool:
+        """Whether the agent chooses an option."""
+        return keys.OPTION in self.full_action_spec.keys()
+
+    @property
+    def position(self) -> Tensor | None:
+        """Where the agents are, for drawing, `[N, 2]`; None where that means nothing."""
+        return None
+
+    def fixed_episodes(self, seed: int) -> TensorDict | None:
+        """Return what to `reset` with for the evaluation episodes of a seed, one for each environment.
+
+        None: `set_seed(seed)` and a reset without arguments are all that it takes.
+        """
+        return None
+
+    def describe(self) -> dict[str, Tensor]:
+        """Return what is known of the episodes that were just reset, first dimension `N`; computed once a run."""
+        return {}
+
+    def results(self, last: TensorDictBase) -> dict[str, Tensor]:
+        """Return how episodes `[M]` went by their last steps' leaves `result_keys`, each `[M]`.
+
+        A `score` takes the place of the return wherever agents are compared; `success` is bool.
+        """
+        return {}
+
+    def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return means of an evaluation, whose arrays are those of `Evaluation.run`, beside score and success.
+
+        `ceiling` is the best possible mean score on the same episodes, where that is known.
+        """
+        return {}
+
+    def state_columns(self) -> dict[str, Tensor]:
+        """Return all that an episode's future depends on, for a checkpoint; empty where that cannot be had."""
+        return {}
+
+    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+        """Go on where `state_columns` were taken; with none, episodes start anew.
+
+        Raises:
+            ValueError: they are of another number of environments.
+        """
+
+    def make_done_spec(self) -> Composite:
+        """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""
+        flag = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
+        flags = {name: flag.clone() for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
+        return Composite(flags, shape=self.batch_size, device=self.device)

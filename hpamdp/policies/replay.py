@@ -1,0 +1,108 @@
+"""What the off-policy learners have in common: store transitions, then update from samples of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from hpamdp import keys
+from hpamdp.policies.base import Learner
+from hpamdp.specs import PAMDPSpecs
+
+
+class ReplayLearner(Learner):
+    """A learner with a replay buffer of its own, from which it makes `updates_per_frame` updates for each press.
+
+    A subclass fills `optimisers` and writes `update`; the other methods are there to be extended.
+    """
+
+    optimisers: dict[str, torch.optim.Optimizer]
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        gamma: float,
+        warmup_frames: int,
+        buffer_size: int,
+        batch_size: int,
+        updates_per_frame: float,
+    ) -> None:
+        super().__init__(specs)
+        self.gamma, self.warmup_frames = gamma, warmup_frames
+        self.batch_size, self.updates_per_frame = batch_size, updates_per_frame
+        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+
+    def stateful(self) -> dict[str, Any]:
+        """Return the optimisers and the replay buffer."""
+        return {**self.optimisers, "buffer": self.buffer}
+
+    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
+        """Store the batch's transitions; once the warm-up is over, make the updates that are due."""
+        rows = self.transitions(batch)[mask]
+        if not len(rows):
+            return {}
+        self.buffer.extend(rows)
+        before, self.frames = int(self.frames), self.frames + len(rows)
+        frames = int(self.frames)
+        if frames < self.warmup_frames:
+            return {}
+        if before < self.warmup_frames:
+            self.start()
+        self.explore(frames - self.warmup_frames)
+        due = int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
+        losses: dict[str, list[Tensor]] = {}
+        if due:
+            # One draw for all updates: the buffer's own overhead is as long as a forward pass.
+            for sample in self.buffer.sample(due * self.batch_size).split(self.batch_size):
+                self.updates += 1
+                for name, value in self.update(sample).items():
+                    losses.setdefault(name, []).append(value.detach())
+        scalars = {name: torch.stack(values).mean().item() for name, values in losses.items()}
+        return {**scalars, "updates": self.updates.item()}
+
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the step terminated, else gamma."""
+        return TensorDict(
+            {
+                "state": batch[keys.OBSERVATION],
+                "key": batch[keys.KEY],
+                "unit": self.specs.to_unit(batch[keys.DURATION]),
+                "reward": batch["next", keys.REWARD].squeeze(-1),
+                "next_state": batch["next", keys.OBSERVATION],
+                "discount": self.gamma * ~batch["next", keys.TERMINATED].squeeze(-1),
+            },
+            batch_size=batch.shape,
+        )
+
+    def start(self) -> None:
+        """Prepare the first update, from what the warm-up stored."""
+
+    def explore(self, frames: int) -> None:
+        """Set the policy's exploration, `frames` presses after the warm-up."""
+
+    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Make one update from transitions `[batch_size]`; return scalars to log."""
+        raise NotImplementedError
+
+    def descend(self, name: str, loss: Tensor, max_grad_norm: float | None = None) -> None:
+        """Take a step of an optimiser, with gradients scaled down to a norm where one is given."""
+        optimiser = self.optimisers[name]
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        if max_grad_norm is not None:
+            parameters = (parameter for group in optimiser.param_groups for parameter in group["params"])
+            nn.utils.clip_grad_norm_(parameters, max_grad_norm)
+        optimiser.step()
+
+
+def falling_share(frames: int, over: int, final: float) -> float:
+    """Return a share that falls in a line from 1 to `final` within `over` frames."""
+    return 1.0 + (final - 1.0) * min(1.0, frames / max(1, over))
