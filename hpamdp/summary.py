@@ -15,7 +15,7 @@ _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy
 
 
 def summarise(
-    cfg: DictConfig, measured: dict[str, float], random: dict[str, float], frames: int, wall_s: float
+    cfg: DictConfig, measured: dict[str, float], random: dict[str, float], frames: int, wall_s: float, cpu_s: float
 ) -> dict[str, Any]:
     """Return the run's summary: its final evaluation's means, what to hold them against, what it cost, what made it.
 
@@ -23,7 +23,7 @@ def summarise(
         cfg: the resolved config.
         measured: means of the agent's final evaluation, from `evaluate.measure`.
         random: the same for random choices and presses.
-        frames, wall_s: presses and seconds of training, evaluations included.
+        frames, wall_s, cpu_s: presses, seconds and the process's own seconds of training, evaluations included.
     """
     controller = "chosen" if cfg.env.controller == "choose" else cfg.env.controller
     ceiling = {"score": measured["ceiling"], "success": 1.0, "optimality_gap": 0.0}
@@ -38,6 +38,7 @@ def summarise(
         "episodes": cfg.eval.layouts,
         "frames": frames,
         "wall_s": wall_s,
+        "cpu_s": cpu_s,
         "seed": cfg.seed,
         "versions": {
             "hpamdp": __version__,

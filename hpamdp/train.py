@@ -39,7 +39,7 @@ def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = ()) -> int
     output_dir.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
     is_interrupted = settings.mode == "train" and trainer.train()
-    print(trainer.recorder.finish(trainer.frames, trainer.wall_s))
+    print(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s))
     print(f"Everything is in {output_dir}")
     if is_interrupted:
         print(f"Stopped at {trainer.frames:,} presses; to go on: python run.py resume={output_dir}")
@@ -52,14 +52,14 @@ class Trainer:
     def __init__(self, cfg: DictConfig, settings: RunConfig, parts: Parts, output_dir: Path) -> None:
         self.cfg, self.settings, self.parts, self.output_dir = cfg, settings, parts, output_dir
         self.recorder = Recorder(cfg, parts, output_dir)
-        self.frames, self.wall_s = 0, 0.0
+        self.frames, self.wall_s, self.cpu_s = 0, 0.0, 0.0
 
     def restore(self, source: Path) -> None:
         """Take the agent from a checkpoint and, to train on, where its run stood."""
         is_training = self.settings.mode == "train"
         env_state = checkpoint.load(source, self.parts.agent, self.parts.device, is_training)
         progress = checkpoint.progress_of(source)
-        self.frames, self.wall_s = progress["frames"], progress["wall_s"]
+        self.frames, self.wall_s, self.cpu_s = (progress[name] for name in ("frames", "wall_s", "cpu_s"))
         if not is_training:
             return
         boats = self.parts.env.base_env  # the wrapper would keep an assigned state to itself
@@ -97,7 +97,8 @@ class Trainer:
             signal.signal(signal.SIGTERM, previous)
 
     def _loop(self, collector: Collector, bar: tqdm) -> None:
-        settings, before, started = self.settings, self.wall_s, time.perf_counter()
+        settings = self.settings
+        wall_before, cpu_before = self.wall_s - time.perf_counter(), self.cpu_s - time.process_time()
         if self.frames == 0:
             self._log(bar, is_evaluated=True)
         batches = iter(collector)
@@ -105,7 +106,7 @@ class Trainer:
             batch = next(batches)
             self.recorder.take(batch, self.parts.agent.learn(batch))
             last, self.frames = self.frames, self.frames + batch.numel()
-            self.wall_s = before + time.perf_counter() - started
+            self.wall_s, self.cpu_s = wall_before + time.perf_counter(), cpu_before + time.process_time()
             bar.update(batch.numel())
             is_over = self.frames >= settings.total_frames
             if is_over or _is_due(last, self.frames, settings.eval.every):
@@ -126,6 +127,7 @@ class Trainer:
             "config": OmegaConf.to_container(self.cfg, resolve=True),
             "frames": self.frames,
             "wall_s": self.wall_s,
+            "cpu_s": self.cpu_s,
         }
         path = self.output_dir / checkpoint.FILE_NAME
         checkpoint.save(path, self.parts.agent, self.parts.env.state._asdict(), progress)
