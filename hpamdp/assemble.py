@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,14 +48,17 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
     """
     classes = {group: validate(group, cfg[group], context)[0] for group, context in CONTEXT.items()}
     has_selector = classes["high"] is not None
-    needs_oracle = classes["low"].needs_oracle or (has_selector and classes["high"].needs_oracle)
+    needs_oracle = [group for group in ("high", "low") if classes[group] is not None and classes[group].needs_oracle]
+    if needs_oracle and "oracle" not in inspect.signature(classes["env"].__init__).parameters:
+        group = needs_oracle[0]
+        raise ConfigError(f"{group}={name_of(cfg[group])}: env={name_of(cfg.env)} has no planner to ask")
     device = settings.resolve_device()
-    env = _make_env(cfg, settings.num_envs, settings.seed, device, needs_oracle)
+    env = _make_env(cfg, settings.num_envs, settings.seed, device, bool(needs_oracle))
     specs = PAMDPSpecs.from_env(env)
     _check_choice(cfg, specs, has_selector)
     selector = build("high", cfg.high, specs=specs, device=device) if has_selector else None
     agent = _make_agent(cfg, settings, specs, selector, device)
-    evaluation = Evaluation(_make_env(cfg, settings.eval.layouts, 0, device, needs_oracle), settings.eval.seed)
+    evaluation = Evaluation(_make_env(cfg, settings.eval.layouts, 0, device, bool(needs_oracle)), settings.eval.seed)
     config = OmegaConf.to_container(cfg, resolve=True)
     return Parts(env, evaluation, agent, build("logger", cfg.logger, output_dir=output_dir, config=config), device)
 
@@ -67,6 +71,10 @@ def _make_env(cfg: DictConfig, num_envs: int, seed: int, device: torch.device, n
 
 
 def _check_choice(cfg: DictConfig, specs: PAMDPSpecs, has_selector: bool) -> None:
+    if has_selector and "controller" not in cfg.env and not specs.num_options:
+        raise ConfigError(
+            f"high={name_of(cfg.high)}: env={name_of(cfg.env)} has no options to choose from; use high=none"
+        )
     if has_selector and not specs.num_options:
         raise ConfigError(
             f"high={name_of(cfg.high)}: env.controller={cfg.env.controller} leaves nothing to choose; use high=none or "

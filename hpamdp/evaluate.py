@@ -2,50 +2,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.env.episode import MAX_PRESSES
-from hpamdp.env.harbour import CONTROLLERS
-from hpamdp.env.physics import OUTCOMES, SAILING, SUCCESS
 
 
 class Evaluation:
     """A fixed set of episodes with what is known of them, on which agents are scored.
 
     Args:
-        env: an environment with one boat for each episode, used for nothing else.
-        seed: of the set; training never meets its layouts.
+        env: a `PAMDPEnv` with its decisions tracked, one environment for each episode, used for nothing else.
+        seed: of the set; training never meets its episodes.
     """
 
     def __init__(self, env: TransformedEnv, seed: int) -> None:
         self.env, self.seed = env, seed
         self.episodes = env.fixed_episodes(seed)
         self._reset()
-        self.layouts = env.describe()
+        self.known = env.describe()
 
-    def _reset(self) -> TensorDict:
+    def _reset(self) -> TensorDictBase:
         self.env.set_seed(self.seed)  # the noise, too, is the same at every evaluation
-        return self.env.reset(self.episodes.clone())
+        return self.env.reset(None if self.episodes is None else self.episodes.clone())
 
     def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
         """Play every episode greedily; return one array an attribute, first dimension the episode.
 
-        `outcome` int, `fuel` (fraction), `score`, `return`, `presses`, `controller` (0 incongruent, 1 congruent),
-        `path` `[N, P + 1, 2]` (px from the harbour's centre, NaN past the end), and the layouts' `start`, `goal`,
-        `bearing_offset`, `optimum`.
+        `return`, `presses` and `score` (the return, where the environment has no score of its own); `option`, the first
+        one, where the agent chooses; `path` `[N, P + 1, 2]` (NaN past the end), where there are positions; beside them
+        what the environment `describe`s and gives as `results`.
         """
         device = self.env.device
         td = self._reset()
-        path, total = [self.env.position], torch.zeros(td.batch_size, device=device)
+        total = torch.zeros(td.batch_size, device=device)
         presses = torch.zeros(td.batch_size, dtype=torch.long, device=device)
-        over = td.get(keys.DONE).squeeze(-1)
+        over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]
         # A policy that draws even when greedy (random presses) must not move the run's generators.
         with (
             torch.random.fork_rng(devices=[device] if device.type == "cuda" else []),
@@ -53,54 +52,29 @@ class Evaluation:
             torch.no_grad(),
         ):
             torch.manual_seed(self.seed)
-            for _ in range(MAX_PRESSES):
+            for _ in range(self.env.max_steps):
                 td = self.env.step(policy(td))
                 total += td.get(("next", keys.REWARD)).squeeze(-1)
                 presses += ~over
-                path.append(torch.where(over.unsqueeze(-1), torch.nan, self.env.position))
+                options.append(td.get(keys.OPTION, None))
+                path.append(_unless(over, self.env.position))
                 td = self.env.step_mdp(td)
                 over = td.get(keys.DONE).squeeze(-1)
                 if over.all():
                     break
-        played: dict[str, Tensor] = {
-            **self.layouts,
-            "outcome": td.get(keys.OUTCOME),
-            "fuel": td.get(keys.FUEL).squeeze(-1),
-            "score": self.env.score(td),
-            "return": total,
-            "presses": presses,
-            "controller": self.env.state.controller,
-            "path": torch.stack(path, 1),
-        }
+        played: dict[str, Tensor] = {"return": total, "presses": presses, "score": total, **self.known}
+        if options[0] is not None:
+            played["option"] = options[0]
+        if path[0] is not None:
+            played["path"] = torch.stack(path, 1)
+        played |= self.env.results(td)
         return {name: value.cpu().numpy() for name, value in played.items()}
 
+    def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return the means of an evaluation: score, return, presses, success, and what else the environment tells."""
+        names = [name for name in ("score", "success", "return", "presses") if name in played]
+        return {name: float(played[name].mean()) for name in names} | self.env.measure(played)
 
-def measure(played: dict[str, np.ndarray], has_choice: bool) -> dict[str, float]:
-    """Return the means of an evaluation: score, success, shares of outcomes and controllers, gap to the ceiling.
 
-    `ceiling` is the best possible mean score on the same layouts: with the better controller of each where the agent
-    chooses, else with the controller given. `oracle_agreement` is the share of episodes in which the agent chose the
-    better controller, `oracle_agreement_weighted` the same weighted by what the choice is worth.
-    """
-    outcome, optimum, controller = played["outcome"], played["optimum"], played["controller"]
-    given = np.take_along_axis(optimum, controller[:, None].astype(int), 1)[:, 0]
-    ceiling = float(np.mean(optimum.max(1) if has_choice else given))
-    scores = {
-        "score": float(played["score"].mean()),
-        "success": float((outcome == SUCCESS).mean()),
-        "return": float(played["return"].mean()),
-        "presses": float(played["presses"].mean()),
-        "ceiling": ceiling,
-        "optimality_gap": ceiling - float(played["score"].mean()),
-    }
-    for code, name in enumerate(OUTCOMES):
-        if code != SAILING:
-            scores[name] = float((outcome == code).mean())
-    for option, name in enumerate(CONTROLLERS):
-        scores[f"option_{name}"] = float((controller == option).mean())
-    if has_choice:
-        is_better = optimum.argmax(1) == controller
-        worth = np.abs(optimum[:, 1] - optimum[:, 0])
-        scores["oracle_agreement"] = float(is_better.mean())
-        scores["oracle_agreement_weighted"] = float((is_better * worth).sum() / worth.sum())
-    return scores
+def _unless(over: Tensor, position: Tensor | None) -> Tensor | None:
+    return None if position is None else torch.where(over.unsqueeze(-1), torch.nan, position)

@@ -13,6 +13,7 @@ OUTCOME, FUEL = "outcome", "fuel"
 IS_DECISION = "is_decision"
 OPTION_RETURN, OPTION_STEPS = "option_return", "option_steps"
 DECISION_OBSERVATION = "decision_observation"
+EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
 
 # Written by an environment that knows the best action: what the `oracle` selector and the `planner` learner read.
 ORACLE_OPTION = ("oracle", "option")

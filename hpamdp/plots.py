@@ -57,7 +57,7 @@ _STYLE = {
 # Panels of the learning curves: the metric, its title, whether it is a share.
 _PANELS = (
     ("score", "Score", False),
-    ("success", "Episodes that dock", True),
+    ("success", "Episodes that succeed", True),
     ("oracle_agreement", "Better boat chosen", True),
     ("option_congruent", "Congruent boat chosen", True),
 )
@@ -74,8 +74,8 @@ def draw_all(output_dir: Path) -> list[Path]:
     summary = _read_summary(output_dir / "summary.json")
     rows = read_rows(output_dir / "metrics.csv")
     evaluation = _read_evaluation(output_dir / "evaluation.npz")
-    if summary.get("controller") == "chosen" and "controller" in evaluation:
-        evaluation.setdefault("option", evaluation["controller"])
+    if "option" in evaluation:
+        evaluation.setdefault("controller", evaluation["option"])
     with mpl.rc_context(_STYLE):
         figures = {
             "learning_curves.png": _learning_curves(rows, summary),

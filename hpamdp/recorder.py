@@ -12,8 +12,6 @@ from tensordict import TensorDictBase
 
 from hpamdp import keys, plots
 from hpamdp.assemble import Parts, random_policy
-from hpamdp.env.physics import SUCCESS
-from hpamdp.evaluate import measure
 from hpamdp.metrics import MetricsFile, closing_table
 from hpamdp.summary import summarise
 
@@ -34,7 +32,7 @@ class Recorder:
         self._scalars: dict[str, float] = {}
         # The last evaluation, as long as the agent has not learned since.
         self._played: dict[str, np.ndarray] | None = None
-        self._random = self._measure(parts.evaluation.run(random_policy(parts)))
+        self._random = parts.evaluation.measure(parts.evaluation.run(random_policy(parts)))
 
     def resume_from(self, folder: Path, frames: int) -> None:
         """Start the metrics with those that the run in `folder` had written by then."""
@@ -43,7 +41,7 @@ class Recorder:
     def take(self, batch: TensorDictBase, scalars: dict[str, float]) -> None:
         """Take note of a collected batch `[N, T]` and of what the agent said while learning from it."""
         is_end = batch.get(("next", keys.DONE)).squeeze(-1)
-        ended = batch.get("next").select(keys.OUTCOME, keys.FUEL, keys.OPTION_RETURN, keys.OPTION_STEPS)[is_end]
+        ended = batch.get("next").select(*self.parts.env.result_keys, keys.EPISODE_RETURN, keys.EPISODE_STEPS)[is_end]
         if keys.OPTION in batch.keys():
             ended.set(keys.OPTION, batch.get(keys.OPTION)[is_end])
         self._ended.append(ended)
@@ -54,7 +52,7 @@ class Recorder:
         """Write a row, with an evaluation if asked for, and return it."""
         row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
         if is_evaluated:
-            measured = self._measure(self._play())
+            measured = self.parts.evaluation.measure(self._play())
             row |= {f"eval/{name}": value for name, value in measured.items()}
         self.metrics.append(row)
         self.parts.logger.log(row, frames)
@@ -65,7 +63,7 @@ class Recorder:
         """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
         played = self._play()
         np.savez_compressed(self.output_dir / "evaluation.npz", **played)
-        summary = summarise(self.cfg, self._measure(played), self._random, frames, wall_s, cpu_s)
+        summary = summarise(self.cfg, self.parts.evaluation.measure(played), self._random, frames, wall_s, cpu_s)
         (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         logger = self.parts.logger
         logger.images(plots.draw_all(self.output_dir))
@@ -78,20 +76,17 @@ class Recorder:
             self._played = self.parts.evaluation.run(self.parts.agent.policy)
         return self._played
 
-    def _measure(self, played: dict[str, np.ndarray]) -> dict[str, float]:
-        return measure(played, has_choice=self.parts.agent.selector is not None)
-
     def _training_scores(self) -> dict[str, float]:
         """Return the means over the exploring episodes that ended since the last row."""
         if not sum(len(ended) for ended in self._ended):
             return {}
         ended = torch.cat(self._ended)
+        results = {"score": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
         scores = {
-            "train/score": self.parts.env.score(ended).mean().item(),
-            "train/success": (ended[keys.OUTCOME] == SUCCESS).float().mean().item(),
-            "train/return": ended[keys.OPTION_RETURN].mean().item(),
-            "train/presses": ended[keys.OPTION_STEPS].float().mean().item(),
+            f"train/{name}": results[name].float().mean().item() for name in ("score", "success") if name in results
         }
+        scores["train/return"] = ended[keys.EPISODE_RETURN].mean().item()
+        scores["train/presses"] = ended[keys.EPISODE_STEPS].float().mean().item()
         for i, name in enumerate(self.parts.agent.specs.option_names):
             scores[f"train/option_{name}"] = (ended[keys.OPTION] == i).float().mean().item()
         return scores

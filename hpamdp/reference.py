@@ -55,7 +55,11 @@ CEILING: dict[str, Figures] = {
 
 def has_choice(summary: Mapping[str, Any]) -> bool:
     """Return whether the run of this summary chose its boats."""
-    return summary.get("controller", "chosen") == "chosen"
+    return _is_on_boats(summary) and summary.get("controller", "chosen") == "chosen"
+
+
+def _is_on_boats(summary: Mapping[str, Any]) -> bool:
+    return summary.get("env", "boatdock") == "boatdock"
 
 
 def references(summary: Mapping[str, Any]) -> dict[str, Figures]:
@@ -65,6 +69,7 @@ def references(summary: Mapping[str, Any]) -> dict[str, Figures]:
         summary: a run's summary. `controller` ("chosen" if missing, "congruent", "incongruent" or "random") picks the
             figures; `references` overrides them by name: a mapping of figures is taken as it is, a number is the
             score beside the other figures, and None leaves the name out. Leaving people out leaves out the best one.
+            Of other environments than the boats these are all there is.
 
     Raises:
         ValueError: the controller is not one of these.
@@ -72,11 +77,10 @@ def references(summary: Mapping[str, Any]) -> dict[str, Figures]:
     controller = summary.get("controller", "chosen")
     if controller not in CEILING:
         raise ValueError(f"controller in the summary must be one of {', '.join(CEILING)}, got {controller!r}")
-    found: dict[str, Figures] = {
-        "human": HUMAN.get(controller, HUMAN["chosen"]),
-        "best_person": BEST_PERSON,
-        "ceiling": CEILING[controller],
-    }
+    found: dict[str, Figures] = {}
+    if _is_on_boats(summary):
+        found["human"] = HUMAN.get(controller, HUMAN["chosen"])
+        found |= {"best_person": BEST_PERSON, "ceiling": CEILING[controller]}
     given = summary.get("references") or {}
     if "human" in given and given["human"] is None:
         del found["best_person"]

@@ -68,11 +68,10 @@ class PAMDPSpecs:
         """Read the sizes off an environment whose action has the leaves `keys.KEY` and `keys.DURATION`."""
         action = env.full_action_spec_unbatched
         duration = action[keys.DURATION]
-        num_keys = action[keys.KEY].n
         return cls(
             observation_dim=env.observation_spec_unbatched[keys.OBSERVATION].shape[-1],
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
-            parameter_dims=tuple(getattr(env, "parameter_dims", (1,) * num_keys)),
+            parameter_dims=tuple(env.parameter_dims),
             parameter_low=tuple(duration.space.low.flatten().tolist()),
             parameter_high=tuple(duration.space.high.flatten().tolist()),
         )

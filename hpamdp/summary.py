@@ -25,16 +25,20 @@ def summarise(
         random: the same for random choices and presses.
         frames, wall_s, cpu_s: presses, seconds and the process's own seconds of training, evaluations included.
     """
-    controller = "chosen" if cfg.env.controller == "choose" else cfg.env.controller
-    ceiling = {"score": measured["ceiling"], "success": 1.0, "optimality_gap": 0.0}
-    if controller == "chosen":
-        ceiling["oracle_agreement"] = 1.0
+    references = {"random": random}
+    if "ceiling" in measured:
+        references["ceiling"] = {"score": measured["ceiling"], "success": 1.0, "optimality_gap": 0.0}
+    if "oracle_agreement" in measured:
+        references["ceiling"]["oracle_agreement"] = 1.0
+    controller = cfg.env.get("controller")
+    boat = {} if controller is None else {"controller": "chosen" if controller == "choose" else controller}
     return {
         "high": name_of(cfg.high),
         "low": name_of(cfg.low),
-        "controller": controller,
+        "env": name_of(cfg.env),
+        **boat,
         **measured,
-        "references": {"random": random, "ceiling": ceiling},
+        "references": references,
         "episodes": cfg.eval.layouts,
         "frames": frames,
         "wall_s": wall_s,

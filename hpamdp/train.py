@@ -62,12 +62,10 @@ class Trainer:
         self.frames, self.wall_s, self.cpu_s = (progress[name] for name in ("frames", "wall_s", "cpu_s"))
         if not is_training:
             return
-        boats = self.parts.env.base_env  # the wrapper would keep an assigned state to itself
-        state = boats.state
-        if env_state["episode"].shape != state.episode.shape:
-            had, given = len(env_state["episode"]), self.settings.num_envs
-            raise ConfigError(f"num_envs={given}: the run to resume had {had}; leave this out")
-        boats.state = type(state)(**env_state)
+        try:
+            self.parts.env.set_state_columns(env_state)
+        except ValueError as error:
+            raise ConfigError(f"num_envs={self.settings.num_envs}: {error}; leave it out when you resume") from error
         self.recorder.resume_from(source.parent, self.frames)
 
     def train(self) -> bool:
@@ -130,7 +128,7 @@ class Trainer:
             "cpu_s": self.cpu_s,
         }
         path = self.output_dir / checkpoint.FILE_NAME
-        checkpoint.save(path, self.parts.agent, self.parts.env.state._asdict(), progress)
+        checkpoint.save(path, self.parts.agent, self.parts.env.state_columns(), progress)
 
 
 def _is_due(before: int, now: int, every: int) -> bool:

@@ -148,7 +148,7 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
     if group in ("high", "low"):
         assert name == name_of(cfg[group])
     assert ("budget" in cfg[group]) == (group == "low")
-    assert group != "low" or set(cfg[group].budget) == {"num_envs", "steps_per_batch", "total_frames"}
+    assert group != "low" or set(cfg[group].budget) == {"num_envs", "steps_per_batch", "total_frames", "eval_every"}
 
 
 @pytest.mark.parametrize("experiment", choices("experiment"))

@@ -64,7 +64,7 @@ def test_planning_in_the_true_model_comes_close_to_the_ceiling():
         td = env.step_mdp(env.step(td))
         if td[keys.DONE].all():
             break
-    assert env.score(td).mean() >= 0.95 * ceiling
+    assert env.results(td)["score"].mean() >= 0.95 * ceiling
 
 
 @pytest.mark.parametrize("form", FORMS)

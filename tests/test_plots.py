@@ -92,13 +92,9 @@ def test_an_evaluation_without_a_choice_gives_trajectories_only(tmp_path):
     assert names(tmp_path) == ["trajectories.png"]
 
 
-def test_the_summary_says_whether_an_evaluation_without_options_is_of_choices(tmp_path):
-    write_evaluation(tmp_path, without=("option",))
-    write_metrics(tmp_path, ("eval/option_congruent",))
-    (tmp_path / "summary.json").write_text('{"controller": "chosen"}')
-    assert names(tmp_path) == ALL
-    (tmp_path / "summary.json").write_text('{"controller": "random"}')
-    assert names(tmp_path) == ["trajectories.png"]
+def test_chosen_options_are_the_boats_of_the_pictures(tmp_path):
+    write_evaluation(tmp_path, without=("controller",))
+    assert names(tmp_path) == ALL[1:]
 
 
 @pytest.mark.parametrize("num", [1, 7])

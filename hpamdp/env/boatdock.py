@@ -6,23 +6,26 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import ClassVar, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, episode, harbour, physics, planner
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.episode import BoatState, Rules
 from hpamdp.env.oracle import BoatDockOracle, oracle_spec
+from hpamdp.env.scores import measure_boats
 
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 
 
-class BoatDockEnv(EnvBase):
+class BoatDockEnv(PAMDPEnv):
     """Dock boats in `num_envs` harbours at once.
 
     Action leaves: `("action", "key")` int64 `[N]` in {0, 1, 2}; `("action", "duration")` float32 `[N, 3]`, seconds in
@@ -53,6 +56,9 @@ class BoatDockEnv(EnvBase):
     """
 
     option_names = harbour.CONTROLLERS
+    parameter_dims = (1,) * harbour.NUM_KEYS
+    max_steps = episode.MAX_PRESSES
+    result_keys: ClassVar[tuple[str, ...]] = (keys.OUTCOME, keys.FUEL)
 
     def __init__(
         self,
@@ -115,24 +121,43 @@ class BoatDockEnv(EnvBase):
         points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
         return TensorDict(points, batch_size=self.batch_size, device=self.device)
 
-    def score(self, td: TensorDictBase) -> Tensor:
-        """Return the score `[N]` of finished (or abandoned) episodes from their last `outcome` and `fuel`."""
-        return harbour.score(td.get(keys.OUTCOME), td.get(keys.FUEL).squeeze(-1))
+    def results(self, last: TensorDictBase) -> dict[str, Tensor]:
+        """Return `outcome`, `fuel` (fraction), `score` and `success` `[M]` of finished (or abandoned) episodes."""
+        outcome, fuel = last.get(keys.OUTCOME), last.get(keys.FUEL).squeeze(-1)
+        score = harbour.score(outcome, fuel)
+        return {"outcome": outcome, "fuel": fuel, "score": score, "success": outcome == physics.SUCCESS}
 
     def describe(self) -> dict[str, Tensor]:
         """Return the boats' layouts for evaluation, px from the harbour's centre.
 
         `start`, `goal` `[N, 2]`, `bearing_offset` `[N]` (degrees) and `optimum` `[N, 2]`: the best possible score with
-        the incongruent and the congruent boat from a full tank.
+        the incongruent and the congruent boat from a full tank; `controller` `[N]` where it is not chosen.
         """
         state = self._state
         layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
-        return {
+        known = {
             "start": torch.stack(layout[:2], -1),
             "goal": torch.stack(layout[2:], -1),
             "bearing_offset": harbour.bearing_offset(layout),
             "optimum": planner.best_plans(layout, state.keymap).score,
         }
+        return known if self.has_choice else {**known, "controller": state.controller}
+
+    def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return the means of `measure_boats`."""
+        return measure_boats(played)
+
+    def state_columns(self) -> dict[str, Tensor]:
+        """Return the boats' columns."""
+        return self._state._asdict()
+
+    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+        """Put the boats where `state_columns` were taken."""
+        if len(columns["episode"]) != self.num_envs:
+            raise ValueError(
+                f"BoatDockEnv: the state of {len(columns['episode'])} boats, but there are {self.num_envs}"
+            )
+        self.state = BoatState(**columns)
 
     def _make_specs(self) -> None:
         n, device = self.num_envs, self.device
@@ -151,10 +176,7 @@ class BoatDockEnv(EnvBase):
         option = {keys.OPTION: Categorical(len(harbour.CONTROLLERS), shape=(n,), device=device)}
         self.action_spec = Composite(**(option if self.has_choice else {}), action=press, shape=(n,))
         self.reward_spec = Unbounded(shape=(n, 1), device=device)
-        flag = Binary(n=1, shape=(n, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,), device=device
-        )
+        self.done_spec = self.make_done_spec()
 
     def _set_seed(self, seed: int | None) -> None:
         self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
