@@ -10,10 +10,13 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
 from hpamdp import checkpoint
 from hpamdp.config import ConfigError, RunConfig, build, name_of, run_config, validate
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.choice import ControllerChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.evaluate import Evaluation
 from hpamdp.policies.agent import HierarchicalAgent
@@ -22,7 +25,7 @@ from hpamdp.specs import PAMDPSpecs
 
 # What the builder supplies; the rest of a constructor's arguments is the yaml's.
 CONTEXT = {
-    "env": ("num_envs", "device", "seed", "oracle"),
+    "env": ("num_envs", "device", "seed", "oracle", "people"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "logger": ("output_dir", "config"),
@@ -34,6 +37,7 @@ class Parts:
     """What a run is made of."""
 
     env: TransformedEnv
+    policy: TensorDictModuleBase  # that acts in `env`
     evaluation: Evaluation
     agent: HierarchicalAgent
     logger: Any
@@ -47,43 +51,69 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
         ConfigError: the first wrong value or impossible pair found.
     """
     classes = {group: validate(group, cfg[group], context)[0] for group, context in CONTEXT.items()}
-    has_selector = classes["high"] is not None
-    needs_oracle = [group for group in ("high", "low") if classes[group] is not None and classes[group].needs_oracle]
-    if needs_oracle and "oracle" not in inspect.signature(classes["env"].__init__).parameters:
-        group = needs_oracle[0]
-        raise ConfigError(f"{group}={name_of(cfg[group])}: env={name_of(cfg.env)} has no planner to ask")
     device = settings.resolve_device()
-    env = _make_env(cfg, settings.num_envs, settings.seed, device, bool(needs_oracle))
+    asked = _asked_of_env(cfg, classes) | {"device": device}
+    env = build("env", cfg.env, num_envs=settings.num_envs, seed=settings.seed, **asked)
     specs = PAMDPSpecs.from_env(env)
-    _check_choice(cfg, specs, has_selector)
-    selector = build("high", cfg.high, specs=specs, device=device) if has_selector else None
+    _check_levels(cfg, settings, env, classes)
+    selector = build("high", cfg.high, specs=specs, device=device) if specs.num_options else None
     agent = _make_agent(cfg, settings, specs, selector, device)
-    evaluation = Evaluation(_make_env(cfg, settings.eval.layouts, 0, device, bool(needs_oracle)), settings.eval.seed)
+    _check_values(cfg, agent)
+    if settings.low.checkpoint is not None and settings.resume is None and settings.mode == "train":
+        checkpoint.load_learners(checkpoint.find(settings.low.checkpoint, "low.checkpoint"), agent, device)
+    test_env = build("env", cfg.env, num_envs=settings.eval.layouts, seed=0, **asked)
+    evaluation = Evaluation(_with_decisions(test_env, settings), settings.eval.seed)
+    policy = agent.policy
+    if settings.low.freeze:
+        env, policy = ControllerChoiceEnv(agent.router, env), agent.selector
     config = OmegaConf.to_container(cfg, resolve=True)
-    return Parts(env, evaluation, agent, build("logger", cfg.logger, output_dir=output_dir, config=config), device)
+    logger = build("logger", cfg.logger, output_dir=output_dir, config=config)
+    return Parts(_with_decisions(env, settings), policy, evaluation, agent, logger, device)
 
 
-def _make_env(cfg: DictConfig, num_envs: int, seed: int, device: torch.device, needs_oracle: bool) -> TransformedEnv:
-    context: dict[str, Any] = {"num_envs": num_envs, "seed": seed, "device": device}
-    if needs_oracle:
-        context["oracle"] = True
-    return with_decisions(build("env", cfg.env, **context))
+def _asked_of_env(cfg: DictConfig, classes: dict[str, type | None]) -> dict[str, Any]:
+    """Return the environment's arguments for what the two levels need of it."""
+    offered = inspect.signature(classes["env"].__init__).parameters
+    asked = {}
+    for group in ("high", "low"):
+        for name in classes[group].needs if classes[group] is not None else ():
+            if name not in offered:
+                lacks = {"oracle": "has no planner to ask", "people": "has no record of people"}[name]
+                raise ConfigError(f"{group}={name_of(cfg[group])}: env={name_of(cfg.env)} {lacks}")
+            asked[name] = True
+    return asked
 
 
-def _check_choice(cfg: DictConfig, specs: PAMDPSpecs, has_selector: bool) -> None:
-    if has_selector and "controller" not in cfg.env and not specs.num_options:
+def _with_decisions(env: PAMDPEnv, settings: RunConfig) -> TransformedEnv:
+    length = settings.agent.option_length
+    return with_decisions(env, option_length=None if length == "episode" else length)
+
+
+def _check_levels(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, classes: dict[str, type | None]) -> None:
+    high, name, length = name_of(cfg.high), name_of(cfg.env), settings.agent.option_length
+    if classes["high"] is not None and not env.option_names and high != "fixed":
+        raise ConfigError(f"high={high}: env={name} has no options to choose; use high=none")
+    if classes["high"] is not None and env.option_names and not env.has_choice:
         raise ConfigError(
-            f"high={name_of(cfg.high)}: env={name_of(cfg.env)} has no options to choose from; use high=none"
-        )
-    if has_selector and not specs.num_options:
-        raise ConfigError(
-            f"high={name_of(cfg.high)}: env.controller={cfg.env.controller} leaves nothing to choose; use high=none or "
+            f"high={high}: env.controller={cfg.env.controller} leaves nothing to choose; use high=none or "
             "env.controller=choose"
         )
-    if not has_selector and specs.num_options:
+    if classes["high"] is None and env.has_choice:
         raise ConfigError(
             "high=none: env.controller=choose needs a selector; use another high or env.controller=congruent, "
             "incongruent, random"
+        )
+    if length != "episode" and not (env.has_choice and env.can_change_option):
+        why = "keeps an option for an episode" if env.has_choice else "has no options"
+        raise ConfigError(f"agent.option_length={length}: env={name} {why}; use agent.option_length=episode")
+    if settings.low.freeze and not env.has_choice:
+        raise ConfigError("low.freeze=true: there is no choice left to learn; use low.freeze=false")
+
+
+def _check_values(cfg: DictConfig, agent: HierarchicalAgent) -> None:
+    if agent.selector is not None and agent.selector.needs_values and not agent.learners[0].has_value:
+        raise ConfigError(
+            f"high.bootstrap={cfg.high.bootstrap}: low={name_of(cfg.low)} has no value of a state; use high.bootstrap=0"
         )
 
 
@@ -95,7 +125,7 @@ def _make_agent(
     if is_shared:
         learner_specs, num_learners = specs.with_option_observed(), 1
     learners = [_make_learner(cfg.low, learner_specs, device) for _ in range(num_learners)]
-    return HierarchicalAgent(selector, learners, specs, is_shared).to(device)
+    return HierarchicalAgent(selector, learners, specs, is_shared, settings.low.freeze).to(device)
 
 
 def _make_learner(node: Any, specs: PAMDPSpecs, device: torch.device) -> Learner:

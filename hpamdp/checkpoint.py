@@ -29,7 +29,7 @@ def find(path: str | Path, where: str) -> Path:
 
 
 class _Columns:
-    """The environment's state as a component with a state dict."""
+    """What is saved or loaded, as a component with a state dict."""
 
     def __init__(self, columns: Mapping[str, Tensor]) -> None:
         self.columns = dict(columns)
@@ -72,6 +72,25 @@ def save(path: Path, agent: HierarchicalAgent, env_state: Mapping[str, Tensor], 
 def progress_of(file: Path) -> dict[str, Any]:
     """Return what `save` was given as `progress`."""
     return Checkpoint.manifest(file)["metadata"]
+
+
+def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:
+    """Fill the agent's learners, but neither their optimisers nor their replay, from another run's checkpoint.
+
+    Raises:
+        ConfigError: the checkpoint is damaged or of other learners.
+    """
+    saved = _Columns({})
+    checkpoint = Checkpoint()
+    checkpoint.register("agent", saved, adapter=StateDictCheckpointAdapter("torch"))
+    try:
+        checkpoint.load(file, components={"agent"}, map_location=device)
+        prefix = "learners."
+        own = {name.removeprefix(prefix): value for name, value in saved.columns.items() if name.startswith(prefix)}
+        agent.learners.load_state_dict(own)
+    except (CheckpointError, RuntimeError, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(f"low.checkpoint={file}: of other learners than these: {reason:.300}") from error
 
 
 def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_training: bool) -> dict[str, Tensor]:

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
 GROUPS = ("env", "high", "low", "logger")
 RUN_FILE = "conf/config.yaml"
-# Entries of a class's yaml that are not options of the class.
-_TARGET, _BUDGET = "_target_", "budget"
+# Entries of a class's part of the config that are not options of the class.
+_TARGET, _RUNS_OWN = "_target_", ("budget", "checkpoint", "freeze")
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
 
@@ -69,6 +69,16 @@ class AgentConfig(BaseModel):
     model_config = _STRICT
 
     sharing: Literal["per_option", "shared"]
+    option_length: Literal["episode"] | PositiveInt
+
+
+class StartConfig(BaseModel):
+    """Where the learners begin."""
+
+    model_config = _STRICT
+
+    checkpoint: str | None
+    freeze: bool
 
 
 class RunConfig(BaseModel):
@@ -81,6 +91,7 @@ class RunConfig(BaseModel):
     device: Annotated[str, AfterValidator(_check_device)]
     threads: Annotated[int, Field(ge=1, le=1024)]
     agent: AgentConfig
+    low: StartConfig
     total_frames: PositiveInt
     num_envs: PositiveInt
     steps_per_batch: PositiveInt
@@ -117,7 +128,9 @@ def run_config(cfg: DictConfig) -> RunConfig:
     for group in GROUPS:
         if cfg.get(group) is None:
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
-    values = {name: value for name, value in _plain(cfg).items() if name not in GROUPS}
+    plain = _plain(cfg)
+    values = {name: value for name, value in plain.items() if name not in GROUPS}
+    values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
     if run.mode == "eval" and run.checkpoint is None:
         raise ConfigError("checkpoint: missing; mode=eval needs the output folder of a run")
@@ -133,7 +146,7 @@ def validate(group: str, node: Any, context_names: Iterable[str] = ()) -> tuple[
 
     Args:
         group: such as `low`.
-        node: the group's part of the config; its `budget` is the run's business and not looked at.
+        node: the group's part of the config; its `budget`, `checkpoint` and `freeze` are the run's business.
         context_names: constructor arguments that the program gives, which no yaml may.
 
     Returns:
@@ -143,7 +156,8 @@ def validate(group: str, node: Any, context_names: Iterable[str] = ()) -> tuple[
         ConfigError: all that is wrong with this group, in one line.
     """
     options = _plain(node, group)
-    options.pop(_BUDGET, None)
+    for name in _RUNS_OWN:
+        options.pop(name, None)
     target = options.pop(_TARGET, None)
     # Only the selector can be none: where the environment gives the option, nothing chooses.
     cls = None if target is None and group == "high" else _load_target(group, target)
@@ -214,7 +228,7 @@ def name_of(node: Mapping[str, Any]) -> str:
 def no_such_option(node: Mapping[str, Any], name: str, file: str) -> str:
     """Return that the class which a group's part of the config describes has no such option."""
     cls = str(node.get(_TARGET) or "none").rpartition(".")[2]
-    return no_such(f"option of {cls} ({file})", name, [option for option in node if option not in (_TARGET, _BUDGET)])
+    return no_such(f"option of {cls} ({file})", name, [option for option in node if option not in (_TARGET, "budget")])
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:

@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
+from hpamdp.policies.agent import HierarchicalAgent
 
 
 class Evaluation:
@@ -70,10 +71,35 @@ class Evaluation:
         played |= self.env.results(td)
         return {name: value.cpu().numpy() for name, value in played.items()}
 
+    def run_agent(self, agent: HierarchicalAgent) -> dict[str, np.ndarray]:
+        """Play every episode as `run` does; where the agent chooses, also with each option held.
+
+        `option_scores` `[N, num_options]`: the scores that this agent's own low level reaches with each option.
+        """
+        played = self.run(agent.policy)
+        if agent.selector is not None:
+            each = [self.run(agent.policy_of(i))["score"] for i in range(agent.specs.num_options)]
+            played["option_scores"] = np.stack(each, -1)
+        return played
+
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return the means of an evaluation: score, return, presses, success, and what else the environment tells."""
+        """Return the means of an evaluation: score, return, presses, success, and what else the environment tells.
+
+        Of choices: `regret`, what the better option of each episode would have scored with the agent's own low level
+        less what was scored; `score_NAME`, the score with the option NAME held; `choice_gain`, the score less that of
+        the best option held; `choice_entropy` of the options' shares (nats).
+        """
         names = [name for name in ("score", "success", "return", "presses") if name in played]
-        return {name: float(played[name].mean()) for name in names} | self.env.measure(played)
+        means = {name: float(played[name].mean()) for name in names} | self.env.measure(played)
+        if "option_scores" not in played:
+            return means
+        held, score = played["option_scores"], played["score"]
+        shares = np.bincount(played["option"], minlength=held.shape[1]) / len(score)
+        means["regret"] = float((held.max(1) - score).mean())
+        means["choice_gain"] = float(score.mean() - held.mean(0).max())
+        means["choice_entropy"] = float(-(shares * np.log(np.maximum(shares, 1e-12))).sum())
+        scores = zip(self.env.option_names, held.mean(0), strict=True)
+        return means | {f"score_{name}": float(mean) for name, mean in scores}
 
 
 def _unless(over: Tensor, position: Tensor | None) -> Tensor | None:

@@ -19,3 +19,9 @@ EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
 ORACLE_OPTION = ("oracle", "option")
 ORACLE_KEY = ("oracle", "key")
 ORACLE_DURATION = ("oracle", "duration")
+
+# Written by an environment that knows what people do: their shares of the options, what the `human` selector reads.
+PEOPLE_OPTION = ("people", "option")
+
+# Written by the agent for a selector that asks for it: what each option's learner expects of the state.
+OPTION_VALUES = "option_values"

@@ -32,6 +32,7 @@ class Recorder:
         self._scalars: dict[str, float] = {}
         # The last evaluation, as long as the agent has not learned since.
         self._played: dict[str, np.ndarray] | None = None
+        self._held: dict[str, float] = {}  # scores with each option held, at the last evaluation
         self._random = parts.evaluation.measure(parts.evaluation.run(random_policy(parts)))
 
     def resume_from(self, folder: Path, frames: int) -> None:
@@ -53,7 +54,7 @@ class Recorder:
         row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
         if is_evaluated:
             measured = self.parts.evaluation.measure(self._play())
-            row |= {f"eval/{name}": value for name, value in measured.items()}
+            row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
         self.metrics.append(row)
         self.parts.logger.log(row, frames)
         self._ended, self._scalars = [], {}
@@ -73,8 +74,16 @@ class Recorder:
 
     def _play(self) -> dict[str, np.ndarray]:
         if self._played is None:
-            self._played = self.parts.evaluation.run(self.parts.agent.policy)
+            self._played = self.parts.evaluation.run_agent(self.parts.agent)
         return self._played
+
+    def _drift(self, measured: dict[str, float]) -> dict[str, float]:
+        """Return how far the score with each option held has moved since the evaluation before."""
+        held = {name: value for name, value in measured.items() if name.startswith("score_")}
+        before, self._held = self._held, held
+        return {
+            name.replace("score_", "drift_"): value - before[name] for name, value in held.items() if name in before
+        }
 
     def _training_scores(self) -> dict[str, float]:
         """Return the means over the exploring episodes that ended since the last row."""

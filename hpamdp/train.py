@@ -74,7 +74,7 @@ class Trainer:
         bar = tqdm(total=settings.total_frames, initial=self.frames, unit=" presses", unit_scale=True, mininterval=1.0)
         collector = Collector(
             self.parts.env,
-            self.parts.agent.policy,
+            self.parts.policy,
             frames_per_batch=settings.num_envs * settings.steps_per_batch,
             total_frames=-1,
             auto_register_policy_transforms=False,

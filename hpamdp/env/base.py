@@ -26,6 +26,7 @@ class PAMDPEnv(EnvBase):
     """
 
     option_names: tuple[str, ...] = ()  # of the options, where there are some
+    can_change_option: ClassVar[bool] = True  # whether an option may end before its episode
     parameter_dims: tuple[int, ...]  # how many parameters each key takes
     max_steps: int  # presses in the longest episode
     result_keys: ClassVar[tuple[str, ...]] = ()  # leaves of an episode's last step that `results` reads

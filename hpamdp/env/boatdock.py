@@ -20,6 +20,7 @@ from hpamdp.env import counter_rng, episode, harbour, physics, planner
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.episode import BoatState, Rules
 from hpamdp.env.oracle import BoatDockOracle, oracle_spec
+from hpamdp.env.people import people_shares, people_spec
 from hpamdp.env.scores import measure_boats
 
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
@@ -45,6 +46,7 @@ class BoatDockEnv(PAMDPEnv):
         slip: probability that a uniformly random key is pressed.
         compile_physics: compile the pure step, reset and observation functions (takes about half a minute).
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `key`, `duration` `[N, num_options]`).
+        people: also write people's shares of the options under `people` (`option` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
 
@@ -56,6 +58,7 @@ class BoatDockEnv(PAMDPEnv):
     """
 
     option_names = harbour.CONTROLLERS
+    can_change_option: ClassVar[bool] = False
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
     result_keys: ClassVar[tuple[str, ...]] = (keys.OUTCOME, keys.FUEL)
@@ -73,6 +76,7 @@ class BoatDockEnv(PAMDPEnv):
         slip: float = 0.0,
         compile_physics: bool = False,
         oracle: bool = False,
+        people: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
     ) -> None:
@@ -89,7 +93,9 @@ class BoatDockEnv(PAMDPEnv):
             )
         self._environment = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
-        self._oracle = None
+        self._has_people, self._oracle = people, None
+        if people:
+            self.observation_spec["people"] = people_spec(num_envs, self.device)
         if oracle:
             self._oracle = BoatDockOracle(num_envs, rules, self.device)
             self.observation_spec["oracle"] = oracle_spec(num_envs, rules, self.device)
@@ -270,6 +276,8 @@ class BoatDockEnv(PAMDPEnv):
     def _read(self) -> TensorDict:
         reading = self._pure_read(self._state, self._seed, self._environment, self.rules)
         seen = TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device)
+        if self._has_people:
+            seen.set(keys.PEOPLE_OPTION, people_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp import keys
@@ -63,6 +63,19 @@ class OptionRouter(TensorDictModuleBase):
         return td
 
 
+class HeldOption(TensorDictModuleBase):
+    """The same option everywhere."""
+
+    def __init__(self, option: int) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys, self.option = [keys.OBSERVATION], [keys.OPTION], option
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write `option` `[*B]`."""
+        observation = td.get(keys.OBSERVATION)
+        return td.set(keys.OPTION, torch.full(td.batch_size, self.option, device=observation.device))
+
+
 class HierarchicalAgent(nn.Module):
     """Selector and learners as one policy and one call to learn.
 
@@ -71,17 +84,36 @@ class HierarchicalAgent(nn.Module):
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
         is_shared: whether the single learner takes the option as input (its own specs then count the one-hot option).
+        is_frozen: whether the learners stay as they are.
     """
 
     def __init__(
-        self, selector: Selector | None, learners: Sequence[Learner], specs: PAMDPSpecs, is_shared: bool = False
+        self,
+        selector: Selector | None,
+        learners: Sequence[Learner],
+        specs: PAMDPSpecs,
+        is_shared: bool = False,
+        is_frozen: bool = False,
     ) -> None:
         super().__init__()
         self.selector = selector
         self.learners = nn.ModuleList(learners)
-        self.specs, self.is_shared = specs, is_shared
-        router = OptionRouter(learners, specs, is_shared)
-        self.policy = router if selector is None else TensorDictSequential(selector, router)
+        self.specs, self.is_shared, self.is_frozen = specs, is_shared, is_frozen
+        self.router = OptionRouter(learners, specs, is_shared)
+        self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
+
+    def policy_of(self, option: int) -> TensorDictModuleBase:
+        """Return the policy that presses as this agent but holds one option."""
+        return TensorDictSequential(HeldOption(option), self.router)
+
+    @torch.no_grad()
+    def option_values(self, observation: Tensor) -> Tensor:
+        """Return what each option's learner expects from observations `[B, observation_dim]` on, `[B, num_options]`."""
+        num = self.specs.num_options
+        if not self.is_shared:
+            return torch.stack([learner.value(observation) for learner in self.learners], -1)
+        told = [F.one_hot(torch.tensor(i), num).to(observation).expand(len(observation), -1) for i in range(num)]
+        return torch.stack([self.learners[0].value(torch.cat([observation, option], -1)) for option in told], -1)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
@@ -91,7 +123,12 @@ class HierarchicalAgent(nn.Module):
             if is_end.any():
                 # Time first, so that the selector meets the decisions oldest first.
                 decisions = batch.transpose(0, -1)[is_end.transpose(0, -1)]
+                if self.selector.needs_values:
+                    decided_at = decisions.get(("next", keys.DECISION_OBSERVATION))
+                    decisions.set(keys.OPTION_VALUES, self.option_values(decided_at))
                 scalars |= {f"high/{name}": value for name, value in self.selector.learn(decisions).items()}
+        if self.is_frozen:
+            return scalars
         everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
         if self.is_shared:
             batch = with_option(batch, self.specs.num_options)
@@ -103,8 +140,7 @@ class HierarchicalAgent(nn.Module):
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold beside the parameters and buffers."""
-        return {
-            f"learner{i}_{name}": part
-            for i, learner in enumerate(self.learners)
-            for name, part in learner.stateful().items()
-        }
+        levels = {f"learner{i}": learner for i, learner in enumerate(self.learners)}
+        if self.selector is not None:
+            levels["selector"] = self.selector
+        return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}

@@ -20,7 +20,9 @@ class Selector(TensorDictModuleBase):
     holds it. Its `__init__` takes `specs` and its options as keyword arguments, which are the schema of its yaml.
     """
 
-    needs_oracle: ClassVar[bool] = False  # whether it reads what only an environment with a planner writes
+    # What it reads that an environment writes only when asked: `oracle`, `people`.
+    needs: ClassVar[tuple[str, ...]] = ()
+    needs_values: bool = False  # whether it reads the learners' own values of a state
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
@@ -32,22 +34,34 @@ class Selector(TensorDictModuleBase):
         """Return a fresh choice for every environment, int64 `[*B]`."""
         raise NotImplementedError
 
+    def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return all `out_keys` of a fresh choice, each `[*B]`; beside the option what `learn` wants to know of it."""
+        return {keys.OPTION: self.select(td)}
+
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first; return scalars to log.
 
-        A decision is its last step: `option`, and under `next` its `option_return`, `option_steps` and
-        `decision_observation`.
+        A decision is its last step: `option`, and under `next` its `option_return`, `option_steps`,
+        `decision_observation`, `observation` and `terminated`; with `needs_values`, `option_values` `[N, num_options]`
+        at the decision.
         """
         return {}
 
+    def stateful(self) -> dict[str, Any]:
+        """Return what a checkpoint must hold beside the module's parameters and buffers: optimisers, replay."""
+        return {}
+
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write `option` `[*B]`: a fresh choice where `is_decision`, the held one elsewhere."""
+        """Write `out_keys` `[*B]`: a fresh choice where `is_decision`, the held one elsewhere."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
-        held = td.get(keys.OPTION, None)
-        if held is None or is_decision.any():
-            fresh = self.select(td)
-            held = fresh if held is None else torch.where(is_decision, fresh, held)
-        return td.set(keys.OPTION, held)
+        held = {key: td.get(key, None) for key in self.out_keys}
+        is_new = any(value is None for value in held.values())
+        if is_new or is_decision.any():
+            fresh = self.choose(td)
+            held = fresh if is_new else {key: torch.where(is_decision, fresh[key], held[key]) for key in held}
+        for key, value in held.items():
+            td.set(key, value)
+        return td
 
 
 class Learner(nn.Module):
@@ -58,7 +72,8 @@ class Learner(nn.Module):
     optimisers. Its `__init__` takes `specs`, `device` and its options as keyword arguments, the schema of its yaml.
     """
 
-    needs_oracle: ClassVar[bool] = False
+    needs: ClassVar[tuple[str, ...]] = ()  # as of a selector
+    has_value: ClassVar[bool] = False  # whether `value` is there
 
     policy: TensorDictModuleBase
 
@@ -72,6 +87,10 @@ class Learner(nn.Module):
         Return scalars to log, averaged over the updates made.
         """
         return {}
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return what the learner expects to earn from observations `[B, observation_dim]` on, `[B]`."""
+        raise NotImplementedError
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold beside the module's parameters and buffers: optimisers, replay."""

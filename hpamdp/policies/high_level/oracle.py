@@ -15,7 +15,7 @@ from hpamdp.specs import PAMDPSpecs
 class Oracle(Selector):
     """Choose the option with which the best plan scores higher."""
 
-    needs_oracle: ClassVar[bool] = True
+    needs: ClassVar[tuple[str, ...]] = ("oracle",)
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -137,6 +137,8 @@ class HPPOPolicy(TensorDictModuleBase):
 class HPPO(Learner):
     """Clipped policy-gradient updates of both actors from the presses just collected."""
 
+    has_value: ClassVar[bool] = True
+
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -179,6 +181,10 @@ class HPPO(Learner):
         self.waiting: list[TensorDict] = []
         self.to(device)
         self.optimiser = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return V(s), `[B]`."""
+        return self.critic(observation).squeeze(-1)
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimiser."""

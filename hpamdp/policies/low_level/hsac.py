@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
@@ -105,6 +105,8 @@ class HSACPolicy(TensorDictModuleBase):
 class HSAC(ReplayLearner):
     """Soft policy iteration over keys and their parameters, from a replay buffer of its own."""
 
+    has_value: ClassVar[bool] = True
+
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -162,6 +164,10 @@ class HSAC(ReplayLearner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
             "temperatures": torch.optim.Adam(temperatures, lr=temperature_lr, fused=True),
         }
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the soft value, `[B]`."""
+        return self.soft_value(self.critics, observation)[0]
 
     def explore(self, frames: int) -> None:
         """Leave the presses to the actor."""

@@ -18,7 +18,7 @@ Differs from the source:
 from __future__ import annotations
 
 import copy
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -125,6 +125,8 @@ class HyARPolicy(TensorDictModuleBase):
 class HyAR(ReplayLearner):
     """TD3 over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
+    has_value: ClassVar[bool] = True
+
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -184,6 +186,10 @@ class HyAR(ReplayLearner):
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return Q of the actor's latent action, `[B]`."""
+        return self.critics(torch.cat([observation, self.actor(observation).tanh()], -1)).squeeze(-1).amin(0)
 
     def explore(self, frames: int) -> None:
         """Let the share of random presses fall."""

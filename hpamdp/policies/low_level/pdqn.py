@@ -22,7 +22,7 @@ target here are functions of parameters that another network, with a target and 
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -97,6 +97,8 @@ class PDQNPolicy(TensorDictModuleBase):
 class PDQN(ReplayLearner):
     """Q-learning over the keys and gradient ascent on their parameters, from a replay buffer of its own."""
 
+    has_value: ClassVar[bool] = True
+
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -149,6 +151,10 @@ class PDQN(ReplayLearner):
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the highest Q at the actor's parameters, `[B]`."""
+        return self.critics(observation, self.actor(observation)).amin(0).amax(-1)
 
     def explore(self, frames: int) -> None:
         """Let the share of random presses fall."""

@@ -36,7 +36,7 @@ class PlannerPolicy(TensorDictModuleBase):
 class Planner(Learner):
     """Learn nothing and follow the planner."""
 
-    needs_oracle: ClassVar[bool] = True
+    needs: ClassVar[tuple[str, ...]] = ("oracle",)
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

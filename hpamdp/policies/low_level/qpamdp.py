@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -214,6 +214,8 @@ class NaturalActorCritic(SizedByData):
 class QPAMDP(Learner):
     """Sarsa(lambda) for the keys and eNAC for their parameters, in turns counted in finished episodes."""
 
+    has_value: ClassVar[bool] = True
+
     def __init__(
         self,
         specs: PAMDPSpecs,
@@ -261,6 +263,10 @@ class QPAMDP(Learner):
         for name in ("frames", "phase", "window_episodes", "windows", "windows_since_best", "updates"):
             self.register_buffer(name, torch.zeros((), dtype=torch.long))
         self.to(device)
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the highest value of a key, `[B]`."""
+        return (self.policy.phi(observation) @ self.policy.w.T).amax(-1)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Fit the features' ranges once the warm-up is over; then update the phase's half, and change phase if due."""

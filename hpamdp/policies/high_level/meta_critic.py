@@ -1,0 +1,152 @@
+"""A critic Q(s, option) over the options' returns, learned off-policy: semi-MDP Q-learning.
+
+Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2. Ensemble for exploration by upper
+bounds: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
+
+Differs from the sources: the target of an option's return may be mixed with what the low level itself expects of the
+state, which also tells of the options that were not chosen.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Annotated, Any, Literal
+
+import torch
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from hpamdp import keys
+from hpamdp.policies.base import Selector
+from hpamdp.policies.nets import EnsembleMLP, move_towards
+from hpamdp.specs import PAMDPSpecs
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class MetaCritic(Selector):
+    """Choose the option of the highest mean Q of an ensemble.
+
+    Args:
+        specs: of the problem.
+        device: where the networks live.
+        hidden_dims, num_members: of the ensemble.
+        exploration: `epsilon` (a share of random options that falls from 1 to `epsilon_final` over `epsilon_decisions`)
+            or `ucb` (mean + `ucb_width` x the deviation between the members).
+        gamma: discount of a step, for options that end before their episode.
+        bootstrap: share of the learners' own values in the targets, 0: none.
+        buffer_size: decisions remembered; payoffs drift, so that old ones mislead.
+        batch_size, updates_per_decision, max_updates, lr, tau: of the updates; at most `max_updates` in one call.
+        warmup_decisions: random options before anything is learned.
+    """
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        hidden_dims: list[PositiveInt],
+        num_members: PositiveInt,
+        exploration: Literal["epsilon", "ucb"],
+        epsilon_final: Share,
+        epsilon_decisions: NonNegativeInt,
+        ucb_width: NonNegativeFloat,
+        gamma: Annotated[float, Field(gt=0.0, le=1.0)],
+        bootstrap: Share,
+        buffer_size: PositiveInt,
+        batch_size: PositiveInt,
+        updates_per_decision: PositiveFloat,
+        max_updates: PositiveInt,
+        warmup_decisions: NonNegativeInt,
+        lr: PositiveFloat,
+        tau: Annotated[float, Field(gt=0.0, le=1.0)],
+    ) -> None:
+        super().__init__(specs)
+        self.needs_values = bootstrap > 0.0
+        self.exploration, self.ucb_width, self.gamma, self.bootstrap = exploration, ucb_width, gamma, bootstrap
+        self.epsilon_final, self.epsilon_decisions = epsilon_final, epsilon_decisions
+        self.batch_size, self.updates_per_decision = batch_size, updates_per_decision
+        self.max_updates, self.warmup_decisions, self.tau = max_updates, warmup_decisions, tau
+        self.critics = EnsembleMLP(num_members, specs.observation_dim, hidden_dims, specs.num_options)
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
+        self.to(device)
+        self.optimiser = torch.optim.Adam(self.critics.parameters(), lr=lr, fused=True)
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+
+    def stateful(self) -> dict[str, Any]:
+        """Return the optimiser and the replay buffer."""
+        return {"critics": self.optimiser, "buffer": self.buffer}
+
+    @property
+    def epsilon(self) -> float:
+        """Share of random options."""
+        after = int(self.num_decisions) - self.warmup_decisions
+        if after < 0:
+            return 1.0
+        if self.exploration == "ucb":
+            return 0.0
+        return 1.0 + (self.epsilon_final - 1.0) * min(1.0, after / max(1, self.epsilon_decisions))
+
+    @torch.no_grad()
+    def select(self, td: TensorDictBase) -> Tensor:
+        """Return the choices `[*B]`: the best mean where the policy is greedy, else exploring."""
+        observation = td.get(keys.OBSERVATION)
+        q = self.critics(observation.flatten(0, -2))
+        value = q.mean(0)
+        if exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+            if self.exploration == "ucb":
+                value = value + self.ucb_width * q.std(0, correction=0)
+            is_random = torch.rand_like(value[:, :1]) < self.epsilon
+            value = torch.where(is_random, torch.rand_like(value), value)
+        return value.argmax(-1).reshape(observation.shape[:-1])
+
+    def learn(self, decisions: TensorDictBase) -> dict[str, float]:
+        """Store the finished decisions and, after the warm-up, make the updates that are due."""
+        self.buffer.extend(self._rows(decisions))
+        before, self.num_decisions = int(self.num_decisions), self.num_decisions + len(decisions)
+        now = int(self.num_decisions)
+        if now < self.warmup_decisions:
+            return {}
+        due = int(now * self.updates_per_decision) - int(before * self.updates_per_decision)
+        losses = [self._update(self.buffer.sample(self.batch_size)) for _ in range(min(due, self.max_updates))]
+        critic = {"critic": torch.stack(losses).mean().item()} if losses else {}
+        return {**critic, "epsilon": self.epsilon}
+
+    def _rows(self, decisions: TensorDictBase) -> TensorDict:
+        after = decisions.get("next")
+        goes_on = ~after.get(keys.TERMINATED).squeeze(-1)
+        rows = {
+            "state": after.get(keys.DECISION_OBSERVATION),
+            "option": decisions.get(keys.OPTION),
+            "payoff": after.get(keys.OPTION_RETURN).squeeze(-1),
+            "next_state": after.get(keys.OBSERVATION),
+            "discount": self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1) * goes_on,
+        }
+        if self.needs_values:
+            rows["values"] = decisions.get(keys.OPTION_VALUES)
+        return TensorDict(rows, batch_size=decisions.shape)
+
+    def _update(self, rows: TensorDictBase) -> Tensor:
+        """Make one update of the critics from decisions `[batch_size]`; return the loss."""
+        q, option = self.critics(rows["state"]), rows["option"].unsqueeze(-1)
+        with torch.no_grad():
+            following = self.target_critics(rows["next_state"]).mean(0).amax(-1)
+            earned = (rows["payoff"] + rows["discount"] * following).unsqueeze(-1)
+            # Without bootstrapping only the chosen option has a target.
+            weight = torch.zeros_like(q[0]).scatter(-1, option, 1.0)
+            target = earned.expand_as(weight)
+            if self.needs_values:
+                target = torch.where(weight > 0.0, earned.lerp(rows["values"], self.bootstrap), rows["values"])
+                weight = weight.clamp(min=self.bootstrap)
+            # Each member sees a random half of the rows, which keeps them apart.
+            member = torch.rand(*q.shape[:2], 1, device=q.device) < 0.5 if len(q) > 1 else 1.0
+        loss = ((q - target).square() * weight * member).sum(-1).mean()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimiser.step()
+        move_towards(self.target_critics, self.critics, self.tau)
+        return loss.detach()
