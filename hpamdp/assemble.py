@@ -62,6 +62,7 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
     if settings.low.checkpoint is not None and settings.resume is None and settings.mode == "train":
         checkpoint.load_learners(checkpoint.find(settings.low.checkpoint, "low.checkpoint"), agent, device)
     test_env = build("env", cfg.env, num_envs=settings.eval.layouts, seed=0, **asked)
+    test_env.set_scaling_from(env)
     evaluation = Evaluation(_with_decisions(test_env, settings), settings.eval.seed)
     policy = agent.policy
     if settings.low.freeze:

@@ -97,7 +97,7 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_traini
     """Fill the agent from a checkpoint, with training also its optimisers and replay and the random generators.
 
     Returns:
-        The environment's columns; empty without training.
+        The environment's columns.
 
     Raises:
         ConfigError: the checkpoint is damaged or of another agent.
@@ -106,7 +106,7 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_traini
     checkpoint = _components(agent, columns)
     # What was empty when it was saved stays empty; anything else that is missing is an error.
     saved = set(Checkpoint.manifest(file)["components"])
-    wanted = (saved | _filled(agent)) if with_training else {"agent"}
+    wanted = (saved | _filled(agent)) if with_training else {"agent", "env"}
     try:
         checkpoint.load(file, components=wanted, map_location=device)
     except (CheckpointError, RuntimeError, OSError) as error:

@@ -126,7 +126,7 @@ def run_config(cfg: DictConfig) -> RunConfig:
         ConfigError: a wrong value, or a group for which nothing is chosen.
     """
     for group in GROUPS:
-        if cfg.get(group) is None:
+        if cfg.get(group) is None or _TARGET not in cfg[group]:
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
     plain = _plain(cfg)
     values = {name: value for name, value in plain.items() if name not in GROUPS}

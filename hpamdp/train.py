@@ -61,6 +61,7 @@ class Trainer:
         progress = checkpoint.progress_of(source)
         self.frames, self.wall_s, self.cpu_s = (progress[name] for name in ("frames", "wall_s", "cpu_s"))
         if not is_training:
+            self.parts.env.set_statistics(env_state)
             return
         try:
             self.parts.env.set_state_columns(env_state)
@@ -117,7 +118,8 @@ class Trainer:
     def _log(self, bar: tqdm, is_evaluated: bool) -> None:
         row = self.recorder.log(self.frames, self.wall_s, is_evaluated)
         if is_evaluated:
-            bar.set_postfix_str(f"score {row['eval/score']:.2f}, success {row['eval/success']:.1%}")
+            success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
+            bar.set_postfix_str(f"score {row['eval/score']:.2f}{success}")
 
     def save(self) -> None:
         """Write the checkpoint."""

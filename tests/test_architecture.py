@@ -35,7 +35,7 @@ def importers(package: str, inside: str = "hpamdp") -> set[str]:
 
 def test_the_modules_are_found():
     assert {"hpamdp.keys", "hpamdp.config", "hpamdp.env.physics", f"{LOW}.hyar"} <= set(FILES)
-    assert "hpamdp.policies.base" in {name.rpartition(".")[0] for name in imports(f"{LOW}.hyar")}
+    assert "hpamdp.policies.base" in {name.rpartition(".")[0] for name in imports(f"{LOW}.random")}
 
 
 @pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.env.physics"])

@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, SarsaLambda, fourier_coefficients
+from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, SarsaLambda
+from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients
 from hpamdp.specs import PAMDPSpecs
 
 # Two keys with a parameter each and one without.

@@ -77,6 +77,12 @@ class PAMDPEnv(EnvBase):
             ValueError: they are of another number of environments.
         """
 
+    def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
+        """Take from saved state columns what was learned of the observations' scale alone, as to score an agent."""
+
+    def set_scaling_from(self, other: PAMDPEnv) -> None:
+        """Scale observations as the other environment does, now and later, where their scale is learned."""
+
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""
         flag = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)

@@ -1,0 +1,174 @@
+"""Gather the runs of the learners' multirun into results.csv and curves.csv, and draw and tabulate them.
+
+python experiments/learners/study.py multirun/learners     reads the runs, writes both csv files, then draws
+python experiments/learners/study.py                       draws and tabulates what the csv files hold
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from collections import defaultdict
+from collections.abc import Iterable
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from hpamdp.metrics import read_rows
+
+HERE = Path(__file__).resolve().parent
+HUMAN = {"congruent": 2.012, "incongruent": 1.912}
+PEOPLE = 1.970
+COLOURS = {
+    "hppo": "#0072B2",
+    "hsac": "#D55E00",
+    "pdqn": "#009E73",
+    "hyar": "#CC79A7",
+    "qpamdp": "#E69F00",
+    "dlpa": "#56B4E9",
+    "pdqn as MP-DQN": "#6b6b00",
+    "pdqn as P-DQN": "#332288",
+}
+Rows = list[dict[str, str]]
+
+
+def gather(folder: Path) -> tuple[Rows, Rows]:
+    """Return a row a run and a row an evaluation of the finished runs under a multirun's folder."""
+    results, curves = [], []
+    for file in sorted(folder.glob("**/summary.json")):
+        summary, config = json.loads(file.read_text()), (file.parent / "config.yaml").read_text()
+        name = {"low": _name(summary["low"], config), "boat": summary["controller"]}
+        name |= {"reward": "sparse" if "reward: sparse" in config else "paper", "seed": summary["seed"]}
+        rows = [row for row in read_rows(file.parent / "metrics.csv") if "eval/score" in row]
+        reached = next((row for row in rows if row["eval/score"] >= PEOPLE), {})
+        results.append(
+            name
+            | {key: round(summary[key], 4) for key in ("score", "success", "ceiling")}
+            | {"random": round(summary["references"]["random"]["score"], 4)}
+            | {"presses": summary["frames"], "wall_s": round(summary["wall_s"], 1), "cpu_s": round(summary["cpu_s"], 1)}
+            | {"presses_to_people": reached.get("frames", ""), "wall_s_to_people": reached.get("wall_s", "")}
+        )
+        columns = ("frames", "wall_s", "eval/score", "eval/success")
+        curves += [name | {key: round(row[key], 4) for key in columns} for row in rows]
+    return results, curves
+
+
+def _name(low: str, config: str) -> str:
+    """Return the learner's name; P-DQN's published forms have names of their own."""
+    if low != "pdqn" or "twin_q: true" in config:
+        return low
+    return "pdqn as MP-DQN" if "multipass: true" in config else "pdqn as P-DQN"
+
+
+def write(path: Path, rows: Rows) -> None:
+    """Write rows as csv."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def read(path: Path) -> Rows:
+    """Read rows from csv."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def groups(rows: Rows, *names: str) -> dict[tuple[str, ...], Rows]:
+    """Return the rows by their values of the named columns."""
+    found = defaultdict(list)
+    for row in rows:
+        found[tuple(row[name] for name in names)].append(row)
+    return dict(found)
+
+
+def table(results: Rows) -> str:
+    """Return mean and standard deviation over seeds, a line a learner, boat and reward."""
+    lines = [
+        "| learner | boat | reward | seeds | score | success | presses | wall | CPU | presses to 1.97 | wall to 1.97 |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for (low, boat, reward), rows in groups(results, "low", "boat", "reward").items():
+        score, success = ([float(row[name]) for row in rows] for name in ("score", "success"))
+        wall, cpu, presses = (np.mean([float(row[name]) for row in rows]) for name in ("wall_s", "cpu_s", "presses"))
+        reached = [row for row in rows if row["presses_to_people"]]
+        first = ["-", "-"]
+        if len(reached) == len(rows):
+            to = [np.mean([float(row[name]) for row in rows]) for name in ("presses_to_people", "wall_s_to_people")]
+            first = [f"{to[0]:,.0f}", f"{to[1]:.0f} s"]
+        lines.append(
+            f"| {low} | {boat} | {reward} | {len(rows)} | {np.mean(score):.3f} ± {np.std(score, ddof=1):.3f} | "
+            f"{np.mean(success):.1%} | {presses:,.0f} | {wall:.0f} s | {cpu:.0f} s | {first[0]} | {first[1]} |"
+        )
+    return "\n".join(lines)
+
+
+def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
+    """Draw the learning curves of one reward, a panel a boat: mean over seeds and one standard deviation."""
+    chosen = [row for row in curves if row["reward"] == reward]
+    boats = sorted({row["boat"] for row in chosen})
+    figure = Figure(figsize=(6.4 * len(boats), 4.2), layout="constrained")
+    for axes, boat in zip(figure.subplots(1, len(boats), squeeze=False)[0], boats, strict=True):
+        of_boat = [row for row in chosen if row["boat"] == boat]
+        ends = [_draw_learner(axes, runs, low, x) for (low,), runs in groups(of_boat, "low").items() if low in COLOURS]
+        _draw_lines(axes, [row for row in results if row["boat"] == boat], boat)
+        axes.legend(loc="lower right", fontsize=8, frameon=False)
+        axes.set_xscale("log")
+        axes.set_xlim(right=max(ends) * 1.1)
+        axes.set_ylim(-1.3, 3.7)
+        axes.set_title(f"{boat} boat, {reward} reward", loc="left", fontweight="bold", fontsize=10)
+        axes.set_xlabel("presses" if x == "frames" else "seconds of training, evaluations included")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_ylabel("score, greedy, 1,000 layouts")
+    with mpl.rc_context({"font.size": 9}):
+        figure.savefig(path, dpi=130)
+
+
+def _draw_learner(axes: Axes, runs: Rows, low: str, x: str) -> float:
+    seeds = [np.array([(float(r[x]), float(r["eval/score"])) for r in rows]) for rows in groups(runs, "seed").values()]
+    num = min(len(seed) for seed in seeds)
+    at, score = np.mean([s[:num, 0] for s in seeds], 0), np.array([s[:num, 1] for s in seeds])
+    mean, deviation = score.mean(0), score.std(0)
+    late = at > 0
+    axes.plot(at[late], mean[late], color=COLOURS[low], linewidth=1.8, label=f"{low} {mean[-1]:.2f}")
+    axes.fill_between(
+        at[late], (mean - deviation)[late], (mean + deviation)[late], color=COLOURS[low], alpha=0.18, lw=0
+    )
+    return float(at[-1])
+
+
+def _draw_lines(axes: Axes, results: Rows, boat: str) -> None:
+    lines = {
+        "ceiling": (float(results[0]["ceiling"]), "#2b2b2b", "-"),
+        "people": (HUMAN[boat], "#D98200", "--"),
+        "random": (float(results[0]["random"]), "#8c8c8c", ":"),
+    }
+    for name, (height, colour, style) in lines.items():
+        axes.axhline(height, color=colour, linestyle=style, linewidth=1.0, zorder=1)
+        axes.annotate(f"{name} {height:.2f}", (0.005, height + 0.04), xycoords=("axes fraction", "data"), fontsize=8)
+
+
+def main(folders: Iterable[str]) -> None:
+    """Gather, draw, tabulate."""
+    results, curves = [], []
+    for folder in folders:
+        for target, rows in zip((results, curves), gather(Path(folder)), strict=True):
+            target += rows
+    if results:
+        write(HERE / "results.csv", results)
+        write(HERE / "curves.csv", curves)
+    results, curves = read(HERE / "results.csv"), read(HERE / "curves.csv")
+    for reward in sorted({row["reward"] for row in curves}):
+        draw(curves, results, reward, "frames", HERE / f"curves_{reward}.png")
+    draw(curves, results, "paper", "wall_s", HERE / "curves_seconds.png")
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

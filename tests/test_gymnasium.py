@@ -1,0 +1,406 @@
+"""Other people's environments get exactly the actions that are chosen, and are seen as every environment here is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+from toy_environments import ALL, FORMS, native_action
+
+from hpamdp import keys
+from hpamdp.config import ConfigError, build
+from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.gymnasium import GymnasiumEnv
+from hpamdp.specs import PAMDPSpecs
+
+TOY = "toy_environments:Toy"
+
+
+def make(num_envs: int = 1, *, form: str = "nested", max_steps: int | None = 6, **options) -> GymnasiumEnv:
+    kwargs = {"form": form, **options.pop("kwargs", {})}
+    options = {"entry_point": TOY, "parameter_dims": FORMS[form][1], "observation_scaling": "none", **options}
+    return GymnasiumEnv(num_envs, kwargs=kwargs, max_steps=max_steps, **options)
+
+
+def action(env: GymnasiumEnv, pressed, parameters) -> TensorDict:
+    press = {"key": torch.as_tensor(pressed), "duration": torch.as_tensor(parameters, dtype=torch.float32)}
+    return TensorDict({"action": TensorDict(press, env.batch_size)}, env.batch_size)
+
+
+def step(env: GymnasiumEnv, pressed=None, parameters=None) -> TensorDict:
+    """Press the first key, or those given, and return what comes of it."""
+    n = env.num_envs
+    pressed = torch.zeros(n, dtype=torch.int64) if pressed is None else pressed
+    parameters = torch.zeros(n, sum(env.parameter_dims)) if parameters is None else parameters
+    return env.step(action(env, pressed, parameters))["next"]
+
+
+def reset_rows(env: GymnasiumEnv, after: TensorDict, mask: list[bool]) -> TensorDict:
+    return env.reset(after.exclude(keys.REWARD).set("_reset", torch.tensor(mask).unsqueeze(-1)))
+
+
+def native(env: GymnasiumEnv, row: int = 0) -> list:
+    return env.envs[row].unwrapped.actions
+
+
+def equal(one, other) -> bool:
+    """Tell whether two nested actions are equal, shapes and types included."""
+    if isinstance(one, dict):
+        return isinstance(other, dict) and one.keys() == other.keys() and all(equal(one[k], other[k]) for k in one)
+    if isinstance(one, tuple):
+        return isinstance(other, tuple) and len(one) == len(other) and all(map(equal, one, other))
+    return one.dtype == other.dtype and one.shape == other.shape and np.array_equal(one, other)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_arrives_is_what_was_chosen(form):
+    env = make(2, form=form, max_steps=1000)
+    assert env.parameter_dims == ((2, 2, 2) if form == "shared" else (2, 0, 1))
+    specs = PAMDPSpecs.from_env(env)
+    assert (specs.num_keys, specs.parameter_dims) == (3, env.parameter_dims)
+    low, high = ([-1.0, 10.0] * 3, [1.0, 30.0] * 3) if form == "shared" else (ALL.low, ALL.high)
+    assert np.allclose(specs.parameter_low, low) and np.allclose(specs.parameter_high, high)
+    env.reset()
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        pressed = torch.randint(3, (2,), generator=generator)
+        # Well inside the bounds, where nothing is clipped.
+        unit = 0.9 * (2.0 * torch.rand(2, specs.num_parameters, generator=generator) - 1.0)
+        parameters = specs.from_unit(unit)
+        step(env, pressed, parameters)
+        for row in range(2):
+            assert equal(native(env, row)[-1], native_action(form, int(pressed[row]), parameters[row].numpy()))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_specs_hold(form):
+    # Toy refuses what its space does not contain, and the specs' samples come with rounded bounds.
+    check_env_specs(make(3, form=form, max_steps=2), return_contiguous=True)
+
+
+def test_values_outside_their_bounds_are_clipped():
+    env = make(2)
+    env.reset()
+    step(env, [0, 2], [[9.0, -9.0, 9.0], [-9.0, 99.0, -9.0]])
+    step(env, [2, 0], [[np.nan, np.inf, 0.3], [0.5, 20.0, np.nan]])
+    assert [[part.ravel().tolist() for part in boxes] for _, boxes in native(env, 0)] == [
+        [[1.0, 10.0], [], [0.3]],
+        [[-1.0, 30.0], [], [0.3]],
+    ]
+    assert native(env, 1)[0][1][2] == 0.1
+    assert native(env, 1)[1][1][2] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("pressed", "parameters", "complaint"),
+    [
+        ([0, 0], [[0.0, 20.0, 0.2], [0.0, np.nan, 0.2]], r"environment 1 got key=0 \(allowed 0 to 2\), .*nan"),
+        ([0, 2], [[0.0, 20.0, 0.2], [0.0, 20.0, np.inf]], "environment 1 got key=2"),
+        ([3, 0], [[0.0, 20.0, 0.2]] * 2, "environment 0 got key=3"),
+        ([0, -1], [[0.0, 20.0, 0.2]] * 2, "environment 1 got key=-1"),
+        ([0.0, 1.0], [[0.0, 20.0, 0.2]] * 2, "has type float32, but must be integer"),
+        ([0, 0], [[0.0, 20.0]] * 2, r"'duration'\) has shape \[2, 2\], but must be \[2, 3\]"),
+        ([[0], [0]], [[0.0, 20.0, 0.2]] * 2, r"'key'\) has shape \[2, 1\], but must be \[2\]"),
+    ],
+)
+def test_a_wrong_action_is_refused_and_harms_nothing(pressed, parameters, complaint):
+    env = make(2)
+    env.reset()
+    with pytest.raises(ValueError, match=complaint) as raised:
+        step(env, pressed, parameters)
+    assert "\n" not in str(raised.value)
+    assert not native(env, 0) and not native(env, 1)
+
+
+@pytest.mark.parametrize("action_format", ["tuple", "dict"])
+def test_our_own_task_goes_the_same_way_as_without_a_detour(action_format):
+    env = GymnasiumEnv(
+        3,
+        id="hpamdp/BoatDock-v0",
+        kwargs={"controller": "congruent", "action_format": action_format, "motor_noise": 0.1},
+        max_steps=25,
+        parameter_dims=[1, 1, 1] if action_format == "dict" else None,
+        observation_scaling="none",
+    )
+    seeds = torch.tensor([3, 14, 15])
+    boats = [BoatDockEnv(controller="congruent", motor_noise=0.1, seed=int(seed)) for seed in seeds]
+    seen = env.reset(TensorDict(seed=seeds, batch_size=[3]))
+    assert torch.equal(seen["observation"], torch.cat([boat.reset()["observation"] for boat in boats]))
+    generator = torch.Generator().manual_seed(0)
+    episodes = 0
+    for _ in range(90):
+        pressed = torch.randint(3, (3,), generator=generator)
+        seconds = 0.6 * torch.rand(3, 3, generator=generator) - 0.01
+        after = step(env, pressed, seconds)
+        others = torch.cat([step_one(boat, pressed[[i]], seconds[[i]]) for i, boat in enumerate(boats)])
+        for name in ("observation", "reward", "done", "terminated", "truncated"):
+            assert torch.equal(after[name], others[name]), name
+        if after["done"].all():
+            episodes += 1
+            mask = [True, False, True]
+            seen = reset_rows(env, after, mask)
+            rows = [boat.reset() if mask[i] else others[[i]] for i, boat in enumerate(boats)]
+            assert torch.equal(seen["observation"], torch.cat([row["observation"] for row in rows]))
+    assert episodes > 2
+
+
+def step_one(boat: BoatDockEnv, pressed: torch.Tensor, seconds: torch.Tensor) -> TensorDict:
+    press = TensorDict(key=pressed, duration=seconds, batch_size=[1])
+    after = boat.step(TensorDict(action=press, batch_size=[1]))["next"]
+    return after.select("observation", "reward", "done", "terminated", "truncated")
+
+
+def test_a_finished_episode_stays_and_earns_nothing_until_it_is_reset():
+    env = make(2, max_steps=3)
+    env.envs[0].unwrapped.length = 2
+    env.reset()
+    for _ in range(2):
+        last = step(env)
+    assert last["terminated"].squeeze(-1).tolist() == [True, False]
+    later = [step(env) for _ in range(3)]
+    assert all(torch.equal(after["observation"][0], last["observation"][0]) for after in later)
+    assert torch.stack([after["reward"] for after in later]).squeeze(-1).tolist() == [
+        [0.0, 3.0],
+        [0.0, 0.0],
+        [0.0, 0.0],
+    ]
+    assert len(native(env, 0)) == 2 and len(native(env, 1)) == 3
+    assert later[-1]["terminated"].squeeze(-1).tolist() == [True, False]
+    assert later[-1]["truncated"].squeeze(-1).tolist() == [False, True]
+    assert later[-1]["done"].all()
+    seen = reset_rows(env, later[-1], [False, True])
+    assert torch.equal(seen["observation"][0], last["observation"][0])
+    assert seen["done"].squeeze(-1).tolist() == [True, False] and seen["observation"][1, 1] == 0.0
+
+
+def test_what_was_returned_is_never_changed_later():
+    env = make(2)
+    kept = [env.reset(), step(env)]
+    copies = [td.clone() for td in kept]
+    step(env)
+    env.reset()
+    assert all((one == other).all() for one, other in zip(kept, copies, strict=True))
+
+
+def test_an_end_at_the_time_limit_is_no_truncation():
+    env = make(kwargs={"length": 2}, max_steps=2)
+    env.reset()
+    step(env)
+    after = step(env)
+    assert after["terminated"].item() and not after["truncated"].item()
+
+
+def test_a_partial_step_moves_only_its_rows():
+    env = make(2)
+    before = env.reset()
+    after = env.step(action(env, [0, 0], [[0.0] * 3] * 2).set("_step", torch.tensor([[True], [False]])))["next"]
+    assert torch.equal(after["observation"][1], before["observation"][1])
+    assert after["reward"].squeeze(-1).tolist() == [1.0, 0.0]
+    assert len(native(env, 0)) == 1 and not native(env, 1)
+
+
+def test_seeds_make_the_same_episodes_whatever_the_number_of_copies():
+    def first_three(env: GymnasiumEnv, **given) -> torch.Tensor:
+        return torch.stack([env.reset(**(given if number == 0 else {}))["observation"] for number in range(3)])
+
+    one, other = make(2, seed=5), make(4, seed=5)
+    seen = first_three(one)
+    assert torch.equal(seen, first_three(other)[:, :2])
+    assert len(set(seen[..., 0].flatten().tolist())) == 6
+    assert not torch.equal(seen, first_three(one))
+    one.set_seed(5)
+    assert torch.equal(seen, first_three(one))
+    one.set_seed(6)
+    assert not torch.equal(seen, first_three(one))
+    fixed = first_three(one, tensordict=one.fixed_episodes(5))
+    assert not torch.equal(seen[0], fixed[0])
+    assert torch.equal(fixed, first_three(make(2, seed=9), tensordict=one.fixed_episodes(5)))
+
+
+def test_given_seeds_concern_only_what_is_reset():
+    env = make(2, seed=1)
+    expected_row = make(2, seed=1).reset()["observation"][1]
+    reset_rows(env, env.full_done_spec.zero().set("seed", torch.tensor([8, 9])), [True, False])
+    assert torch.equal(env.reset()["observation"][1], expected_row)
+    for wrong in (torch.tensor([1, -1]), torch.tensor([1.0, 2.0]), torch.ones(2, 1, dtype=torch.int64)):
+        with pytest.raises(ValueError, match="seed must be integers of at least 0"):
+            env.reset(TensorDict(seed=wrong, batch_size=[2]))
+
+
+def test_the_time_limit_is_the_environments_own_or_the_one_given():
+    assert GymnasiumEnv(id="toy_environments:Toy-v0").max_steps == 6
+    assert GymnasiumEnv(entry_point="toy_environments:make_toy").max_steps == 6
+    for limit in (3, 9):
+        env = GymnasiumEnv(id="Toy-v0", max_steps=limit)
+        assert env.max_steps == limit
+        env.reset()
+        assert [step(env)["truncated"].item() for _ in range(limit)] == [False] * (limit - 1) + [True]
+
+
+def test_observations_of_any_form_are_one_vector():
+    env = GymnasiumEnv(2, entry_point="toy_environments:Mixed", max_steps=2)
+    assert env.reset()["observation"].shape == (2, 7)
+    check_env_specs(env)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "complaint"),
+    [({"size": 1}, "1 values, but its space has 2"), ({"value": float("nan")}, "that is not finite")],
+)
+def test_an_observation_that_the_space_does_not_have_is_refused(kwargs, complaint):
+    env = GymnasiumEnv(entry_point="toy_environments:Wrong", kwargs=kwargs, max_steps=5)
+    with pytest.raises(ValueError, match=f"Wrong: environment 0: gave an observation.*{complaint}"):
+        env.reset()
+
+
+def running(num_envs: int = 3, **options) -> GymnasiumEnv:
+    return make(num_envs, observation_scaling="running", **options)
+
+
+def test_running_statistics_are_those_of_all_observations_so_far():
+    env, plain = running(kwargs={"length": 3}), make(3, kwargs={"length": 3})
+    so_far = [plain.reset()["observation"]]
+    assert torch.allclose(env.reset()["observation"].mean(0), torch.zeros(2), atol=1e-6)
+    for number in range(5):
+        so_far.append(step(plain)["observation"][: 3 if number < 3 else 0])
+        after = step(env)["observation"]
+    everything = torch.cat(so_far).double()
+    mean, deviation = everything.mean(0), everything.std(0, correction=0)
+    assert torch.allclose(env.observations.statistics.mean, mean) and torch.allclose(
+        env.observations.statistics.variance.sqrt(), deviation
+    )
+    assert torch.allclose(after.double(), (so_far[3].double() - mean) / deviation, atol=1e-5)
+    check_env_specs(env)
+
+
+def test_running_statistics_are_saved_and_restored():
+    one, other = running(seed=1), running(seed=2)
+    one.reset()
+    step(one)
+    columns = one.state_columns()
+    kept = {name: column.clone() for name, column in columns.items()}
+    step(one)
+    assert all(torch.equal(columns[name], kept[name]) for name in kept)
+    other.set_state_columns(columns)
+    assert all(torch.equal(other.state_columns()[name], kept[name]) for name in kept)
+    other.reset()
+    assert all(torch.equal(columns[name], kept[name]) for name in kept)
+    with pytest.raises(ValueError, match="must have shape"):
+        other.set_state_columns({name: column[..., None] for name, column in columns.items()})
+    assert make().state_columns() == {}
+    make().set_state_columns({})
+
+
+def test_an_environment_for_evaluation_follows_the_statistics_and_adds_nothing():
+    training, evaluation = running(), running(kwargs={"form": "split"}, parameter_dims=[2, 0, 1])
+    evaluation.set_scaling_from(training)
+    plain = make(3).reset()["observation"]
+    assert torch.equal(evaluation.reset()["observation"], plain.clamp(-10.0, 10.0))
+    training.reset()
+    before = training.state_columns()
+    step(evaluation)
+    evaluation.set_seed(0)
+    seen = evaluation.reset()["observation"].double()
+    assert all(torch.equal(column, before[name]) for name, column in training.state_columns().items())
+    deviation = training.observations.statistics.variance.sqrt().where(
+        training.observations.statistics.variance > 0, 1.0
+    )
+    assert torch.allclose(seen, (plain - training.observations.statistics.mean) / deviation, atol=1e-5)
+    training.set_state_columns({name: column + 1.0 for name, column in before.items()})
+    evaluation.set_seed(0)
+    assert not torch.equal(evaluation.reset()["observation"].double(), seen)
+    make().set_scaling_from(make())
+    with pytest.raises(ValueError, match="scaling can be shared only"):
+        make().set_scaling_from(training)
+
+
+def test_success_is_what_the_infos_say():
+    silent, telling = make(2, kwargs={"length": 2}), make(2, kwargs={"length": 2, "success": True})
+    for env in (silent, telling):
+        env.reset()
+        env.envs[1].unwrapped.length = 4
+        for _ in range(2):
+            last = step(env)
+        assert last["success"].tolist() == [env is telling, False]
+    assert silent.results(last) == {}
+    assert telling.results(last)["success"].tolist() == [True, False]
+    assert step(telling)["success"].tolist() == [True, False]
+    assert telling.reset()["success"].tolist() == [False, False]
+    assert set(GymnasiumEnv.result_keys) <= set(last.keys())
+
+
+def test_closing_closes_every_copy():
+    env = make(3)
+    env.close()
+    assert not any(inner.unwrapped.is_open for inner in env.envs)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_an_old_environment_does_as_its_new_form_does(form):
+    one, other = make(2, form=form, kwargs={"length": 4}), make(2, form=form, entry_point="toy_environments:OldToy")
+    for env in other.envs:
+        env.unwrapped.env.toy.length = 4
+    assert torch.equal(one.reset()["observation"], other.reset()["observation"])
+    assert one.parameter_dims == other.parameter_dims
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(5):
+        pressed = torch.randint(3, (2,), generator=generator)
+        parameters = 30.0 * torch.rand(2, sum(one.parameter_dims), generator=generator)
+        after, others = step(one, pressed, parameters), step(other, pressed, parameters)
+        assert (after == others).all()
+    old_actions = other.envs[1].unwrapped.env.toy.actions
+    assert len(native(one, 1)) == 4 and all(map(equal, native(one, 1), old_actions))
+
+
+def test_an_old_time_limit_is_a_truncation():
+    for length, flags in ((0, (False, True)), (3, (True, False))):
+        env = make(entry_point="toy_environments:OldToy", kwargs={"length": length, "limit": 3})
+        env.reset()
+        last = [step(env) for _ in range(3)][-1]
+        assert (last["terminated"].item(), last["truncated"].item()) == flags
+
+
+def mistake_in(**options) -> str:
+    node = OmegaConf.create({"_target_": "hpamdp.env.gymnasium.GymnasiumEnv", **options})
+    with pytest.raises(ConfigError) as raised:
+        build("env", node, num_envs=2, device="cpu", seed=0)
+    assert "\n" not in str(raised.value) and "GymnasiumEnv" in str(raised.value)
+    return str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({}, "set env.id=Name-v0 or env.entry_point=package.module:name; neither is set"),
+        ({"id": "Toy-v0", "entry_point": TOY}, "both are set"),
+        ({"id": "Toy-v0", "max_steps": 0}, "max_steps=0, but must be at least 1 or null"),
+        ({"id": "Nowhere-v0"}, "Nowhere-v0: Environment `Nowhere` doesn't exist"),
+        ({"id": "Toy-v3"}, "Toy-v3: Environment version `v3`"),
+        ({"id": "nowhere:Toy-v0"}, "nowhere:Toy-v0: No module named 'nowhere'"),
+        ({"id": "not an id"}, "not an id: Malformed environment ID"),
+        ({"id": "Endless-v0"}, "Endless-v0: has no time limit of its own; set env.max_steps"),
+        ({"id": "CartPole-v1"}, "CartPole-v1: action space Discrete(2): not of these forms; accepted are "),
+        ({"id": "Toy-v0", "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
+        ({"entry_point": TOY, "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
+        ({"entry_point": "nowhere:Toy"}, "nowhere:Toy: No module named 'nowhere'"),
+        ({"entry_point": "toy_environments:Nobody"}, "there is no class or function Nobody in toy_environments"),
+        ({"entry_point": "toy_environments"}, "must be a class or function, as package.module:name"),
+        ({"entry_point": "builtins:object", "max_steps": 5}, "is no environment"),
+        ({"id": "Toy-v0", "parameter_dims": [1, 1, 1]}, "goes with one Box for all keys, but there is a Box for each"),
+        (
+            {"entry_point": "toy_environments:Mixed", "max_steps": 5, "kwargs": {"is_text": True}},
+            "observation space Text(1, 5, ",
+        ),
+    ],
+)
+def test_a_mistake_costs_one_line(options, complaint):
+    assert complaint in mistake_in(**options)
+
+
+def test_a_bug_in_an_environment_is_no_mistake_of_the_users():
+    for made_by in ({"id": "Toy-v0"}, {"entry_point": TOY}):
+        with pytest.raises(TypeError, match="has no len"):
+            make(**{"entry_point": None, **made_by}, kwargs={"broken": True})

@@ -1,0 +1,118 @@
+"""Spaces of Gymnasium and of gym are read as documented, and what cannot be read is refused in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
+from toy_environments import FORMS, MIXED, ONE, PAIR, TWO, Toy, old_space
+
+from hpamdp.env.action_spaces import ActionSpace
+from hpamdp.env.four_value import FourValueEnv, to_gymnasium
+from hpamdp.env.observation_spaces import ObservationSpace
+
+UNIT, TWO_BOXES = Box(0, 1, (1,)), Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
+
+
+@pytest.mark.parametrize(
+    ("space", "reason"),
+    [
+        (Discrete(3), "not of these forms"),
+        (UNIT, "not of these forms"),
+        (Tuple([Discrete(3)]), "not of these forms"),
+        (Dict(a=Discrete(2), b=TWO_BOXES, c=Discrete(2)), "not of these forms"),
+        (
+            Tuple([Box(np.zeros((2, 9)), np.ones((2, 9)) * np.arange(1.0, 10.0), dtype=np.float64), Discrete(3)]),
+            "no Discrete for the keys",
+        ),
+        (Dict(a=UNIT, b=UNIT), "no Discrete for the keys"),
+        (Tuple([Discrete(3), TWO_BOXES]), "3 keys, but 2 Boxes"),
+        (Tuple([Discrete(3), UNIT, UNIT]), "3 keys, but 2 Boxes"),
+        (Tuple([Discrete(2), MultiDiscrete([2, 3])]), "parameters must be Boxes of floats"),
+        (Tuple([Discrete(2), Discrete(2), Discrete(2)]), "parameters must be Boxes of floats"),
+        (Dict(a=Discrete(2), b=Discrete(2)), "parameters must be Boxes of floats"),
+        (Tuple([Discrete(2), Box(0, 9, (2,), dtype=np.int64)]), "parameters must be Boxes of floats"),
+        (Tuple([Discrete(2), Box(0, np.inf, (40, 2))]), "parameters must have finite bounds"),
+        (Tuple([Discrete(2), Box(-1e300, 1e300, (2,), dtype=np.float64)]), "parameters must have finite bounds"),
+        (Tuple([Discrete(2), Box(1, 1, (2,))]), "a parameter's lower bound must be less than its upper one"),
+        (Tuple([Discrete(2), Box(0, 1, (0,))]), "no key has a parameter"),
+    ],
+    ids=str,
+)
+def test_another_action_space_is_refused_in_one_line(space, reason):
+    with pytest.raises(ValueError) as raised:
+        ActionSpace(space)
+    line = str(raised.value)
+    assert line.startswith(f"action space {type(space).__name__}(") and "\n" not in line and len(line) < 700
+    assert f": {reason}; accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P" in line
+
+
+def test_how_a_box_is_split_must_add_up():
+    for wrong in ([1, 1, 2], [3], [4, -1, 0], []):
+        with pytest.raises(ValueError, match=r"must be 3 numbers of at least 0 that add up to 3"):
+            ActionSpace(FORMS["split"][0], wrong)
+    with pytest.raises(ValueError, match="goes with one Box for all keys"):
+        ActionSpace(FORMS["nested"][0], [2, 0, 1])
+
+
+def test_boxes_in_a_dict_belong_to_the_keys_in_its_order_unless_all_are_numbered():
+    def sizes(**boxes: int) -> tuple[int, ...]:
+        parts = [(name, spaces.Box(0.0, 1.0, (size,))) for name, size in boxes.items()]
+        space = spaces.Dict(key=spaces.Discrete(3), of=spaces.Dict(parts))
+        return ActionSpace(space).parameter_dims
+
+    assert sizes(go=1, at=2, by=3) == (1, 2, 3)
+    assert sizes(go10=1, at9=2, by8=3) == (3, 2, 1)
+    assert sizes(go10=1, at9=2, by=3) == (1, 2, 3)
+    assert sizes(go1=1, at1=2, by0=3) == (1, 2, 3)
+
+
+def test_observations_are_flattened():
+    value = (np.array([[1.5], [-2.0]], np.float32), np.int64(2), {"a": np.array([1, 0], np.int8)})
+    plain, scaled = (ObservationSpace(MIXED, scaling) for scaling in ("none", "bounds"))
+    assert plain.scaled(plain.flat(value)[None]).tolist() == [[1.5, -2.0, 0.0, 1.0, 0.0, 1.0, 0.0]]
+    assert scaled.scaled(scaled.flat(value)[None]).tolist() == [[0.75, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0]]
+
+
+def test_entries_without_bounds_stay_as_they_are():
+    low = np.array([0.0, -np.inf, -3.4e38, -1.0, -1e10, 5.0, 1e5])
+    high = np.array([4.0, 1.0, 3.4e38, np.inf, 1e10, 5.0, 1.00001e5])
+    for dtype in (np.float32, np.float64):
+        space = ObservationSpace(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype), "bounds")
+        seen = space.scaled(np.array([[1.0, 7.0, 7.0, 7.0, 7.0, 5.0, 1e5], [9.0, 7.0, 7.0, 7.0, 7.0, 5.0, 1e5]]))
+        assert seen.tolist() == [[-0.5, 7.0, 7.0, 7.0, 7.0, 5.0, -1.0], [3.5, 7.0, 7.0, 7.0, 7.0, 5.0, -1.0]]
+    image = ObservationSpace(spaces.Box(0, 255, (2, 2), np.uint8), "bounds")
+    assert image.scaled(image.flat(np.array([[0, 255], [0, 255]], np.uint8))[None]).tolist() == [[-1.0, 1.0, -1.0, 1.0]]
+
+
+def test_running_statistics_leave_what_never_varied_and_clip():
+    space = ObservationSpace(spaces.Box(-np.inf, np.inf, (2,)), "running")
+    for _ in range(300):
+        assert space.scaled(np.array([[3.0, 1e8]])).tolist() == [[0.0, 0.0]]
+    assert space.scaled(np.array([[4.0, 1e8]]))[0].tolist() == [10.0, 0.0]
+
+
+def test_old_spaces_are_told_by_their_attributes():
+    parts = [spaces.Discrete(3, start=2), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(4), TWO, ONE, PAIR]
+    parts += [spaces.Dict([("b", TWO), ("a", ONE)]), spaces.Box(0.0, 1.0, ())]
+    space = spaces.Tuple(parts)
+    assert to_gymnasium(old_space(space)) == space
+    assert list(to_gymnasium(old_space(parts[6])).spaces) == ["b", "a"]
+    with pytest.raises(ValueError, match="is no space that is known"):
+        to_gymnasium(object())
+
+
+class Halfway(Toy):
+    """Has Gymnasium's interface, but is passed on as if it had the old one."""
+
+
+def test_what_has_not_the_old_interface_is_refused():
+    env = FourValueEnv(Halfway())
+    with pytest.raises(ValueError, match=r"Halfway returned an info, too; .* must inherit"):
+        env.reset()
+    env.env.reset()
+    with pytest.raises(ValueError, match=r"Halfway returned 5 values, not 4; .* must inherit"):
+        env.step(env.action_space.sample())
+    with pytest.raises(ValueError, match="is no environment: it has no reset, step, action_space, observation_space"):
+        FourValueEnv(object())

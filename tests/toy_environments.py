@@ -1,0 +1,153 @@
+"""Small environments of every kind that hpamdp.env.gymnasium takes in; importing them registers Toy-v0."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+# Three keys with two, no and one parameter, in odd bounds that float32 cannot tell, shapes and types.
+TWO = spaces.Box(np.array([-1.0, 10.0]), np.array([1.0, 30.0]), dtype=np.float64)
+NONE = spaces.Box(0.0, 1.0, (0,))
+ONE = spaces.Box(0.1, 0.3, (1, 1), dtype=np.float64)
+ALL = spaces.Box(np.float32([-1.0, 10.0, 0.1]), np.float32([1.0, 30.0, 0.3]))
+PAIR = spaces.Box(np.float32([[-1.0, 10.0]]), np.float32([[1.0, 30.0]]))
+
+# Each form of action space, and the option that it needs.
+FORMS: dict[str, tuple[spaces.Space, list[int] | None]] = {
+    "nested": (spaces.Tuple([spaces.Discrete(3), spaces.Tuple([TWO, NONE, ONE])]), None),
+    "flat": (spaces.Tuple([spaces.Discrete(3, start=4), TWO, NONE, ONE]), None),
+    "dict of tuple": (spaces.Dict(move=spaces.Discrete(3, start=-1), by=spaces.Tuple([TWO, NONE, ONE])), None),
+    "dict of dict": (spaces.Dict(key=spaces.Discrete(3), of=spaces.Dict(a=TWO, b=NONE, c=ONE)), None),
+    "numbered": (spaces.Dict(key=spaces.Discrete(3), of=spaces.Dict(turn1=NONE, wait10=ONE, xgo0=TWO)), None),
+    "split": (spaces.Tuple([spaces.Discrete(3), ALL]), [2, 0, 1]),
+    "split dict": (spaces.Dict(how=ALL, what=spaces.Discrete(3, start=7)), [2, 0, 1]),
+    "shared": (spaces.Tuple([spaces.Discrete(3), PAIR]), None),
+}
+
+
+def native_action(form: str, key: int, values: np.ndarray):
+    """Return the native action of a key in 0..2 and the canonical parameters, written out."""
+    two, none, one = values[:2].astype(np.float64), np.zeros(0, np.float32), values[2:3, None].astype(np.float64)
+    k, boxes = np.int64(key), (two, none, one)
+    return {
+        "nested": (k, boxes),
+        "flat": (k + 4, *boxes),
+        "dict of tuple": {"move": k - 1, "by": boxes},
+        "dict of dict": {"key": k, "of": {"a": two, "b": none, "c": one}},
+        "numbered": {"key": k, "of": {"xgo0": two, "turn1": none, "wait10": one}},
+        "split": (k, values),
+        "split dict": {"how": values, "what": k + 7},
+        "shared": (k, values[2 * key : 2 * key + 2][None]),
+    }[form]
+
+
+class Toy(gymnasium.Env):
+    """Notes every action and observes random numbers, its own steps last.
+
+    Args:
+        form: of the action space, from FORMS.
+        length: steps to the end; 0 for no end.
+        success: what the info says at the end; None for nothing.
+        broken: makes a constructor with a bug.
+    """
+
+    def __init__(self, form: str = "nested", length: int = 0, success: bool | None = None, broken: bool = False):
+        if broken:
+            len(3)  # a bug
+        self.action_space = FORMS[form][0]
+        self.observation_space = spaces.Box(np.array([-3.0, 0.0]), np.array([5.0, np.inf]), dtype=np.float64)
+        self.length, self.success = length, success
+        self.actions: list[Any] = []
+        self.is_open = True
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._observation(), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action), action
+        self.actions.append(action)
+        self.steps += 1
+        is_over = self.steps == self.length
+        info = {"is_success": self.success} if is_over and self.success is not None else {}
+        return self._observation(), np.float64(self.steps), is_over, False, info
+
+    def close(self):
+        self.is_open = False
+
+    def _observation(self):
+        return np.array([self.np_random.uniform(-3.0, 5.0), self.steps])
+
+
+# What a Mixed observes: seven numbers once it is flattened.
+MIXED = spaces.Tuple([spaces.Box(-2, 2, (2, 1)), spaces.Discrete(3, start=1), spaces.Dict(a=spaces.MultiBinary(2))])
+
+
+class Mixed(Toy):
+    """Observes samples of MIXED, or of a space of words."""
+
+    def __init__(self, is_text: bool = False):
+        super().__init__()
+        self.observation_space = spaces.Text(5) if is_text else MIXED
+
+    def _observation(self):
+        return self.observation_space.sample()
+
+
+class Wrong(Toy):
+    """Observes what its space does not hold."""
+
+    def __init__(self, size: int = 2, value: float = 0.0):
+        super().__init__()
+        self.size, self.value = size, value
+
+    def _observation(self):
+        return np.full(self.size, self.value)
+
+
+def old_space(space: spaces.Space) -> Any:
+    """Return a space that has the attributes of gym's, and no more."""
+    if isinstance(space, spaces.Tuple):
+        return SimpleNamespace(spaces=[old_space(part) for part in space.spaces], shape=None)
+    if isinstance(space, spaces.Dict):
+        return SimpleNamespace(spaces=OrderedDict((name, old_space(part)) for name, part in space.spaces.items()))
+    names = ("low", "high", "shape", "dtype") if isinstance(space, spaces.Box) else ("n", "start", "nvec", "shape")
+    return SimpleNamespace(**{name: getattr(space, name) for name in names if hasattr(space, name)})
+
+
+class OldToy:
+    """Toy with the old four-value interface, and a time limit as gym had them; a Gymnasium environment for nobody."""
+
+    def __init__(self, form: str = "nested", length: int = 0, limit: int = 0):
+        self.toy, self.limit = Toy(form, length), limit
+        self.action_space, self.observation_space = map(old_space, (self.toy.action_space, self.toy.observation_space))
+        self.seeds: list[int | None] = []
+
+    def seed(self, seed: int | None = None) -> list[int | None]:
+        self.seeds.append(seed)
+        return [seed]
+
+    def reset(self) -> Any:
+        seed = self.seeds.pop() if self.seeds else None
+        return self.toy.reset(seed=seed)[0]
+
+    def step(self, action: Any) -> tuple[Any, float, bool, dict]:
+        observation, reward, done, _, info = self.toy.step(action)
+        if self.toy.steps == self.limit:
+            info["TimeLimit.truncated"] = not done
+            done = True
+        return observation, reward, done, info
+
+
+def make_toy(**kwargs: Any) -> gymnasium.Env:
+    return gymnasium.make("Toy-v0", **kwargs)
+
+
+gymnasium.register("Toy-v0", entry_point=Toy, max_episode_steps=6)
+gymnasium.register("Endless-v0", entry_point="toy_environments:Toy")
