@@ -69,7 +69,8 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
         env, policy = ControllerChoiceEnv(agent.router, env), agent.selector
     config = OmegaConf.to_container(cfg, resolve=True)
     logger = build("logger", cfg.logger, output_dir=output_dir, config=config)
-    return Parts(_with_decisions(env, settings), policy, evaluation, agent, logger, device)
+    gamma = 1.0 if selector is None else selector.gamma
+    return Parts(_with_decisions(env, settings, gamma), policy, evaluation, agent, logger, device)
 
 
 def _asked_of_env(cfg: DictConfig, classes: dict[str, type | None]) -> dict[str, Any]:
@@ -85,9 +86,9 @@ def _asked_of_env(cfg: DictConfig, classes: dict[str, type | None]) -> dict[str,
     return asked
 
 
-def _with_decisions(env: PAMDPEnv, settings: RunConfig) -> TransformedEnv:
+def _with_decisions(env: PAMDPEnv, settings: RunConfig, gamma: float = 1.0) -> TransformedEnv:
     length = settings.agent.option_length
-    return with_decisions(env, option_length=None if length == "episode" else length)
+    return with_decisions(env) if length == "episode" else with_decisions(env, gamma, length)
 
 
 def _check_levels(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, classes: dict[str, type | None]) -> None:
@@ -109,6 +110,10 @@ def _check_levels(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, classes: 
         raise ConfigError(f"agent.option_length={length}: env={name} {why}; use agent.option_length=episode")
     if settings.low.freeze and not env.has_choice:
         raise ConfigError("low.freeze=true: there is no choice left to learn; use low.freeze=false")
+    if settings.low.freeze and length != "episode":
+        raise ConfigError(
+            f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
+        )
 
 
 def _check_values(cfg: DictConfig, agent: HierarchicalAgent) -> None:

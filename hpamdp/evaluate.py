@@ -15,6 +15,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.policies.agent import HierarchicalAgent
 
+# Keeps the randomness of the evaluation apart from that of a training run with the same seed.
+_APART = 0x5EED0000
+
 
 class Evaluation:
     """A fixed set of episodes with what is known of them, on which agents are scored.
@@ -31,8 +34,9 @@ class Evaluation:
         self.known = env.describe()
 
     def _reset(self) -> TensorDictBase:
-        self.env.set_seed(self.seed)  # the noise, too, is the same at every evaluation
-        return self.env.reset(None if self.episodes is None else self.episodes.clone())
+        self.env.set_seed(self.seed ^ _APART)  # the noise, too, is the same at every evaluation
+        self.env.begin_with(self.episodes)
+        return self.env.reset()
 
     def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
         """Play every episode greedily; return one array an attribute, first dimension the episode.
@@ -85,12 +89,15 @@ class Evaluation:
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of an evaluation: score, return, presses, success, and what else the environment tells.
 
-        Of choices: `regret`, what the better option of each episode would have scored with the agent's own low level
-        less what was scored; `score_NAME`, the score with the option NAME held; `choice_gain`, the score less that of
-        the best option held; `choice_entropy` of the options' shares (nats).
+        `optimality_gap` is what is missing to the environment's `ceiling`. Of choices: `regret`, what the better option
+        of each episode would have scored with the agent's own low level less what was scored; `score_NAME`, the score
+        with the option NAME held; `choice_gain`, the score less that of the best option held; `choice_entropy` of the
+        options' shares (nats).
         """
         names = [name for name in ("score", "success", "return", "presses") if name in played]
         means = {name: float(played[name].mean()) for name in names} | self.env.measure(played)
+        if "ceiling" in means:
+            means["optimality_gap"] = means["ceiling"] - means["score"]
         if "option_scores" not in played:
             return means
         held, score = played["option_scores"], played["score"]

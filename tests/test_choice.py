@@ -2,15 +2,24 @@
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import check_env_specs
+from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.modules import MLP, EGreedyModule, QValueModule
+from torchrl.objectives import DQNLoss
+from toy_options import Crossing, WholeStep, steppers
 
 from hpamdp import keys
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock import BoatDockEnv
 from hpamdp.env.choice import ControllerChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.policies.high_level.fixed import Fixed
+from hpamdp.policies.low_level.planner import PlannerPolicy
 from hpamdp.policies.low_level.random import RandomPolicy
 from hpamdp.specs import PAMDPSpecs
 
@@ -32,6 +41,7 @@ def make(num_envs: int) -> ControllerChoiceEnv:
 def test_specs_are_clean():
     env = BoatDockEnv(4)
     check_env_specs(ControllerChoiceEnv(RandomPolicy(PAMDPSpecs.from_env(env)), env))
+    check_env_specs(with_decisions(ControllerChoiceEnv(WholeStep(), Crossing(4, start=6.0))))
 
 
 def test_every_step_is_one_whole_episode():
@@ -62,6 +72,105 @@ def test_reward_is_the_return_of_the_episode_played_press_by_press(option):
     torch.testing.assert_close(reward, expected)
 
 
-def test_an_environment_without_a_choice_is_refused():
+@pytest.mark.parametrize("option", [0, 1])
+def test_any_environment_with_a_choice_will_do(option):
+    class Hurried(Crossing):
+        max_steps = 10
+
+    env = ControllerChoiceEnv(WholeStep(), Hurried(40, start=6.0, seed=1))
+    after = env.step(env.reset().set(keys.OPTION, torch.full((40,), option)))["next"]
+
+    specs = PAMDPSpecs.from_env(Hurried(1))
+    single = with_decisions(Hurried(40, start=6.0, seed=1))
+    rows = single.rollout(10, steppers(Fixed(specs, option=option), specs).policy, break_when_any_done=False)
+    first_end = rows["next", keys.DONE].squeeze(-1).int().argmax(1)
+    arrived = rows["next", keys.TERMINATED][torch.arange(40), first_end]
+    assert arrived.any() and not arrived.all()
+    assert torch.equal(after[keys.REWARD], arrived.float())
+    assert torch.equal(env.results(after)["success"], arrived.squeeze(-1))
+    assert after[keys.TERMINATED].all() and not after[keys.TRUNCATED].any()
+
+
+@pytest.mark.parametrize("outside", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+def test_the_low_level_acts_greedily_while_the_options_are_explored(outside):
+    seen = set()
+
+    class Listening(Presser):
+        def forward(self, td):
+            seen.add(exploration_type())
+            return super().forward(td)
+
+    env = ControllerChoiceEnv(Listening(), BoatDockEnv(3))
+    with set_exploration_type(outside):
+        env.rollout(2)
+        assert exploration_type() == outside
+    assert seen == {ExplorationType.DETERMINISTIC}
+
+
+def test_it_is_itself_a_problem_that_the_framework_takes():
+    env, boats = make(5), BoatDockEnv(5, seed=3)
+    assert isinstance(env, PAMDPEnv) and env.has_choice and env.max_steps == 1
+    assert env.option_names == boats.option_names and env.result_keys == boats.result_keys
+    assert (env.fixed_episodes(4) == boats.fixed_episodes(4)).all()
+    rows = env.rollout(3, break_when_any_done=False)
+    assert set(env.results(rows[:, -1]["next"])) == {"outcome", "fuel", "score", "success"}
+    assert list(env.parameters()) == []
+
+
+def test_episodes_go_on_where_the_state_was_taken():
+    env, other = make(5), make(5)
+    env.rollout(3, break_when_any_done=False)
+    other.set_state_columns(env.state_columns())
+    expected = env.reset()[keys.OBSERVATION]
+    torch.testing.assert_close(other.reset()[keys.OBSERVATION], expected)
+
+
+def test_given_layouts_are_played():
+    env = make(20)
+    td = env.reset(env.fixed_episodes(0))
+    again = make(20)
+    again.reset()
+    torch.testing.assert_close(again.reset(again.fixed_episodes(0))[keys.OBSERVATION], td[keys.OBSERVATION])
+
+
+@pytest.mark.parametrize("controller", ["congruent", "random"])
+def test_an_environment_without_a_choice_is_refused(controller):
     with pytest.raises(ValueError, match="choose"):
-        ControllerChoiceEnv(Presser(), BoatDockEnv(2, controller="congruent"))
+        ControllerChoiceEnv(Presser(), BoatDockEnv(2, controller=controller))
+
+
+def planned(num_envs: int, seed: int = 0) -> ControllerChoiceEnv:
+    boats = BoatDockEnv(num_envs, oracle=True, seed=seed)
+    return ControllerChoiceEnv(PlannerPolicy(PAMDPSpecs.from_env(boats)), boats)
+
+
+def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
+    torch.manual_seed(0)
+    env = planned(50, seed=5)
+    q = TensorDictModule(MLP(16, 2, num_cells=[64, 64]), [keys.OBSERVATION], ["action_value"])
+    out_keys = [keys.OPTION, "action_value", "chosen_action_value"]
+    greedy = TensorDictSequential(q, QValueModule(action_space="categorical", out_keys=out_keys))
+    option = env.full_action_spec[keys.OPTION]
+    explore = EGreedyModule(option, eps_init=1.0, eps_end=0.2, annealing_num_steps=500, action_key=keys.OPTION)
+    loss = DQNLoss(greedy, action_space="categorical", delay_value=False)
+    loss.set_keys(action=keys.OPTION)
+    loss.make_value_estimator(gamma=1.0)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(1000), batch_size=128)
+    policy = TensorDictSequential(greedy, explore)
+    collector = Collector(env, policy, frames_per_batch=50, total_frames=1000, auto_register_policy_transforms=False)
+    for batch in collector:
+        buffer.extend(batch.reshape(-1))
+        explore.step(len(batch))
+        for _ in range(30):
+            optimiser.zero_grad()
+            loss(buffer.sample())["loss"].backward()
+            optimiser.step()
+    collector.shutdown(close_env=False)
+
+    test, returns = planned(250), []
+    for chosen in (0, 1, None):
+        td = test.reset(test.fixed_episodes(0))
+        td = greedy(td) if chosen is None else td.set(keys.OPTION, torch.full((250,), chosen))
+        returns.append(test.step(td)["next", keys.REWARD].mean().item())
+    assert returns[2] > max(returns[:2]) + 0.1  # the best choices: 0.23

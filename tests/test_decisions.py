@@ -1,15 +1,19 @@
-"""DecisionTracker: the semi-MDP view of an episode."""
+"""DecisionTracker: the semi-MDP view of an episode, and what it is worth to choose anew within one."""
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import check_env_specs
+from toy_options import Crossing, Toll, best_value, earned, steppers
 
 from hpamdp import keys
 from hpamdp.env.boatdock import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.actor import Actor
+from hpamdp.policies.high_level.meta_critic import MetaCritic
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
 from hpamdp.specs import PAMDPSpecs
@@ -21,44 +25,78 @@ def random_agent(env):
     return HierarchicalAgent(selector, [Random(specs) for _ in range(max(1, specs.num_options))], specs)
 
 
+def collect(env, policy, num_envs: int, steps: int, batch_steps: int):
+    """Yield the batches `[num_envs, batch_steps]` that a collector gives."""
+    collector = Collector(
+        env,
+        policy,
+        frames_per_batch=num_envs * batch_steps,
+        total_frames=num_envs * steps,
+        auto_register_policy_transforms=False,
+    )
+    yield from collector
+    collector.shutdown()
+
+
 @pytest.mark.parametrize("controller", ["choose", "congruent", "random"])
 def test_tracked_environment_has_clean_specs(controller):
     check_env_specs(with_decisions(BoatDockEnv(3, controller=controller)))
 
 
-def account(rows: TensorDict, gamma: float) -> None:
-    """Follow one environment's rows and hold every key of the tracker against a count of our own."""
-    is_due, total, steps, decided_at = True, 0.0, 0, rows[0][keys.OBSERVATION]
+def test_tracked_environment_with_options_of_a_fixed_length_has_clean_specs():
+    check_env_specs(with_decisions(Crossing(3, start=6.0), 0.9, 2))
+
+
+def account(rows: TensorDict, gamma: float, option_length: int | None = None) -> int:
+    """Follow one environment's rows and hold every key of the tracker against a count of our own.
+
+    Return how many options ended before their episode.
+    """
+    is_due, is_first, total, steps, decided_at, num_cut = True, True, 0.0, 0, None, 0
     for row in rows:
         assert row[keys.IS_DECISION].item() == is_due
+        if is_first:
+            episode_return, episode_steps = 0.0, 0
         if is_due:
             total, steps, decided_at, option = 0.0, 0, row[keys.OBSERVATION], row[keys.OPTION]
-        assert row[keys.OPTION] == option, "the option changed inside an episode"
-        total += gamma**steps * row["next", keys.REWARD].item()
-        steps += 1
-        is_due = row["next", keys.DONE].item()
+        assert row[keys.OPTION] == option, "the option changed where no decision was due"
+        reward = row["next", keys.REWARD].item()
+        total += gamma**steps * reward
+        episode_return += reward
+        steps, episode_steps = steps + 1, episode_steps + 1
+        is_first = row["next", keys.DONE].item()
+        is_due = is_first or steps == option_length
+        num_cut += is_due and not is_first
         assert row["next", keys.IS_DECISION].item() == is_due
         assert row["next", keys.OPTION_STEPS].item() == steps
         assert row["next", keys.OPTION_RETURN].item() == pytest.approx(total, abs=1e-5)
+        assert row["next", keys.EPISODE_RETURN].item() == pytest.approx(episode_return, abs=1e-5)
+        assert row["next", keys.EPISODE_STEPS].item() == episode_steps
         assert torch.equal(row["next", keys.DECISION_OBSERVATION], decided_at)
+    return num_cut
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
 def test_options_are_accounted_right_across_collected_batches(gamma):
     torch.manual_seed(0)
     env = with_decisions(BoatDockEnv(4), gamma)
-    collector = Collector(
-        env,
-        random_agent(env).policy,
-        frames_per_batch=4 * 3,
-        total_frames=4 * 60,
-        auto_register_policy_transforms=False,
-    )
-    rows = torch.cat([batch.clone() for batch in collector], 1)
-    collector.shutdown()
+    rows = torch.cat([batch.clone() for batch in collect(env, random_agent(env).policy, 4, 60, 3)], 1)
     assert rows.shape == (4, 60)
     for environment in rows:
-        account(environment, gamma)
+        assert account(environment, gamma) == 0
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.9])
+@pytest.mark.parametrize(("option_length", "batch_steps"), [(1, 3), (4, 3), (5, 7), (100, 3)])
+def test_options_of_a_fixed_length_are_accounted_right_across_collected_batches(option_length, batch_steps, gamma):
+    torch.manual_seed(0)
+    env = with_decisions(Toll(4, start=6.0), gamma, option_length)
+    specs = PAMDPSpecs.from_env(env)
+    rows = [batch.clone() for batch in collect(env, steppers(Uniform(specs), specs).policy, 4, 63, batch_steps)]
+    rows = torch.cat(rows, 1)
+    assert rows["next", keys.DONE].sum() > 10
+    for environment in rows:
+        assert (account(environment, gamma, option_length) > 5) == (option_length < 100)
 
 
 def test_decisions_of_one_environment_survive_the_resets_of_others():
@@ -68,3 +106,71 @@ def test_decisions_of_one_environment_survive_the_resets_of_others():
     assert rows["next", keys.DONE].any(1).all()
     for environment in rows:
         account(environment, 1.0)
+
+
+def test_the_selector_learns_from_every_decision_once_oldest_first():
+    class Listener(Uniform):
+        heard = ()
+
+        def learn(self, decisions):
+            self.heard = (*self.heard, decisions.clone())
+            return {}
+
+    torch.manual_seed(0)
+    env = with_decisions(Toll(4, start=6.0), 0.9, 2)
+    specs = PAMDPSpecs.from_env(env)
+    agent, rows = steppers(Listener(specs), specs), []
+    for batch in collect(env, agent.policy, 4, 60, 5):
+        rows.append(batch.clone())
+        agent.learn(batch)
+    rows, heard = torch.cat(rows, 1), torch.cat(agent.selector.heard)
+    is_end = rows["next", keys.IS_DECISION].squeeze(-1)
+    assert len(heard) == is_end.sum() > 60
+    expected = torch.cat([rows[:, t][is_end[:, t]]["next", keys.OPTION_RETURN] for t in range(60)])
+    assert torch.equal(heard["next", keys.OPTION_RETURN], expected)
+
+
+# What it is worth to choose anew within an episode.
+
+GAMMA = 0.9
+
+
+def test_the_optimum_of_the_crossing_is_that_of_a_count_by_hand():
+    # Two steps: walk 2, walk 1.25, swim 2, arrive with the first. Three: walk 3, swim 3. An episode: 3 on the right
+    # side, 12 on the wrong one.
+    assert best_value(GAMMA, 2) == pytest.approx(GAMMA**6)
+    assert best_value(GAMMA, 3) == pytest.approx(GAMMA**5)
+    assert best_value(GAMMA, Crossing.max_steps) == pytest.approx(GAMMA**14)
+
+
+def trained(selector: Selector, option_length: int | None, num_batches: int) -> float:
+    """Train a selector on the crossing; return the discounted return of its greedy choices."""
+    env = with_decisions(Crossing(50, start=6.0), GAMMA, option_length)
+    agent = steppers(selector, selector.specs)
+    for batch in collect(env, agent.policy, 50, 10 * num_batches, 10):
+        agent.learn(batch)
+    return earned(agent, GAMMA, option_length)
+
+
+def make_meta_critic() -> MetaCritic:
+    torch.manual_seed(0)
+    options = dict(
+        hidden_dims=[64], num_members=1, exploration="epsilon", epsilon_final=0.2, epsilon_decisions=2000,
+        ucb_width=2.0, gamma=GAMMA, bootstrap=0.0, buffer_size=5000, batch_size=64, updates_per_decision=0.15,
+        max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
+    )  # fmt: skip
+    return MetaCritic(PAMDPSpecs.from_env(Crossing()), torch.device("cpu"), **options)
+
+
+def make_actor() -> Actor:
+    torch.manual_seed(0)
+    options = dict(hidden_dims=[64], epochs=4, minibatch_size=128, clip=0.2, entropy=0.01, lr=3e-3, max_grad_norm=0.5)
+    return Actor(PAMDPSpecs.from_env(Crossing()), torch.device("cpu"), gamma=GAMMA, **options)
+
+
+@pytest.mark.parametrize(("make", "num_batches"), [(make_meta_critic, 25), (make_actor, 80)])
+def test_options_of_a_fixed_length_are_chosen_optimally_and_beat_those_that_last_an_episode(make, num_batches):
+    anew = trained(make(), 2, num_batches)
+    assert anew >= 0.95 * best_value(GAMMA, 2)
+    whole = trained(make(), None, num_batches)
+    assert whole <= best_value(GAMMA, Crossing.max_steps) + 1e-6 < 0.5 * anew

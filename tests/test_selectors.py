@@ -1,52 +1,110 @@
-"""Selectors: what each one chooses, and that the bandits find the better arm."""
-
-import math
+"""What all selectors have in common, and those that learn nothing."""
 
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_bandits import CPU, SPECS, due
+from toy_options import Stepper, Toll
 
 from hpamdp import keys
+from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Selector
+from hpamdp.policies.high_level.actor import LOG_PROB, Actor
+from hpamdp.policies.high_level.exp3 import PROBABILITY, Exp3
 from hpamdp.policies.high_level.fixed import Fixed
+from hpamdp.policies.high_level.human import Human
 from hpamdp.policies.high_level.oracle import Oracle
-from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.high_level.uniform import Uniform
+from hpamdp.policies.low_level.random import Random
+from hpamdp.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.specs import PAMDPSpecs
 
-SPECS = PAMDPSpecs(2, ("left", "right"), (1, 1), (0.0, 0.0), (1.0, 1.0))
-UCB_VARIANTS = ("ucb1", "discounted", "sliding_window")
+
+def make_actor(specs: PAMDPSpecs) -> Actor:
+    options = dict(hidden_dims=[16], gamma=1.0, epochs=1, minibatch_size=8, clip=0.2, entropy=0.0)
+    return Actor(specs, CPU, **options, lr=1e-3, max_grad_norm=1.0)
 
 
-def due(num: int, **more: torch.Tensor) -> TensorDict:
-    """Return a root at which every environment decides."""
-    is_decision = torch.ones(num, 1, dtype=torch.bool)
-    return TensorDict({keys.OBSERVATION: torch.zeros(num, 2), keys.IS_DECISION: is_decision, **more}, [num])
+def make_exp3(specs: PAMDPSpecs) -> Exp3:
+    return Exp3(specs, exploration=0.5, memory="all", discount=0.9, window=5)
 
 
-def ended(options: torch.Tensor, payoffs: torch.Tensor) -> TensorDict:
-    return TensorDict({keys.OPTION: options, "next": {keys.OPTION_RETURN: payoffs.unsqueeze(-1)}}, options.shape)
+class Counter(Selector):
+    """Choose 0, 1, 0, 1 ... at its calls, and say at which."""
+
+    def __init__(self) -> None:
+        super().__init__(SPECS)
+        self.out_keys = [*self.out_keys, "call"]
+        self.calls = 0
+
+    def choose(self, td: TensorDict) -> dict[str, torch.Tensor]:
+        self.calls += 1
+        call = torch.full(td.batch_size, self.calls)
+        return {keys.OPTION: (call - 1) % 2, "call": call}
 
 
-def make_ucb(variant: str = "ucb1", exploration: float = 1.0, discount: float = 0.99, window: int = 500) -> UCB:
-    return UCB(SPECS, exploration=exploration, variant=variant, discount=discount, window=window)
+def test_all_that_a_choice_tells_is_held_where_no_decision_is_due():
+    counter, root = Counter(), due(4)
+    first = counter(root)
+    assert first[keys.OPTION].tolist() == [0] * 4 and first["call"].tolist() == [1] * 4
+    root[keys.IS_DECISION] = torch.tensor([[True], [False], [False], [True]])
+    second = counter(root)
+    assert second[keys.OPTION].tolist() == [1, 0, 0, 1] and second["call"].tolist() == [2, 1, 1, 2]
+    root[keys.IS_DECISION] = torch.zeros(4, 1, dtype=torch.bool)
+    assert counter(root)["call"].tolist() == [2, 1, 1, 2] and counter.calls == 2
 
 
-def play(selector: UCB, means: tuple[float, float], num_rounds: int, batch: int = 1) -> torch.Tensor:
-    """Let the selector play a two-armed Gaussian bandit; return its choices `[num_rounds * batch]`."""
-    choices = []
-    for _ in range(num_rounds):
-        options = selector.select(due(batch))
-        payoffs = torch.tensor(means)[options] + torch.randn(batch)
-        selector.learn(ended(options, payoffs))
-        choices.append(options)
-    return torch.cat(choices)
+def probability_now(selector: Selector, rows: TensorDict) -> torch.Tensor:
+    """Return the (log-)probability of the rows' options as the selector would choose now."""
+    option = rows[keys.OPTION]
+    if isinstance(selector, Exp3):
+        return selector.probabilities.float()[option]
+    return selector.logits(rows[keys.OBSERVATION]).log_softmax(-1).gather(-1, option.unsqueeze(-1)).squeeze(-1).detach()
 
 
-def test_the_held_option_stays_where_no_decision_is_due():
-    td = due(4, option=torch.tensor([0, 1, 0, 1]))
-    td[keys.IS_DECISION][:] = torch.tensor([[True], [False], [False], [True]])
-    assert Fixed(SPECS, option="right")(td)[keys.OPTION].tolist() == [1, 1, 0, 1]
+@pytest.mark.parametrize(("env_class", "option_length"), [(BoatDockEnv, None), (Toll, None), (Toll, 4)])
+@pytest.mark.parametrize(("make", "key"), [(make_actor, LOG_PROB), (make_exp3, PROBABILITY)])
+def test_a_choices_probability_is_held_with_the_option_while_the_selector_learns(make, key, env_class, option_length):
+    torch.manual_seed(0)
+    env = with_decisions(env_class(6), option_length=option_length)
+    specs = PAMDPSpecs.from_env(env)
+    selector = make(specs)
+    learner = Random if env_class is BoatDockEnv else Stepper
+    agent = HierarchicalAgent(selector, [learner(specs), learner(specs)], specs)
+    frames = dict(frames_per_batch=6 * 7, total_frames=6 * 63)
+    collector = Collector(env, agent.policy, **frames, auto_register_policy_transforms=False)
+    rows, now = [], []
+    for batch in collector:
+        rows.append(batch.clone())
+        now.append(probability_now(selector, batch))
+        agent.learn(batch)
+    collector.shutdown()
+    rows, now = torch.cat(rows, 1), torch.cat(now, 1)
+    is_decision = rows[keys.IS_DECISION].squeeze(-1)
+    torch.testing.assert_close(rows[key][is_decision], now[is_decision])
+    goes_on = ~is_decision[:, 1:]
+    assert goes_on.sum() > 50 and is_decision.sum() > 20
+    for held in (keys.OPTION, key):
+        assert torch.equal(rows[held][:, 1:][goes_on], rows[held][:, :-1][goes_on])
+    assert not torch.isclose(rows[key], now).all(), "the selector has learned while options were held"
+
+
+@pytest.mark.parametrize(("make", "key"), [(make_actor, LOG_PROB), (make_exp3, PROBABILITY)])
+def test_a_finished_decision_tells_the_probability_at_the_decision(make, key):
+    torch.manual_seed(0)
+    env = with_decisions(BoatDockEnv(6))
+    specs = PAMDPSpecs.from_env(env)
+    selector = make(specs)
+    agent = HierarchicalAgent(selector, [Random(specs), Random(specs)], specs)
+    rows = env.rollout(40, agent.policy, break_when_any_done=False)
+    ended = rows[rows["next", keys.IS_DECISION].squeeze(-1)]
+    decided = ended.select(keys.OPTION).set(keys.OBSERVATION, ended["next", keys.DECISION_OBSERVATION])
+    assert len(ended) > 20
+    torch.testing.assert_close(ended[key], probability_now(selector, decided))
 
 
 @pytest.mark.parametrize(("option", "number"), [("left", 0), ("right", 1), (1, 1)])
@@ -54,9 +112,10 @@ def test_fixed_chooses_by_name_or_number(option, number):
     assert Fixed(SPECS, option=option).select(due(3)).tolist() == [number] * 3
 
 
-def test_fixed_refuses_an_unknown_option_and_names_the_known_ones():
+@pytest.mark.parametrize("option", ["up", 2, -1])
+def test_fixed_refuses_an_unknown_option_and_names_the_known_ones(option):
     with pytest.raises(ValueError, match="left, right"):
-        Fixed(SPECS, option="up")
+        Fixed(SPECS, option=option)
 
 
 def test_uniform_chooses_both_options_about_equally():
@@ -68,67 +127,18 @@ def test_oracle_passes_on_what_the_environment_knows():
     assert Oracle(SPECS).select(due(3, oracle={"option": torch.tensor([1, 0, 1])})).tolist() == [1, 0, 1]
 
 
-def test_ucb1_counts_and_bounds_equal_the_formula():
-    ucb = make_ucb(exploration=0.7)
-    options, payoffs = torch.tensor([0, 0, 0, 1]), torch.tensor([1.0, 2.0, 3.0, 2.5])
-    ucb.learn(ended(options, payoffs))
-    assert ucb.counts.tolist() == [3, 1] and ucb.means.tolist() == [2.0, 2.5]
-    deviation = payoffs.double().std(correction=0).item()
-    bounds = [m + 0.7 * deviation * math.sqrt(2 * math.log(5) / n) for m, n in ((2.0, 3), (2.5, 1))]
-    assert ucb.select(due(1)).item() == bounds.index(max(bounds))
-
-
-def test_simultaneous_decisions_are_served_as_if_one_after_another():
-    ucb = make_ucb()
-    ucb.learn(ended(torch.tensor([0] * 30 + [1] * 10), torch.randn(40)))
-    counts, means = ucb.counts.clone(), ucb.means.clone()
-    mean = ucb.sums.sum() / 40
-    deviation = (ucb.squares.sum() / 40 - mean**2).sqrt()
-    for _ in range(64):
-        bounds = means + deviation * (2 * math.log(40 + 64) / counts).sqrt()
-        counts[bounds.argmax()] += 1
-    chosen = ucb.select(due(64))
-    assert torch.bincount(chosen, minlength=2).tolist() == (counts - ucb.counts).tolist()
-
-
-@pytest.mark.parametrize("variant", UCB_VARIANTS)
-def test_untried_options_are_tried_first_and_shared_evenly(variant):
-    assert make_ucb(variant).select(due(100)).sum().item() == 50
-
-
-@pytest.mark.parametrize("variant", UCB_VARIANTS)
-@pytest.mark.parametrize("batch", [1, 64])
-def test_ucb_finds_the_better_option(variant, batch):
+@pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+def test_human_chooses_the_congruent_boat_as_often_as_people_do_at_each_bearing(exploration):
     torch.manual_seed(0)
-    choices = play(make_ucb(variant, exploration=0.5), (0.0, 1.0), 2000 // batch, batch)
-    assert choices[-500:].float().mean() > 0.85
-
-
-def test_forgetting_forms_follow_an_option_that_becomes_the_better_one_and_ucb1_lags():
-    shares = {}
-    for variant in UCB_VARIANTS:
-        torch.manual_seed(0)
-        ucb = make_ucb(variant, exploration=0.2)
-        play(ucb, (1.0, 0.0), 3000)
-        shares[variant] = play(ucb, (0.0, 1.0), 2000)[-500:].float().mean().item()
-    assert shares["discounted"] > 0.85 and shares["sliding_window"] > 0.85
-    assert shares["ucb1"] < shares["discounted"]
-
-
-def test_greedy_ucb_takes_the_best_mean_everywhere():
-    ucb = make_ucb()
-    ucb.learn(ended(torch.tensor([0, 1] * 50), torch.tensor([1.0, 0.0] * 50)))
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert ucb.select(due(20)).tolist() == [0] * 20
-
-
-@pytest.mark.parametrize("variant", UCB_VARIANTS)
-def test_what_ucb_knows_survives_a_state_dict(variant):
-    torch.manual_seed(0)
-    source, target = make_ucb(variant), make_ucb(variant)
-    play(source, (0.0, 1.0), 50)
-    target.load_state_dict(source.state_dict())
-    torch.manual_seed(1)
-    expected = play(source, (0.0, 1.0), 50)
-    torch.manual_seed(1)
-    assert torch.equal(play(target, (0.0, 1.0), 50), expected)
+    env = BoatDockEnv(20_000, people=True)
+    human = Human(PAMDPSpecs.from_env(env))
+    with set_exploration_type(exploration):
+        chosen = human(with_decisions(env).reset())[keys.OPTION].float()
+    way = env.state.goal_x - env.state.start_x, env.state.goal_y - env.state.start_y
+    bearing = torch.rad2deg(torch.atan2(way[1], way[0]))
+    # The congruent boat's keys point to 30, 150 and 270 degrees, y down.
+    offset = torch.stack([((bearing - d + 180.0) % 360.0 - 180.0).abs() for d in (30.0, 150.0, 270.0)]).amin(0)
+    for share, low, high in zip(HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES[:-1], OFFSET_EDGES[1:], strict=True):
+        inside = (offset >= low) & (offset < high)
+        assert inside.sum() > 2500
+        assert chosen[inside].mean().item() == pytest.approx(share, abs=0.035)

@@ -13,6 +13,7 @@ from conftest import compose_config
 
 from hpamdp import checkpoint
 from hpamdp.config import ConfigError
+from hpamdp.env import harbour
 from hpamdp.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
@@ -133,3 +134,11 @@ def test_a_foreign_file_is_no_checkpoint(tmp_path):
     file.write_bytes(b"PK\x03\x04 not a checkpoint")
     with pytest.raises(ConfigError, match="not a checkpoint"):
         checkpoint.find(file, "resume")
+
+
+def test_agents_are_scored_on_the_layouts_that_no_training_meets(tmp_path):
+    start(tmp_path, "high=uniform", "low=random", "eval.seed=3")
+    with np.load(tmp_path / "evaluation.npz") as played:
+        layout = harbour.fixed_layouts(20, 3)
+        np.testing.assert_allclose(played["start"], torch.stack(layout[:2], -1).numpy(), atol=1e-4)
+        np.testing.assert_allclose(played["path"][:, 0], played["start"], atol=1e-4)

@@ -183,6 +183,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._next_seeds: list[int | None] = [*_seeds(0 if seed is None else seed, self.num_envs, _TRAINING)]
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        tensordict = self._asked_of_reset(tensordict)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         given = None if tensordict is None else tensordict.get(_SEED, None)
         if given is not None and (given.shape != (self.num_envs,) or given.is_floating_point() or (given < 0).any()):

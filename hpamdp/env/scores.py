@@ -22,7 +22,6 @@ def measure_boats(played: Mapping[str, np.ndarray]) -> dict[str, float]:
     controller = (played["controller"] if chosen is None else chosen).astype(int)
     given = np.take_along_axis(optimum, controller[:, None], 1)[:, 0]
     scores = {"ceiling": float(np.mean(given if chosen is None else optimum.max(1)))}
-    scores["optimality_gap"] = scores["ceiling"] - float(played["score"].mean())
     for code, name in enumerate(OUTCOMES):
         if code != SAILING:
             scores[name] = float((outcome == code).mean())

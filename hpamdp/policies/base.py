@@ -23,6 +23,7 @@ class Selector(TensorDictModuleBase):
     # What it reads that an environment writes only when asked: `oracle`, `people`.
     needs: ClassVar[tuple[str, ...]] = ()
     needs_values: bool = False  # whether it reads the learners' own values of a state
+    gamma: float = 1.0  # discount of a step, where options end before their episode
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()

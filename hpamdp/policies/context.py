@@ -105,11 +105,15 @@ class LinearBandit(Selector):
     def predict(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return the options' expected payoffs and the deviations of these estimates, `[B, num_options]` each."""
         x = self.features(observation)
-        dim = self.features.num_features
-        factor = torch.linalg.cholesky(self.gram + self.ridge * torch.eye(dim, dtype=x.dtype, device=x.device))
-        theta = torch.cholesky_solve(self.moment.unsqueeze(-1), factor).squeeze(-1)
+        one = torch.eye(self.features.num_features, dtype=x.dtype, device=x.device)
+        gram = self.gram + self.ridge * one
+        # Each feature in units of its own size, and a trifle on the diagonal: monomials of pixels span many magnitudes,
+        # and rounding would leave a matrix that is not positive definite.
+        size = gram.diagonal(dim1=-2, dim2=-1).sqrt()
+        factor = torch.linalg.cholesky(gram / (size.unsqueeze(-1) * size.unsqueeze(-2)) + 1e-11 * one)
+        theta = torch.cholesky_solve((self.moment / size).unsqueeze(-1), factor).squeeze(-1) / size
         # x' A^-1 x is the squared length of L^-1 x.
-        spread = torch.linalg.solve_triangular(factor, x.T.expand(len(factor), *x.T.shape), upper=False)
+        spread = torch.linalg.solve_triangular(factor, (x / size.unsqueeze(1)).mT, upper=False)
         explained = (theta * self.moment).sum() / self.counts.sum().clamp(min=1.0)
         noise = (self.squares.sum() / self.counts.sum().clamp(min=1.0) - explained).clamp(min=1e-12).sqrt()
         return x @ theta.T, noise * spread.square().sum(1).sqrt().T
@@ -123,8 +127,8 @@ class LinearBandit(Selector):
         observation = td.get(keys.OBSERVATION)
         mean, deviation = self.predict(observation.flatten(0, -2))
         if exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
-            # The noise decides where nothing else does.
-            mean = self.draw(mean, deviation) + 1e-9 * torch.rand_like(mean)
+            # Options never chosen come first, in random order.
+            mean = torch.where(self.counts < 1e-9, 1e9 + torch.rand_like(mean), self.draw(mean, deviation))
         return mean.argmax(-1).reshape(observation.shape[:-1])
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:

@@ -45,6 +45,5 @@ class LinThompson(LinearBandit):
         self.exploration = exploration
 
     def draw(self, mean: Tensor, deviation: Tensor) -> Tensor:
-        """Return draws of the predictions; an option that was never chosen comes first."""
-        noise = torch.randn_like(mean)
-        return torch.where(self.counts < 1e-9, 1e9 + noise, mean + self.exploration * deviation * noise)
+        """Return draws of the predictions."""
+        return mean + self.exploration * deviation * torch.randn_like(mean)

@@ -9,7 +9,6 @@ Gram matrix.
 
 from __future__ import annotations
 
-import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from torch import Tensor
 
@@ -45,5 +44,5 @@ class LinUCB(LinearBandit):
         self.exploration = exploration
 
     def draw(self, mean: Tensor, deviation: Tensor) -> Tensor:
-        """Return the upper bounds; an option that was never chosen comes first."""
-        return torch.where(self.counts < 1e-9, 1e9, mean + self.exploration * deviation)
+        """Return the upper bounds."""
+        return mean + self.exploration * deviation

@@ -46,9 +46,9 @@ class UCB(Bandit):
         pulls = torch.arange(num, device=known.counts.device)
         counts = known.counts.unsqueeze(-1) + pulls
         width = (2.0 * (known.counts.sum() + num).clamp(min=2.0).log() / counts).sqrt()
+        # An arm without payoffs has an infinite bound and, from its first pull on, the mean of all.
+        mean = torch.where(known.is_untried, known.sums.sum() / known.counts.sum().clamp(min=1.0), known.means)
         # An arm's bound falls with each pull, so taking the best arm `num` times over is taking the `num` best bounds.
-        # An arm without payoffs has an infinite one; the term in `pulls` lets such arms take turns.
-        bounds = known.means.unsqueeze(-1) + self.exploration * known.deviation * width
-        bounds = torch.where(known.is_untried.unsqueeze(-1), 1e9 - pulls.double(), bounds)
+        bounds = mean.unsqueeze(-1) + self.exploration * known.deviation * width
         chosen = bounds.flatten().topk(num).indices // num
         return chosen[torch.randperm(num, device=chosen.device)]

@@ -64,6 +64,7 @@ class Planner:
         min_deviation: the smallest deviation of a parameter, in [-1, 1] units.
         gamma: discount of a press.
         pessimism: deviations between the model's members that are taken off their mean return.
+        precision: in which the model's networks predict when planning.
     """
 
     def __init__(
@@ -80,12 +81,14 @@ class Planner:
         min_deviation: float,
         gamma: float,
         pessimism: float,
+        precision: str = "float32",
     ) -> None:
         if num_elites > num_samples:
             raise ValueError(f"num_elites={num_elites}, but must be at most num_samples={num_samples}")
         self.model, self.specs, self.horizon, self.num_samples = model, specs, horizon, num_samples
         self.num_elites, self.num_iterations, self.temperature = num_elites, num_iterations, temperature
         self.momentum, self.min_deviation, self.gamma, self.pessimism = momentum, min_deviation, gamma, pessimism
+        self.precision = getattr(torch, precision)
 
     @torch.no_grad()
     def plan(self, state: Tensor) -> Plan:
@@ -115,10 +118,11 @@ class Planner:
         rows = state.repeat_interleave(key.shape[1], 0)
         total, survival = 0.0, 1.0
         for h in range(key.shape[2]):
-            predicted = self.model(rows, key[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
-            ends = predicted.logit.sigmoid()
+            with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
+                predicted = self.model(rows, key[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
+            ends = predicted.logit.float().sigmoid()
             reward = ends * predicted.terminating + (1.0 - ends) * predicted.continuing
-            total = total + self.gamma**h * survival * reward
+            total = total + self.gamma**h * survival * reward.float()
             survival = survival * (1.0 - ends)
             rows = predicted.next_state
         doubt = self.pessimism * total.std(0, correction=0) if self.pessimism else 0.0
@@ -217,6 +221,7 @@ class DLPA(Learner):
         momentum: Share,
         min_deviation: NonNegativeFloat,
         pessimism: NonNegativeFloat,
+        planning_precision: Literal["float32", "bfloat16"],
     ) -> None:
         super().__init__(specs)
         self.weights = {"state": state_weight, "reward": reward_weight, "termination": termination_weight}
@@ -225,6 +230,7 @@ class DLPA(Learner):
         self.model = PAMDPModel(specs, form, hidden_dims, num_members)
         search = dict(num_samples=num_samples, num_elites=num_elites, num_iterations=num_iterations, gamma=gamma)
         search |= dict(temperature=temperature, momentum=momentum, min_deviation=min_deviation, pessimism=pessimism)
+        search |= dict(precision=planning_precision)
         self.policy = DLPAPolicy(Planner(self.model, specs, horizon=horizon, **search), specs, epsilon)
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))

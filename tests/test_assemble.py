@@ -1,0 +1,197 @@
+"""What goes together: pairs that cannot be are refused in one line, and those that can do what they are for."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import compose_config
+from omegaconf import DictConfig, OmegaConf
+from test_grid import SHORT, SMALL
+from toy_options import Crossing
+
+from hpamdp import keys
+from hpamdp.assemble import Parts, assemble
+from hpamdp.config import ConfigError, run_config
+from hpamdp.env.choice import ControllerChoiceEnv
+from hpamdp.train import Trainer
+
+OWN_VALUES = ("hppo", "hsac", "hyar", "pdqn", "qpamdp")
+QUICK_CRITIC = ["high=meta_critic", "high.warmup_decisions=0", "high.updates_per_decision=0.2", "high.batch_size=16"]
+
+
+def make(cfg: DictConfig, folder: Path) -> Parts:
+    torch.manual_seed(0)
+    return assemble(cfg, run_config(cfg), folder)
+
+
+def train(cfg: DictConfig, folder: Path) -> Parts:
+    """Train as `cfg` says and leave the checkpoint in the folder."""
+    folder.mkdir()
+    parts = make(cfg, folder)
+    assert not Trainer(cfg, run_config(cfg), parts, folder).train()
+    return parts
+
+
+def crossing(*words: str) -> DictConfig:
+    """Compose a config on an environment whose options may change within an episode, for learners that know the way."""
+    cfg = compose_config([*SMALL, "low=random", *words])
+    OmegaConf.set_struct(cfg, False)
+    cfg.env = {"_target_": "toy_options.Crossing", "start": 3.0}
+    cfg.low._target_ = "toy_options.Stepper"
+    return cfg
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        ("high=ucb env=platform", "high=ucb: env=platform has no options to choose; use high=none"),
+        ("high=human env=platform", "high=human: env=platform has no record of people"),
+        ("high=oracle env=platform", "high=oracle: env=platform has no planner to ask"),
+        ("high=none low=planner env=platform", "low=planner: env=platform has no planner to ask"),
+        (
+            "high=ucb env.controller=random",
+            "high=ucb: env.controller=random leaves nothing to choose; use high=none or env.controller=choose",
+        ),
+        (
+            "high=none",
+            "high=none: env.controller=choose needs a selector; use another high or env.controller=congruent, "
+            "incongruent, random",
+        ),
+        (
+            "high=ucb agent.option_length=3",
+            "agent.option_length=3: env=boatdock keeps an option for an episode; use agent.option_length=episode",
+        ),
+        (
+            "high=none env=platform agent.option_length=3",
+            "agent.option_length=3: env=platform has no options; use agent.option_length=episode",
+        ),
+        (
+            "high=none env.controller=random low.freeze=true",
+            "low.freeze=true: there is no choice left to learn; use low.freeze=false",
+        ),
+        (
+            "high=meta_critic high.bootstrap=0.5 low=random",
+            "high.bootstrap=0.5: low=random has no value of a state; use high.bootstrap=0",
+        ),
+        (
+            "high=linucb env=boatdock env.observation=pixels",
+            "high: inputs=[14, 15]: the observation has entries 0 to 13 (LinUCB, conf/high)",
+        ),
+        (
+            "low.checkpoint=/nowhere",
+            "low.checkpoint=/nowhere: no checkpoint there; give a run's output folder or its checkpoint.zip",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused_in_one_line(words, complaint, tmp_path):
+    low = [] if "low=" in words else ["low=random"]
+    with pytest.raises(ConfigError) as error:
+        make(compose_config([*SMALL, *low, *words.split()]), tmp_path)
+    assert str(error.value) == complaint
+
+
+def test_frozen_learners_play_whole_episodes_so_that_options_cannot_be_shorter(tmp_path):
+    with pytest.raises(ConfigError) as error:
+        make(crossing("low.freeze=true", "agent.option_length=2"), tmp_path)
+    line = "agent.option_length=2: low.freeze=true plays whole episodes; use agent.option_length=episode"
+    assert str(error.value) == line
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """Return the output folder of a tiny run of H-PPO."""
+    folder = tmp_path_factory.mktemp("runs") / "hppo"
+    train(compose_config([*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"]]), folder)
+    return folder
+
+
+@pytest.mark.parametrize(
+    "words", ["low=random", "low=pdqn", "low=hppo low.hidden_dims=[8]", "low=hppo agent.sharing=shared"]
+)
+def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained, tmp_path):
+    with pytest.raises(ConfigError) as error:
+        make(compose_config([*SMALL, *words.split(), f"low.checkpoint={trained}"]), tmp_path)
+    assert str(error.value).startswith(f"low.checkpoint={trained / 'checkpoint.zip'}: of other learners than these: ")
+    assert "\n" not in str(error.value)
+
+
+def copied(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in module.state_dict().items() if isinstance(value, torch.Tensor)}
+
+
+def is_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_frozen_learners_of_another_run_stay_as_they_are_while_the_selector_learns(trained, tmp_path):
+    words = [*SMALL, "low=hppo", *SHORT["hppo"], "agent.sharing=per_option"]
+    fresh = copied(make(compose_config([*words, "high=ucb"]), tmp_path / "fresh").agent.learners)
+    words += [*QUICK_CRITIC, f"low.checkpoint={trained}", "low.freeze=true"]
+    parts = make(compose_config(words), tmp_path / "before")
+    assert isinstance(parts.env.base_env, ControllerChoiceEnv)
+    start, selector = copied(parts.agent.learners), copied(parts.agent.selector)
+    assert not is_same(start, fresh)
+    parts = train(compose_config(words), tmp_path / "after")
+    assert is_same(copied(parts.agent.learners), start)
+    now = copied(parts.agent.selector)
+    assert int(now["num_decisions"]) == 256, "a frame is a decision"
+    assert not torch.equal(now["critics.layers.0.weight"], selector["critics.layers.0.weight"])
+
+
+def test_learners_of_another_run_go_on_learning_where_they_are_not_frozen(trained, tmp_path):
+    words = [*SMALL, "high=ucb", "low=hppo", *SHORT["hppo"], f"low.checkpoint={trained}"]
+    start = copied(make(compose_config(words), tmp_path).agent.learners)
+    assert not is_same(copied(train(compose_config(words), tmp_path / "on").agent.learners), start)
+
+
+def test_frozen_learners_that_need_no_training_need_no_checkpoint(tmp_path):
+    words = [*SMALL, "high=ucb", "low=random", "low.freeze=true"]
+    parts = train(compose_config(words), tmp_path / "out")
+    assert parts.agent.selector.payoffs.num_decisions.item() == 256
+
+
+@pytest.mark.parametrize("sharing", ["per_option", "shared"])
+@pytest.mark.parametrize("low", OWN_VALUES)
+def test_the_meta_critic_learns_from_the_learners_own_values(low, sharing, tmp_path, monkeypatch):
+    words = [*SMALL, *QUICK_CRITIC, "high.bootstrap=0.5", f"low={low}", *SHORT[low], f"agent.sharing={sharing}"]
+    parts = make(compose_config(words), tmp_path)
+    agent, learn, num = parts.agent, parts.agent.selector.learn, []
+
+    def checked(decisions):
+        values, state = decisions[keys.OPTION_VALUES], decisions["next", keys.DECISION_OBSERVATION]
+        assert values.shape == (len(state), 2) and values.isfinite().all()
+        for i in (0, 1) if low != "hsac" else ():  # its value is of one draw
+            option = torch.eye(2)[i].expand(len(state), 2)
+            is_shared = sharing == "shared"
+            own = agent.learners[0 if is_shared else i].value(torch.cat([state, option], -1) if is_shared else state)
+            torch.testing.assert_close(values[:, i], own)
+        num.append(len(state))
+        return learn(decisions)
+
+    monkeypatch.setattr(agent.selector, "learn", checked)
+    for _ in range(3):
+        batch = parts.env.rollout(12, parts.policy, break_when_any_done=False).contiguous()
+        assert agent.learn(batch)["high/critic"] >= 0.0
+    assert len(num) == 3 and min(num) > 5
+
+
+def test_options_of_a_fixed_length_are_chosen_and_discounted_as_the_selector_asks(tmp_path):
+    parts = make(crossing(*QUICK_CRITIC, "high.gamma=0.9", "agent.option_length=2"), tmp_path)
+    batch = parts.env.rollout(40, parts.policy, break_when_any_done=False)
+    is_cut = batch["next", keys.IS_DECISION] & ~batch["next", keys.DONE]
+    assert is_cut.any() and batch["next", keys.OPTION_STEPS].max() == 2
+    paid = batch["next", keys.REWARD] > 0.0
+    expected = 0.9 ** (batch["next", keys.OPTION_STEPS][paid] - 1.0)
+    torch.testing.assert_close(batch["next", keys.OPTION_RETURN][paid], expected)
+    assert (expected < 1.0).any() and (expected == 1.0).any()
+    assert parts.evaluation.env.transform.option_length == 2
+    assert "high/critic" in parts.agent.learn(batch.contiguous())
+    played = parts.evaluation.run_agent(parts.agent)
+    assert played["option_scores"].shape == (10, 2) and played["presses"].max() <= Crossing.max_steps
+
+
+def test_an_episodes_return_is_not_discounted_where_options_last_as_long(tmp_path):
+    parts = make(crossing(*QUICK_CRITIC, "high.gamma=0.9"), tmp_path)
+    batch = parts.env.rollout(60, parts.policy, break_when_any_done=False)
+    paid = batch["next", keys.REWARD] > 0.0
+    assert paid.any() and (batch["next", keys.OPTION_RETURN][paid] == 1.0).all()

@@ -1,0 +1,255 @@
+"""Context-free bandits: what they count, what they choose, and that they find and follow the better option."""
+
+import math
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_bandits import SPECS, constant, due, paid, play
+
+from hpamdp import keys
+from hpamdp.policies.high_level.epsilon_greedy import EpsilonGreedy
+from hpamdp.policies.high_level.exp3 import PROBABILITY, Exp3
+from hpamdp.policies.high_level.thompson import Thompson
+from hpamdp.policies.high_level.ucb import UCB
+from hpamdp.policies.payoffs import Bandit, Payoffs
+
+MEMORIES = ("all", "discounted", "sliding_window")
+BANDITS = {
+    "epsilon_greedy": (EpsilonGreedy, {"epsilon_scale": 30.0, "epsilon_final": 0.1}),
+    "ucb": (UCB, {"exploration": 0.3}),
+    "thompson": (Thompson, {"exploration": 1.0}),
+    "exp3": (Exp3, {"exploration": 0.2}),
+}
+every_bandit = pytest.mark.parametrize("name", BANDITS)
+every_memory = pytest.mark.parametrize("memory", MEMORIES)
+
+
+def make(name: str, memory: str = "all", **changes: float) -> Bandit:
+    cls, options = BANDITS[name]
+    return cls(SPECS, **{**options, "memory": memory, "discount": 0.998, "window": 500, **changes})
+
+
+def share_of_right(options: torch.Tensor) -> float:
+    return options.float().mean().item()
+
+
+# What is remembered.
+
+
+def test_all_payoffs_count_the_same():
+    payoffs = Payoffs(2, "all", 0.9, 3)
+    for option, payoff in ((0, 1.0), (1, 2.5), (0, 2.0), (0, 3.0)):
+        payoffs.add(torch.tensor([option]), torch.tensor([payoff]))
+    assert payoffs.counts.tolist() == [3, 1] and payoffs.means.tolist() == [2.0, 2.5]
+    assert payoffs.deviation.item() == pytest.approx(torch.tensor([1.0, 2.5, 2.0, 3.0]).std(correction=0).item())
+    assert payoffs.best() == 1 and payoffs.num_decisions.item() == 4
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3, 6])
+def test_discounted_payoffs_weigh_by_their_age_in_decisions(at_once):
+    options, values = torch.tensor([0, 1, 0, 0, 1, 0]), torch.tensor([1.0, 2.0, -3.0, 4.0, 5.0, -6.0])
+    payoffs = Payoffs(2, "discounted", 0.9, 3)
+    for o, v in zip(options.split(at_once), values.split(at_once), strict=True):
+        payoffs.add(o, v)
+    weights = 0.9 ** torch.arange(5, -1, -1).double()
+    for option in (0, 1):
+        own = options == option
+        assert payoffs.counts[option].item() == pytest.approx(weights[own].sum().item())
+        mean = (weights * values)[own].sum() / weights[own].sum()
+        assert payoffs.means[option].item() == pytest.approx(mean.item())
+
+
+@pytest.mark.parametrize("at_once", [1, 2, 3, 6])
+def test_a_sliding_window_holds_the_last_decisions_alone(at_once):
+    payoffs = Payoffs(2, "sliding_window", 0.9, 4)
+    options, values = torch.tensor([0, 0, 1, 1, 0, 0]), torch.tensor([9.0, 9.0, 1.0, 2.0, 3.0, 5.0])
+    for o, v in zip(options.split(at_once), values.split(at_once), strict=True):
+        payoffs.add(o, v)
+    assert payoffs.counts.tolist() == [2, 2] and payoffs.means.tolist() == [4.0, 1.5]
+
+
+def test_an_option_that_left_the_window_is_untried_again():
+    payoffs = Payoffs(2, "sliding_window", 0.9, 2)
+    payoffs.add(torch.tensor([1, 0, 0]), torch.tensor([5.0, -1.0, -1.0]))
+    assert payoffs.is_untried.tolist() == [False, True] and payoffs.best() == 0
+
+
+# What is chosen.
+
+
+@every_bandit
+@every_memory
+def test_greedy_choices_are_the_best_option_everywhere(name, memory):
+    torch.manual_seed(0)
+    bandit = make(name, memory)
+    bandit.learn(paid([0, 1] * 50, [1.0, 0.0] * 50, **{PROBABILITY: torch.full((100,), 0.5)}))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert bandit.select(due(20)).tolist() == [0] * 20
+    bandit.learn(paid([1] * 300, [3.0] * 300, **{PROBABILITY: torch.full((300,), 0.5)}))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert bandit.select(due(20)).tolist() == [1] * 20
+
+
+@every_bandit
+@pytest.mark.parametrize("payoffs", [[], [5.0], [1.0, 2.0, 3.0, 2.0, 2.0]])
+def test_options_without_payoffs_get_tried(name, payoffs):
+    torch.manual_seed(0)
+    bandit = make(name, **({"epsilon_scale": 1e-3, "epsilon_final": 0.0} if name == "epsilon_greedy" else {}))
+    if payoffs:
+        bandit.learn(paid([0] * len(payoffs), payoffs, **{PROBABILITY: torch.full((len(payoffs),), 0.5)}))
+    tried = bandit.select(due(100)).sum().item()
+    assert tried >= 20 if payoffs else 20 <= tried <= 80
+
+
+@every_bandit
+def test_only_decisions_that_are_due_are_drawn(name):
+    torch.manual_seed(0)
+    root = due(100)
+    root[keys.IS_DECISION][:50] = False
+    bandit, drawn = make(name), []
+    bandit.draw = lambda num: drawn.append(num) or torch.ones(num, dtype=torch.long)
+    assert bandit.select(root)[50:].tolist() == [1] * 50
+    assert drawn == [50]
+
+
+def test_epsilon_falls_with_one_over_the_decisions_to_its_end():
+    torch.manual_seed(0)
+    bandit = make("epsilon_greedy", epsilon_scale=100.0, epsilon_final=0.05)
+    bandit.learn(paid([0, 1] * 200, [1.0, 0.0] * 200))
+    # At decisions 401 to 10,400: 2 options, so half of the random choices are wrong.
+    expected = sum(max(0.05, 100.0 / t) for t in range(401, 10_401)) / 2
+    assert bandit.select(due(10_000)).sum().item() == pytest.approx(expected, abs=4 * math.sqrt(expected))
+
+
+def test_ucb1_chooses_by_its_formula():
+    ucb, payoffs = make("ucb"), [1.0, 2.0, 3.0, 1.2]
+    ucb.learn(paid([0, 0, 0, 1], payoffs))
+    # Means 2 and 1.2, decision 5: the factor at which the bounds of 3 payoffs and of 1 are the same.
+    deviation = torch.tensor(payoffs).std(correction=0).item()
+    even = (2.0 - 1.2) / (deviation * math.sqrt(2 * math.log(5)) * (1 - 1 / math.sqrt(3)))
+    for factor, chosen in ((0.99, 0), (1.01, 1)):
+        ucb.exploration = factor * even
+        assert ucb.select(due(1)).item() == chosen
+
+
+@pytest.mark.parametrize("tried", [(30, 10), (30, 0), (0, 0)])
+def test_ucb_serves_simultaneous_decisions_as_if_one_after_another(tried):
+    torch.manual_seed(0)
+    ucb = make("ucb", exploration=1.0)
+    payoffs = torch.randn(sum(tried))
+    if sum(tried):
+        ucb.learn(paid([0] * tried[0] + [1] * tried[1], payoffs.tolist()))
+    means = [part.mean() if len(part) else payoffs.mean() for part in payoffs.split(list(tried))]
+    means = torch.stack(means) if sum(tried) else torch.zeros(2)
+    counts = torch.tensor(tried, dtype=torch.float64)
+    for _ in range(64):
+        bounds = means + ucb.payoffs.deviation * (2 * math.log(sum(tried) + 64) / counts).sqrt()
+        counts[bounds.argmax()] += 1
+    chosen = torch.bincount(ucb.select(due(64)), minlength=2)
+    assert chosen.tolist() == (counts - torch.tensor(tried)).tolist()
+
+
+def test_thompson_chooses_an_option_as_often_as_it_is_likely_to_be_the_best():
+    torch.manual_seed(0)
+    thompson = make("thompson", exploration=0.8)
+    thompson.learn(paid([0] * 8 + [1] * 2, [1.0, 0.0] * 4 + [1.2, 0.0]))
+    deviation = 0.8 * thompson.payoffs.deviation * math.sqrt(1 / 8 + 1 / 2)
+    likely = torch.distributions.Normal(0.0, 1.0).cdf(0.1 / deviation).item()
+    assert share_of_right(thompson.select(due(40_000))) == pytest.approx(likely, abs=0.01)
+
+
+def test_exp3_weighs_payoffs_by_the_probability_of_their_choice():
+    exp3 = make("exp3", exploration=0.5)
+    exp3.learn(paid([0, 1, 1], [4.0, 2.0, 3.0], **{PROBABILITY: torch.tensor([0.8, 0.2, 0.25])}))
+    gains = torch.tensor([1.0 / 0.8, 0.0 / 0.2 + 0.5 / 0.25])  # scaled by the range, 2 to 4
+    weights = (0.5 / 2 * gains).exp()
+    expected = (1 - 0.5) * weights / weights.sum() + 0.5 / 2
+    torch.testing.assert_close(exp3.probabilities.float(), expected)
+    torch.manual_seed(0)
+    td = exp3(due(20_000))
+    assert share_of_right(td[keys.OPTION]) == pytest.approx(expected[1].item(), abs=0.015)
+    torch.testing.assert_close(td[PROBABILITY], expected[td[keys.OPTION]])
+
+
+# What they achieve.
+
+
+@every_bandit
+@every_memory
+@pytest.mark.parametrize("batch", [1, 64])
+def test_the_better_option_is_found(name, memory, batch):
+    torch.manual_seed(0)
+    num = 600 if batch == 1 else 3200
+    options, _ = play(make(name, memory), constant(0.0, 1.0), num, batch, noise=0.5)
+    assert share_of_right(options[-200:]) > 0.8
+
+
+@every_bandit
+def test_forgetting_bandits_follow_a_change_of_the_better_option_and_others_lag(name):
+    share = {}
+    for memory in MEMORIES:
+        torch.manual_seed(0)
+        bandit = make(name, memory)
+        before, _ = play(bandit, constant(1.0, 0.0), 3000, 8, noise=0.5)
+        after, _ = play(bandit, constant(0.0, 1.0), 2000, 8, noise=0.5)
+        assert share_of_right(before[-500:]) < 0.2
+        share[memory] = share_of_right(after)
+        assert memory == "all" or share_of_right(after[-500:]) > 0.8
+    assert share["all"] < min(share["discounted"], share["sliding_window"]) - 0.15
+
+
+@every_bandit
+@every_memory
+def test_a_copy_made_of_a_state_dict_goes_on_identically(name, memory):
+    torch.manual_seed(0)
+    source, target = make(name, memory), make(name, memory)
+    play(source, constant(0.0, 1.0), 50)
+    target.load_state_dict(source.state_dict())
+    torch.manual_seed(1)
+    expected, _ = play(source, constant(1.0, 0.0), 60, 2)
+    torch.manual_seed(1)
+    assert torch.equal(play(target, constant(1.0, 0.0), 60, 2)[0], expected)
+
+
+# Regret where payoffs stand still, at T and at 4 T decisions, with means 1 apart.
+
+T = 2000
+
+
+def growth(name: str, **changes: float) -> tuple[float, float]:
+    """Return the mean regret at T decisions, and by what it grows until 4 T."""
+    curves = []
+    for seed in range(4):
+        torch.manual_seed(seed)
+        curves.append(play(make(name, **changes), constant(1.0, 0.0), 4 * T, 8)[1].cumsum(0))
+    regret = torch.stack(curves).mean(0)
+    return regret[T - 1].item(), (regret[-1] / regret[T - 1]).item()
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [("epsilon_greedy", {"epsilon_final": 0.0}), ("ucb", {"exploration": 1.0}), ("thompson", {"exploration": 1.0})],
+)
+def test_regret_grows_with_the_logarithm_of_time(name, changes):
+    regret, factor = growth(name, **changes)
+    assert regret < 0.08 * T and factor < 1.8  # of log T: 1.2
+
+
+def test_a_constant_share_of_random_choices_costs_regret_in_proportion_to_time():
+    assert growth("epsilon_greedy", epsilon_scale=1.0, epsilon_final=0.1)[1] > 3.0
+
+
+def test_regret_of_exp3_tuned_to_the_horizon_grows_with_the_root_of_time():
+    regret = {}
+    for horizon in (T, 4 * T):
+        gamma = math.sqrt(2 * math.log(2) / ((math.e - 1) * horizon))  # corollary 3.2 of the source
+        total = 0.0
+        for seed in range(3):
+            torch.manual_seed(seed)
+            bandit = make("exp3", exploration=gamma)
+            total += play(bandit, constant(1.0, 0.0), horizon, 8, noise=0.5)[1].sum().item() / 3
+        regret[horizon] = total
+        payoffs = bandit.high - bandit.low
+        assert total < 2.63 * payoffs * math.sqrt(horizon * 2 * math.log(2))
+    assert regret[4 * T] / regret[T] < 2.6  # of the root: 2

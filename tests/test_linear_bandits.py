@@ -1,0 +1,219 @@
+"""Linear contextual bandits: features, predictions and their deviations, and what they learn of who pays where."""
+
+import itertools
+
+import pytest
+import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_bandits import SPECS, against_sign, by_sign, constant, due, ended, play
+
+from hpamdp import keys
+from hpamdp.config import ConfigError, build
+from hpamdp.policies.context import ContextFeatures, LinearBandit
+from hpamdp.policies.high_level.lin_thompson import LinThompson
+from hpamdp.policies.high_level.linucb import LinUCB
+from hpamdp.specs import PAMDPSpecs
+
+MEMORIES = ("all", "discounted", "sliding_window")
+BANDITS = {"linucb": LinUCB, "lin_thompson": LinThompson}
+OPTIONS = dict(
+    exploration=1.0, inputs=None, features="polynomial", degree=2, ridge=1.0, memory="all", discount=0.998, window=500
+)
+every_bandit = pytest.mark.parametrize("name", BANDITS)
+every_memory = pytest.mark.parametrize("memory", MEMORIES)
+
+
+def make(name: str, **changes: object) -> LinearBandit:
+    return BANDITS[name](SPECS, **{**OPTIONS, **changes})
+
+
+def wide(observation_dim: int) -> PAMDPSpecs:
+    return PAMDPSpecs(observation_dim, ("left", "right"), (1,), (0.0,), (1.0,))
+
+
+def teach(bandit: LinearBandit, num: int, at_once: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Let the bandit learn `num` random decisions; return their observations, options and payoffs."""
+    torch.manual_seed(0)
+    observation, option, payoff = torch.rand(num, 2) * 2 - 1, torch.randint(2, (num,)), torch.randn(num)
+    for rows in torch.arange(num).split(at_once):
+        bandit.learn(ended(due(observation[rows], option=option[rows]), payoff[rows]))
+    return observation, option, payoff
+
+
+# Features.
+
+
+@pytest.mark.parametrize(("num_inputs", "degree"), [(1, 4), (2, 3), (3, 2), (2, 1)])
+def test_polynomial_features_are_all_monomials_up_to_the_degree(num_inputs, degree):
+    torch.manual_seed(0)
+    observation = torch.randn(7, num_inputs).double()
+    powers = [p for p in itertools.product(range(degree + 1), repeat=num_inputs) if sum(p) <= degree]
+    expected = torch.stack([(observation ** torch.tensor(p)).prod(-1) for p in powers], -1)
+    features = ContextFeatures(wide(num_inputs), None, "polynomial", degree)
+    found = features(observation)
+    assert features.num_features == len(powers) == found.shape[-1]
+    torch.testing.assert_close(found[0].sort().values, expected[0].sort().values)
+    torch.testing.assert_close(found.pow(2).sum(-1), expected.pow(2).sum(-1))
+
+
+def test_random_fourier_features_are_cosines_and_a_constant_and_the_same_in_every_run():
+    torch.manual_seed(0)
+    first = ContextFeatures(wide(3), None, "random_fourier", 200)
+    torch.manual_seed(1)
+    second = ContextFeatures(wide(3), None, "random_fourier", 200)
+    x, y = torch.zeros(1, 3), torch.tensor([[0.6, 0.0, 0.0]])
+    assert torch.equal(first(x), second(x)) and first(x).shape == (1, 201) and first(x)[0, -1] == 1.0
+    # The product of two feature vectors stands for the Gaussian kernel, exp(-|x - y|^2 / 2).
+    kernel = (first(x)[0, :-1] * first(y)[0, :-1]).mean() * 2
+    assert kernel.item() == pytest.approx(torch.tensor(-(0.6**2) / 2).exp().item(), abs=0.15)
+
+
+def test_only_the_inputs_are_seen():
+    features = ContextFeatures(wide(4), [2, 0], "polynomial", 1)
+    assert features(torch.tensor([5.0, 6.0, 7.0, 8.0])).tolist() == [7.0, 5.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"inputs": [0, 2]}, "high: inputs=[0, 2]: the observation has entries 0 to 1 (LinUCB, conf/high"),
+        ({"inputs": []}, "high: inputs=[]: the observation has entries 0 to 1"),
+        ({"inputs": [-1]}, "high.inputs.0=-1: must be greater than or equal to 0"),
+        ({"degree": 62}, "high: degree=62: 2016 features of 2 inputs; at most 2000"),
+        ({"features": "random_fourier", "degree": 2000}, "high: degree=2000: 2001 features of 2 inputs; at most 2000"),
+        ({"features": "cubic"}, "high.features=\"cubic\": must be 'polynomial' or 'random_fourier'"),
+    ],
+)
+def test_features_that_cannot_be_are_refused_in_one_line(changes, complaint):
+    target = {"_target_": "hpamdp.policies.high_level.linucb.LinUCB"}
+    with pytest.raises(ConfigError) as error:
+        build("high", target | OPTIONS | changes, specs=SPECS)
+    assert complaint in str(error.value) and "\n" not in str(error.value)
+
+
+# Predictions.
+
+
+@every_memory
+@pytest.mark.parametrize("at_once", [1, 7, 60])
+def test_predictions_and_deviations_are_those_of_a_ridge_regression(memory, at_once):
+    bandit = make("linucb", ridge=0.5, memory=memory, discount=0.9, window=25)
+    observation, option, payoff = teach(bandit, 60, at_once)
+    weight = torch.ones(60).double()
+    if memory == "discounted":
+        weight = 0.9 ** torch.arange(59, -1, -1).double()
+    if memory == "sliding_window":
+        weight[:-25] = 0.0
+    x, y = bandit.features(observation), payoff.double()
+    probe = torch.rand(9, 2) * 2 - 1
+    mean, deviation = bandit.predict(probe)
+    squares, spread = 0.0, []
+    for i in (0, 1):
+        w = weight * (option == i)
+        a = x.T @ (w.unsqueeze(-1) * x) + 0.5 * torch.eye(6).double()
+        theta = torch.linalg.solve(a, x.T @ (w * y))
+        torch.testing.assert_close(mean[:, i], bandit.features(probe) @ theta)
+        squares += (w * (y - x @ theta).square()).sum() + 0.5 * theta.square().sum()
+        spread.append((bandit.features(probe) @ torch.linalg.inv(a) * bandit.features(probe)).sum(-1).sqrt())
+    noise = (squares / weight.sum()).sqrt()
+    torch.testing.assert_close(deviation, noise * torch.stack(spread, -1))
+
+
+@every_bandit
+@pytest.mark.parametrize("degree", [1, 3])
+def test_observations_in_pixels_are_no_trouble(name, degree):
+    torch.manual_seed(0)
+    bandit = BANDITS[name](wide(6), **{**OPTIONS, "degree": degree})
+    observation = torch.rand(2000, 6) * torch.tensor([1280.0, 1024.0, 1280.0, 1024.0, 0.0, 0.0])
+    observation[:, 4:] = torch.tensor([640.0, 512.0])  # the harbour's centre, in every observation
+    option, right = torch.randint(2, (2000,)), (observation[:, 0] - observation[:, 2]) / 300.0
+    bandit.learn(ended(due(observation, option=option), torch.where(option == 1, right, -right)))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        chosen = bandit.select(due(observation))
+    assert (chosen == (right > 0)).float().mean() > 0.97
+
+
+# Choices.
+
+
+def test_linucb_adds_the_width_and_greedily_does_not():
+    bandit = make("linucb", exploration=3.0)
+    teach(bandit, 20, 20)
+    probe = torch.rand(500, 2) * 2 - 1
+    mean, deviation = bandit.predict(probe)
+    assert torch.equal(bandit.select(due(probe)), (mean + 3.0 * deviation).argmax(-1))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(bandit.select(due(probe)), mean.argmax(-1))
+    assert not torch.equal((mean + 3.0 * deviation).argmax(-1), mean.argmax(-1))
+
+
+def test_lin_thompson_chooses_an_option_as_often_as_it_is_likely_to_be_the_best():
+    bandit = make("lin_thompson", exploration=0.7)
+    teach(bandit, 20, 20)
+    probe = torch.tensor([[0.3, -0.4]])
+    mean, deviation = bandit.predict(probe)
+    likely = torch.distributions.Normal(0.0, 1.0).cdf((mean[0, 1] - mean[0, 0]) / (0.7 * deviation.norm())).item()
+    chosen = bandit.select(due(probe.expand(40_000, 2)))
+    assert 0.02 < likely < 0.98 and chosen.float().mean().item() == pytest.approx(likely, abs=0.01)
+
+
+@every_bandit
+def test_options_without_payoffs_come_first_and_are_shared_evenly(name):
+    torch.manual_seed(0)
+    bandit = make(name)
+    assert 20 <= bandit.select(due(torch.rand(100, 2))).sum().item() <= 80
+    bandit.learn(ended(due(torch.rand(9, 2), option=torch.zeros(9, dtype=torch.long)), torch.full((9,), 5.0)))
+    assert bandit.select(due(torch.rand(100, 2))).all()
+
+
+@every_bandit
+def test_who_pays_where_is_learned_where_either_option_alone_is_worth_nothing(name):
+    torch.manual_seed(0)
+    _, regret = play(make(name, degree=3), by_sign, 3000, 8, noise=0.5)
+    # Always the same option costs 1.
+    assert regret[-500:].mean() < 0.15
+
+
+@every_bandit
+def test_forgetting_bandits_follow_a_flip_of_who_pays_where_and_others_lag(name):
+    after = {}
+    for memory in MEMORIES:
+        torch.manual_seed(0)
+        bandit = make(name, memory=memory, degree=1)
+        play(bandit, by_sign, 3000, 16, noise=0.5)
+        regret = play(bandit, against_sign, 2000, 16, noise=0.5)[1]
+        after[memory] = regret.mean().item()
+        assert memory == "all" or regret[-500:].mean() < 0.2
+    assert after["all"] > 0.3 + max(after["discounted"], after["sliding_window"])
+
+
+@every_bandit
+def test_regret_on_a_linear_problem_grows_far_slower_than_time(name):
+    weights, horizon, curves = torch.tensor([[0.5, 0.0], [-0.5, 0.3]]), 2000, []
+    for seed in range(3):
+        torch.manual_seed(seed)
+        curves.append(play(make(name, degree=1), lambda x: x @ weights.T, 4 * horizon, 16, noise=0.5)[1].cumsum(0))
+    regret = torch.stack(curves).mean(0)
+    assert regret[horizon - 1] < 0.02 * horizon
+    assert regret[-1] / regret[horizon - 1] < 2.4  # of sqrt(T) log T: 2.4
+
+
+@every_bandit
+@every_memory
+def test_a_copy_made_of_a_state_dict_goes_on_identically(name, memory):
+    torch.manual_seed(0)
+    source, target = make(name, memory=memory), make(name, memory=memory)
+    play(source, constant(0.0, 1.0), 50)
+    target.load_state_dict(source.state_dict())
+    torch.manual_seed(1)
+    expected, _ = play(source, by_sign, 60, 2)
+    torch.manual_seed(1)
+    assert torch.equal(play(target, by_sign, 60, 2)[0], expected)
+
+
+def test_the_context_is_the_observation_at_which_the_option_was_chosen():
+    bandit = make("linucb", degree=1)
+    decisions = ended(due(torch.ones(4, 2), option=torch.zeros(4, dtype=torch.long)), torch.ones(4))
+    decisions[keys.OBSERVATION] = torch.full((4, 2), 9.0)  # of the option's last step
+    bandit.learn(decisions)
+    torch.testing.assert_close(bandit.gram[0], torch.full((3, 3), 4.0).double())

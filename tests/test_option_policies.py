@@ -1,0 +1,197 @@
+"""The learned option policies, MetaCritic and Actor: their targets by hand, and that they learn who pays where."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_bandits import CPU, SPECS, by_sign, due, ended, play
+
+from hpamdp import keys
+from hpamdp.policies.high_level.actor import LOG_PROB, Actor
+from hpamdp.policies.high_level.meta_critic import MetaCritic
+
+OPTIONS = {
+    MetaCritic: dict(
+        hidden_dims=[32, 32], num_members=3, exploration="epsilon", epsilon_final=0.1, epsilon_decisions=1000,
+        ucb_width=2.0, gamma=1.0, bootstrap=0.0, buffer_size=4000, batch_size=64, updates_per_decision=0.1,
+        max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
+    ),
+    Actor: dict(
+        hidden_dims=[32, 32], gamma=1.0, epochs=4, minibatch_size=64, clip=0.2, entropy=0.0, lr=3e-3, max_grad_norm=0.5,
+    ),
+}  # fmt: skip
+
+
+def make(cls: type, seed: int = 0, **changes: object) -> MetaCritic | Actor:
+    torch.manual_seed(seed)
+    return cls(SPECS, CPU, **{**OPTIONS[cls], **changes})
+
+
+def greedy_regret(selector: MetaCritic | Actor) -> float:
+    """Return what greedy choices lose on `by_sign`, where the right ones lose 0 and any single option 1."""
+    observation = torch.rand(1000, 2) * 2 - 1
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        option = selector(due(observation))[keys.OPTION]
+    return 1.0 - by_sign(observation).gather(-1, option.unsqueeze(-1)).mean().item()
+
+
+def mid_episode(selector: MetaCritic | Actor) -> TensorDict:
+    """Return two decisions of 3 steps that paid 0.7: after the first one the episode goes on, after the second not."""
+    decisions = ended(selector(due(torch.tensor([[0.1, 0.2], [0.3, 0.4]]))), torch.tensor([0.7, 0.7]))
+    after = decisions["next"]
+    after[keys.OBSERVATION] = torch.tensor([[0.5, 0.6], [0.7, 0.8]])
+    after[keys.TERMINATED] = torch.tensor([[False], [True]])
+    after[keys.OPTION_STEPS] = torch.tensor([[3], [3]])
+    decisions[keys.OBSERVATION] = torch.full((2, 2), 9.0)  # of the last step, which nobody should look at
+    return decisions
+
+
+# MetaCritic.
+
+
+@pytest.mark.parametrize("changes", [{}, {"exploration": "ucb"}, {"num_members": 1}])
+def test_meta_critic_learns_who_pays_where(changes):
+    critic = make(MetaCritic, **changes)
+    play(critic, by_sign, 3000, 30, noise=0.5)
+    assert greedy_regret(critic) < 0.2
+
+
+def test_meta_critic_learns_from_options_that_others_chose():
+    critic = make(MetaCritic)
+    for _ in range(60):
+        root = due(torch.rand(50, 2) * 2 - 1, option=torch.randint(2, (50,)))
+        means = by_sign(root[keys.OBSERVATION]).gather(-1, root[keys.OPTION].unsqueeze(-1)).squeeze(-1)
+        critic.learn(ended(root, means + 0.5 * torch.randn(50)))
+    assert greedy_regret(critic) < 0.2
+
+
+def test_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
+    critic = make(MetaCritic, gamma=0.9, num_members=1)
+    with torch.no_grad():
+        for layer in critic.target_critics.layers:
+            layer.bias.normal_()
+    decisions = mid_episode(critic)
+    rows = critic._rows(decisions)
+    torch.testing.assert_close(rows["discount"], torch.tensor([0.9**3, 0.0]))
+    torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
+    q = critic.critics(rows["state"])[0].detach()
+    following = critic.target_critics(torch.tensor([[0.5, 0.6]]))[0, 0].max().item()
+    targets = [0.7 + 0.9**3 * following, 0.7]
+    chosen = decisions[keys.OPTION].tolist()
+    expected = sum((q[i, chosen[i]].item() - targets[i]) ** 2 for i in (0, 1)) / 2
+    assert critic._update(rows).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_without_bootstrap_only_the_chosen_option_has_a_target():
+    critic = make(MetaCritic, num_members=1)
+    rows = critic._rows(mid_episode(critic).set(keys.OPTION, torch.tensor([1, 1])))
+    critic._update(rows)
+    gradient = critic.critics.layers[-1].bias.grad[0, 0]
+    assert gradient[0] == 0.0 and gradient[1] != 0.0
+
+
+@pytest.mark.parametrize("bootstrap", [1.0, 0.5])
+def test_values_of_the_learners_also_teach_of_options_that_were_never_chosen(bootstrap):
+    critic = make(MetaCritic, bootstrap=bootstrap, updates_per_decision=0.2)
+    assert critic.needs_values
+    for _ in range(30):
+        root = due(torch.rand(50, 2) * 2 - 1, option=torch.zeros(50, dtype=torch.long))
+        values = by_sign(root[keys.OBSERVATION])
+        payoff = torch.full((50,), 100.0) if bootstrap == 1.0 else values[:, 0]
+        critic.learn(ended(root, payoff).set(keys.OPTION_VALUES, values))
+    assert greedy_regret(critic) < 0.2
+
+
+def test_targets_mix_payoff_and_values_by_the_bootstrap_share():
+    critic = make(MetaCritic, bootstrap=0.25, num_members=1)
+    decisions = mid_episode(critic).set(keys.OPTION, torch.tensor([1, 0]))[1:]  # the terminated one
+    decisions.set(keys.OPTION_VALUES, torch.tensor([[2.0, 3.0]]))
+    q = critic.critics(torch.tensor([[0.3, 0.4]]))[0, 0].tolist()
+    expected = (q[0] - (0.75 * 0.7 + 0.25 * 2.0)) ** 2 + 0.25 * (q[1] - 3.0) ** 2
+    assert critic._update(critic._rows(decisions)).item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_share_of_random_options_falls_from_1_after_the_warm_up():
+    critic = make(MetaCritic, warmup_decisions=200, epsilon_decisions=1000, epsilon_final=0.1)
+    shares = []
+    for _ in range(14):
+        shares.append(critic.epsilon)
+        critic.learn(ended(due(100, option=torch.zeros(100, dtype=torch.long)), torch.zeros(100)))
+    assert shares == pytest.approx([1.0, 1.0, *(1.0 - 0.09 * i for i in range(11)), 0.1])
+    assert make(MetaCritic, exploration="ucb", warmup_decisions=0).epsilon == 0.0
+
+
+def test_ucb_exploration_adds_the_deviation_between_the_members():
+    critic = make(MetaCritic, exploration="ucb", warmup_decisions=0, ucb_width=3.0)
+    observation = torch.rand(500, 2) * 2 - 1
+    q = critic.critics(observation)
+    bound = q.mean(0) + 3.0 * q.std(0, correction=0)
+    assert torch.equal(critic.select(due(observation)), bound.argmax(-1))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert torch.equal(critic.select(due(observation)), q.mean(0).argmax(-1))
+    assert not torch.equal(bound.argmax(-1), q.mean(0).argmax(-1))
+
+
+# Actor.
+
+
+def test_actor_learns_who_pays_where():
+    actor = make(Actor)
+    play(actor, by_sign, 4000, 50, noise=0.5)
+    assert greedy_regret(actor) < 0.2
+
+
+def test_actor_draws_options_by_its_probabilities_and_tells_them():
+    actor = make(Actor)
+    observation = torch.tensor([[0.5, -0.5]]).expand(40_000, 2)
+    td = actor(due(observation))
+    probability = actor.logits(observation[0]).softmax(-1)
+    assert td[keys.OPTION].float().mean().item() == pytest.approx(probability[1].item(), abs=0.01)
+    torch.testing.assert_close(td[LOG_PROB], probability.log()[td[keys.OPTION]].detach())
+
+
+def test_the_ratio_is_1_in_the_first_minibatch(monkeypatch):
+    actor = make(Actor, epochs=2, minibatch_size=32)
+    seen = []
+
+    def update(rows):
+        log_prob = actor.logits(rows["state"]).log_softmax(-1).gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
+        seen.append((log_prob - rows["log_prob"]).abs().max().item())
+        return Actor._update(actor, rows)
+
+    monkeypatch.setattr(actor, "_update", update)
+    play(actor, by_sign, 64, 64)
+    assert len(seen) == 4 and seen[0] < 1e-6 and max(seen[1:]) > 1e-4
+
+
+def test_targets_of_the_actor_are_discounted_by_the_options_length_and_end_with_the_episode():
+    actor = make(Actor, gamma=0.9)
+    decisions = mid_episode(actor)
+    rows = actor._rows(decisions)
+    following = actor.critic(torch.tensor([[0.5, 0.6]])).item()
+    assert rows["target"].tolist() == pytest.approx([0.7 + 0.9**3 * following, 0.7])
+    torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
+
+
+def test_decisions_that_wait_for_an_update_survive_a_state_dict():
+    actor = make(Actor)
+    play(actor, by_sign, 40, 20)
+    assert sum(len(rows) for rows in actor.waiting) == 40
+    other = make(Actor, seed=1)
+    other.load_state_dict(actor.state_dict())
+    other.optimiser.load_state_dict(actor.optimiser.state_dict())
+    decisions = ended(actor(due(torch.rand(40, 2))), torch.randn(40))
+    for one in (actor, other):
+        torch.manual_seed(3)
+        assert one.learn(decisions) and not one.waiting
+    for one, two in zip(actor.parameters(), other.parameters(), strict=True):
+        torch.testing.assert_close(one, two)
+
+
+@pytest.mark.parametrize("cls", [MetaCritic, Actor])
+def test_greedy_choices_draw_nothing(cls):
+    selector = make(cls)
+    state = torch.get_rng_state()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        selector(due(torch.rand(20, 2, generator=torch.Generator().manual_seed(0))))
+    assert torch.equal(torch.get_rng_state(), state)

@@ -1,0 +1,76 @@
+"""Problems of one step for selectors: two options, whose payoffs may depend on what is observed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.policies.base import Selector
+from hpamdp.specs import PAMDPSpecs
+
+SPECS = PAMDPSpecs(2, ("left", "right"), (1, 1), (0.0, 0.0), (1.0, 1.0))
+CPU = torch.device("cpu")
+
+Means = Callable[[Tensor], Tensor]  # observations [B, 2] to the options' mean payoffs [B, 2]
+
+
+def constant(left: float, right: float) -> Means:
+    """Payoffs that depend on nothing."""
+    return lambda observation: torch.tensor([left, right]).expand(len(observation), 2)
+
+
+def by_sign(observation: Tensor) -> Tensor:
+    """Right pays 1 and left -1 where the first entry is positive, the reverse elsewhere; either alone is worth 0."""
+    right = observation[:, 0].sign()
+    return torch.stack([-right, right], -1)
+
+
+def against_sign(observation: Tensor) -> Tensor:
+    return -by_sign(observation)
+
+
+def due(observation: Tensor | int, **more: object) -> TensorDict:
+    """Return a root at which every environment decides, given the observations or their number."""
+    if isinstance(observation, int):
+        observation = torch.zeros(observation, SPECS.observation_dim)
+    is_decision = torch.ones(len(observation), 1, dtype=torch.bool)
+    return TensorDict({keys.OBSERVATION: observation, keys.IS_DECISION: is_decision, **more}, [len(observation)])
+
+
+def ended(chosen: TensorDict, payoffs: Tensor) -> TensorDict:
+    """Return the decisions `[N]` made at a root, each paid after one step, which ended its episode."""
+    is_end = torch.ones(len(chosen), 1, dtype=torch.bool)
+    after = {
+        keys.OBSERVATION: torch.zeros_like(chosen[keys.OBSERVATION]),
+        keys.TERMINATED: is_end,
+        keys.IS_DECISION: is_end,
+        keys.OPTION_RETURN: payoffs.unsqueeze(-1),
+        keys.OPTION_STEPS: is_end.long(),
+        keys.DECISION_OBSERVATION: chosen[keys.OBSERVATION],
+    }
+    return chosen.copy().set("next", TensorDict(after, chosen.batch_size))
+
+
+def paid(options: list[int], payoffs: list[float], **more: object) -> TensorDict:
+    """Return the decisions for these options with these payoffs, all of them made at the observation 0."""
+    return ended(due(len(options), option=torch.tensor(options), **more), torch.tensor(payoffs))
+
+
+def play(selector: Selector, means: Means, num: int, batch: int = 1, noise: float = 1.0) -> tuple[Tensor, Tensor]:
+    """Let the selector choose and learn for `num` decisions, `batch` at once; return the options and the regrets.
+
+    Observations are uniform in [-1, 1]; payoffs are normal with the deviation `noise`.
+    """
+    options, regrets = [], []
+    for _ in range(num // batch):
+        chosen = selector(due(2.0 * torch.rand(batch, SPECS.observation_dim) - 1.0))
+        offered = means(chosen[keys.OBSERVATION])
+        earned = offered.gather(-1, chosen[keys.OPTION].unsqueeze(-1)).squeeze(-1)
+        selector.learn(ended(chosen, earned + noise * torch.randn(batch)))
+        options.append(chosen[keys.OPTION])
+        regrets.append(offered.amax(-1) - earned)
+    return torch.cat(options), torch.cat(regrets)
