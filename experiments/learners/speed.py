@@ -1,0 +1,117 @@
+"""Time training and updates of every learner at the sizes of the code released with the benchmark paper.
+
+python experiments/learners/speed.py       one thread; prints the table and writes speed.csv
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from hydra import compose, initialize_config_dir
+from torchrl.collectors import Collector
+
+from hpamdp.assemble import Parts, assemble
+from hpamdp.config import run_config
+from hpamdp.main import conf_dir
+
+HERE = Path(__file__).resolve().parent
+PUBLISHED = ["low=pdqn", "low.twin_q=false", "low.target_smoothing=0", "low.policy_delay=1", "low.hidden_dims=[128]"]
+EVERY_PRESS = ["low.updates_per_frame=1", "low.batch_size=128", "num_envs=64", "steps_per_batch=1"]
+HYAR = ["low=hyar", "low.warmup_frames=1000", "low.codec_pretrain_updates=10"]
+HYAR_SIZE = ["low.hidden_dims=[256,256]", "low.codec_hidden_dim=256"]
+DLPA = ["low=dlpa", "low.warmup_frames=64"]
+DLPA_SIZE = [
+    *("low.num_samples=1000", "low.num_elites=100", "low.num_iterations=6", "low.horizon=5"),
+    "low.batch_size=128",
+]
+
+
+class Case(NamedTuple):
+    """What to time, and the released code's figures on one core."""
+
+    name: str
+    overrides: list[str]
+    before: int  # presses
+    timed: int  # presses
+    released_speed: float | None = None  # presses/s
+    released_update: float | None = None  # ms
+
+
+CASES = [
+    Case("hppo, defaults", ["low=hppo"], 20_000, 200_000, 665),
+    Case("P-DQN, an update a press", [*PUBLISHED, "low.multipass=false", *EVERY_PRESS], 6_000, 3_000, 295, 3.4),
+    Case("MP-DQN, an update a press", [*PUBLISHED, *EVERY_PRESS], 6_000, 3_000, 194, 5.2),
+    Case("pdqn, defaults", ["low=pdqn"], 6_000, 20_000, 194),
+    Case("HyAR, layers of 256, an update a press", [*HYAR, *HYAR_SIZE, *EVERY_PRESS], 1_500, 2_000, 59, 15.0),
+    Case("hyar, defaults", HYAR, 2_500, 20_000, 59),
+    Case("DLPA, 1,000 x 6 x 5, an update a press", [*DLPA, *DLPA_SIZE], 128, 640, 2.0, 15.0),
+    Case(
+        "DLPA, 1,000 x 6 x 5, 25 updates a press", [*DLPA, *DLPA_SIZE, "low.updates_per_frame=25"], 128, 128, 2.0, 15.0
+    ),
+    Case("dlpa, defaults", DLPA, 128, 1_280, 2.0),
+    Case("qpamdp, defaults", ["low=qpamdp"], 60_000, 1_000_000, 1_800),
+    Case("hsac, defaults", ["low=hsac"], 6_000, 20_000),
+]
+
+
+def run_case(overrides: list[str], before: int, frames: int) -> tuple[float, float | None]:
+    """Return presses/s of training and ms of an update, None where the learner counts none."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"), tempfile.TemporaryDirectory() as folder:
+        cfg = compose("config", ["high=none", "env.controller=congruent", "eval.layouts=10", *overrides])
+        settings = run_config(cfg)
+        torch.manual_seed(0)
+        parts = assemble(cfg, settings, Path(folder))
+    batch_size = settings.num_envs * settings.steps_per_batch
+    collector = Collector(
+        parts.env, parts.policy, frames_per_batch=batch_size, total_frames=-1, auto_register_policy_transforms=False
+    )
+    batches = iter(collector)
+    for _ in range(before // batch_size):
+        parts.agent.learn(next(batches))
+    updates, learning, started, played = _updates(parts), 0.0, time.perf_counter(), 0
+    while played < frames:
+        batch = next(batches)
+        begun = time.perf_counter()
+        parts.agent.learn(batch)
+        learning += time.perf_counter() - begun
+        played += batch.numel()
+    wall = time.perf_counter() - started
+    made = _updates(parts) - updates
+    return played / wall, 1000.0 * learning / made if made else None
+
+
+def _updates(parts: Parts) -> int:
+    return int(getattr(parts.agent.learners[0], "updates", 0))
+
+
+def main() -> None:
+    """Time every case, print a table, write the csv."""
+    torch.set_num_threads(1)
+    rows = []
+    print("| case | presses/s | released | ratio | ms an update | released | ratio |\n|---|---|---|---|---|---|---|")
+    for case in CASES:
+        speed, update = run_case(case.overrides, case.before, case.timed)
+        row = {
+            "case": case.name,
+            "presses_per_s": round(speed, 1),
+            "released_presses_per_s": case.released_speed or "-",
+            "ratio": round(speed / case.released_speed, 1) if case.released_speed else "-",
+            "update_ms": round(update, 2) if update else "-",
+            "released_update_ms": case.released_update or "-",
+            "update_ratio": round(case.released_update / update, 1) if update and case.released_update else "-",
+        }
+        rows.append(row)
+        print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)
+    with (HERE / "speed.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()
