@@ -156,9 +156,9 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
     loss.set_keys(action=keys.OPTION)
     loss.make_value_estimator(gamma=1.0)
     optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(1000), batch_size=128)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(800), batch_size=128)
     policy = TensorDictSequential(greedy, explore)
-    collector = Collector(env, policy, frames_per_batch=50, total_frames=1000, auto_register_policy_transforms=False)
+    collector = Collector(env, policy, frames_per_batch=50, total_frames=800, auto_register_policy_transforms=False)
     for batch in collector:
         buffer.extend(batch.reshape(-1))
         explore.step(len(batch))
@@ -168,9 +168,9 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
             optimiser.step()
     collector.shutdown(close_env=False)
 
-    test, returns = planned(250), []
+    test, returns = planned(200), []
     for chosen in (0, 1, None):
         td = test.reset(test.fixed_episodes(0))
-        td = greedy(td) if chosen is None else td.set(keys.OPTION, torch.full((250,), chosen))
+        td = greedy(td) if chosen is None else td.set(keys.OPTION, torch.full((200,), chosen))
         returns.append(test.step(td)["next", keys.REWARD].mean().item())
     assert returns[2] > max(returns[:2]) + 0.1  # the best choices: 0.23

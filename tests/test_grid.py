@@ -1,6 +1,7 @@
 """Every selector runs over every learner, and every one of them survives a checkpoint: the lists are those of conf/."""
 
 import itertools
+import json
 
 import pytest
 import torch
@@ -43,6 +44,23 @@ def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
     monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0
     assert (tmp_path / "summary.json").is_file()
+
+
+# Keys with two, no and one parameter, in odd bounds; and the built-in second domain.
+ELSEWHERE = {
+    "gymnasium": ["env.entry_point=toy_environments:Toy", "env.kwargs={length:4}", "env.max_steps=6"],
+    "platform": [],
+}
+
+
+@pytest.mark.parametrize("env", list(ELSEWHERE))
+@pytest.mark.parametrize("low", [low for low in choices("low") if low != "planner"])
+def test_every_learner_works_on_other_problems(low, env, tmp_path, monkeypatch):
+    given = [f"env={env}", "high=none", f"low={low}", *ELSEWHERE[env], *SHORT.get(low, []), *SMALL]
+    given += ["low.features=null"] if low == "qpamdp" else []
+    assert run(compose_config(given), tmp_path, given) == 0
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["env"] == env and "human" not in summary["references"]
 
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])

@@ -148,11 +148,11 @@ def test_linucb_adds_the_width_and_greedily_does_not():
 
 
 def test_lin_thompson_chooses_an_option_as_often_as_it_is_likely_to_be_the_best():
-    bandit = make("lin_thompson", exploration=0.7)
+    bandit = make("lin_thompson", exploration=3.0)
     teach(bandit, 20, 20)
     probe = torch.tensor([[0.3, -0.4]])
     mean, deviation = bandit.predict(probe)
-    likely = torch.distributions.Normal(0.0, 1.0).cdf((mean[0, 1] - mean[0, 0]) / (0.7 * deviation.norm())).item()
+    likely = torch.distributions.Normal(0.0, 1.0).cdf((mean[0, 1] - mean[0, 0]) / (3.0 * deviation.norm())).item()
     chosen = bandit.select(due(probe.expand(40_000, 2)))
     assert 0.02 < likely < 0.98 and chosen.float().mean().item() == pytest.approx(likely, abs=0.01)
 

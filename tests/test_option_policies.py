@@ -121,15 +121,16 @@ def test_the_share_of_random_options_falls_from_1_after_the_warm_up():
     assert make(MetaCritic, exploration="ucb", warmup_decisions=0).epsilon == 0.0
 
 
-def test_ucb_exploration_adds_the_deviation_between_the_members():
-    critic = make(MetaCritic, exploration="ucb", warmup_decisions=0, ucb_width=3.0)
-    observation = torch.rand(500, 2) * 2 - 1
-    q = critic.critics(observation)
-    bound = q.mean(0) + 3.0 * q.std(0, correction=0)
-    assert torch.equal(critic.select(due(observation)), bound.argmax(-1))
+@pytest.mark.parametrize(("width", "chosen"), [(0.7, 0), (0.8, 1)])
+def test_ucb_exploration_adds_the_deviation_between_the_members(width, chosen):
+    critic = make(MetaCritic, exploration="ucb", warmup_decisions=0, ucb_width=width)
+    with torch.no_grad():
+        critic.critics.layers[-1].weight.zero_()
+        critic.critics.layers[-1].bias[:, 0] = torch.tensor([[2.0, 0.0], [2.0, 0.0], [2.0, 3.0]])
+    # Means 2 and 1, deviations 0 and sqrt(2).
+    assert critic.select(due(20)).tolist() == [chosen] * 20
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert torch.equal(critic.select(due(observation)), q.mean(0).argmax(-1))
-    assert not torch.equal(bound.argmax(-1), q.mean(0).argmax(-1))
+        assert critic.select(due(20)).tolist() == [0] * 20
 
 
 # Actor.

@@ -39,7 +39,8 @@ class ContextFeatures(nn.Module):
         super().__init__()
         inputs = list(range(specs.observation_dim)) if inputs is None else inputs
         if not inputs or not all(0 <= i < specs.observation_dim for i in inputs):
-            raise ValueError(f"inputs={inputs}: the observation has entries 0 to {specs.observation_dim - 1}")
+            last = specs.observation_dim - 1
+            raise ValueError(f"inputs={inputs}: the observation has entries 0 to {last}; null: all")
         is_polynomial = features == "polynomial"
         self.num_features = math.comb(len(inputs) + degree, degree) if is_polynomial else degree + 1
         if self.num_features > 2000:

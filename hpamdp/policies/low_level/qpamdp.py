@@ -198,7 +198,8 @@ class QPAMDP(Learner):
     ) -> None:
         super().__init__(specs)
         if features is not None and not all(i < specs.observation_dim for i in features):
-            raise ValueError(f"features={features}: the observation has entries 0 to {specs.observation_dim - 1}")
+            last = specs.observation_dim - 1
+            raise ValueError(f"features={features}: the observation has entries 0 to {last}; null: all")
         self.features, self.warmup_frames, self.initial_episodes = features, warmup_frames, initial_episodes
         self.relearning_episodes, self.rollouts = relearning_episodes, rollouts
         self.parameter_updates, self.patience, self.max_divergence = parameter_updates, patience, max_divergence
