@@ -87,10 +87,13 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
         checkpoint.load(file, components={"agent"}, map_location=device)
         prefix = "learners."
         own = {name.removeprefix(prefix): value for name, value in saved.columns.items() if name.startswith(prefix)}
+        saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
+        if own and saved_num != num:
+            raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} learners, but this agent has {num}")
         agent.learners.load_state_dict(own)
     except (CheckpointError, RuntimeError, OSError) as error:
         reason = " ".join(str(error).split())
-        raise ConfigError(f"low.checkpoint={file}: of other learners than these: {reason:.300}") from error
+        raise ConfigError(f"low.checkpoint={file}: of another class or size than low: {reason:.160}") from error
 
 
 def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_training: bool) -> dict[str, Tensor]:

@@ -72,7 +72,8 @@ class Trainer:
     def train(self) -> bool:
         """Run until `total_frames`; return whether the user stopped it before. Either way the agent is saved."""
         settings = self.settings
-        bar = tqdm(total=settings.total_frames, initial=self.frames, unit=" presses", unit_scale=True, mininterval=1.0)
+        unit = " decisions" if settings.low.freeze else " presses"
+        bar = tqdm(total=settings.total_frames, initial=self.frames, unit=unit, unit_scale=True, mininterval=1.0)
         collector = Collector(
             self.parts.env,
             self.parts.policy,

@@ -75,7 +75,7 @@ def crossing(*words: str) -> DictConfig:
         ),
         (
             "high=linucb env=boatdock env.observation=pixels",
-            "high: inputs=[14, 15]: the observation has entries 0 to 13 (LinUCB, conf/high)",
+            "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all (LinUCB, conf/high)",
         ),
         (
             "low.checkpoint=/nowhere",
@@ -111,7 +111,9 @@ def trained(tmp_path_factory) -> Path:
 def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained, tmp_path):
     with pytest.raises(ConfigError) as error:
         make(compose_config([*SMALL, *words.split(), f"low.checkpoint={trained}"]), tmp_path)
-    assert str(error.value).startswith(f"low.checkpoint={trained / 'checkpoint.zip'}: of other learners than these: ")
+    line = str(error.value)
+    assert line.startswith(f"low.checkpoint={trained / 'checkpoint.zip'}: ")
+    assert "it holds 2 learners, but this agent has 1" in line or "of another class or size than low: " in line
     assert "\n" not in str(error.value)
 
 

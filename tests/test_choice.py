@@ -151,18 +151,18 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
     out_keys = [keys.OPTION, "action_value", "chosen_action_value"]
     greedy = TensorDictSequential(q, QValueModule(action_space="categorical", out_keys=out_keys))
     option = env.full_action_spec[keys.OPTION]
-    explore = EGreedyModule(option, eps_init=1.0, eps_end=0.2, annealing_num_steps=500, action_key=keys.OPTION)
+    explore = EGreedyModule(option, eps_init=1.0, eps_end=0.2, annealing_num_steps=300, action_key=keys.OPTION)
     loss = DQNLoss(greedy, action_space="categorical", delay_value=False)
     loss.set_keys(action=keys.OPTION)
     loss.make_value_estimator(gamma=1.0)
-    optimiser = torch.optim.Adam(loss.parameters(), lr=2e-3)
-    buffer = ReplayBuffer(storage=LazyTensorStorage(800), batch_size=128)
+    optimiser = torch.optim.Adam(loss.parameters(), lr=5e-3)
+    buffer = ReplayBuffer(storage=LazyTensorStorage(600), batch_size=256)
     policy = TensorDictSequential(greedy, explore)
-    collector = Collector(env, policy, frames_per_batch=50, total_frames=800, auto_register_policy_transforms=False)
+    collector = Collector(env, policy, frames_per_batch=50, total_frames=600, auto_register_policy_transforms=False)
     for batch in collector:
         buffer.extend(batch.reshape(-1))
         explore.step(len(batch))
-        for _ in range(30):
+        for _ in range(40):
             optimiser.zero_grad()
             loss(buffer.sample())["loss"].backward()
             optimiser.step()

@@ -227,17 +227,18 @@ class HPPO(Learner):
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the generalised advantages and the targets of V, each `[*B, T]`; they count in the rows of `mask`.
 
-        Bootstrapping stops where an episode terminated, the trace where it is done, which is also where another
-        option's rows can begin; those rows are zeros here.
+        Bootstrapping stops where an episode terminated, the trace where it is done or its option ends, for there
+        another option's rows can begin; those rows are zeros here.
         """
         with torch.no_grad():
             value, next_value, reward = torch.zeros(3, *mask.shape, 1, device=mask.device)
             value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
             next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
             reward[mask] = batch.get(("next", keys.REWARD))[mask]
-            done, terminated = batch.get(("next", keys.DONE)), batch.get(("next", keys.TERMINATED))
+            terminated = batch.get(("next", keys.TERMINATED))
+            ends = batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
             advantage, target = generalized_advantage_estimate(
-                self.gamma, self.gae_lambda, value, next_value, reward, done, terminated
+                self.gamma, self.gae_lambda, value, next_value, reward, ends, terminated
             )
         return advantage.squeeze(-1), target.squeeze(-1)
 

@@ -163,7 +163,8 @@ class PDQN(ReplayLearner):
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state after it and the discount of that state's value."""
         rows = super().transitions(batch)
-        done = batch["next", keys.DONE].squeeze(-1)
+        # Another learner's rows can follow where an option ends.
+        done = (batch["next", keys.DONE] | batch["next"].get(keys.IS_DECISION, False)).squeeze(-1)
         reward, last = n_step_returns(rows["reward"], done, self.n_step, self.gamma)
         steps = last - torch.arange(done.shape[-1], device=last.device) + 1
         goes_on = ~batch["next", keys.TERMINATED].squeeze(-1).gather(-1, last)
