@@ -24,6 +24,7 @@ from hpamdp.metrics import read_rows
 HERE = Path(__file__).resolve().parent
 HUMAN = {"congruent": 2.012, "incongruent": 1.912}
 PEOPLE = 1.970
+_REWARDS = {"given": "the paper's", "sparse": "sparse"}
 COLOURS = {
     "hppo": "#0072B2",
     "hsac": "#D55E00",
@@ -42,8 +43,8 @@ def gather(folder: Path) -> tuple[Rows, Rows]:
     results, curves = [], []
     for file in sorted(folder.glob("**/summary.json")):
         summary, config = json.loads(file.read_text()), (file.parent / "config.yaml").read_text()
-        name = {"low": _name(summary["low"], config), "boat": summary["controller"]}
-        name |= {"reward": "sparse" if "reward: sparse" in config else "paper", "seed": summary["seed"]}
+        name = {"low": _name(summary["low"], config), "problem": summary.get("controller", summary.get("env"))}
+        name |= {"reward": "sparse" if "reward: sparse" in config else "given", "seed": summary["seed"]}
         rows = [row for row in read_rows(file.parent / "metrics.csv") if "eval/score" in row]
         reached = next((row for row in rows if row["eval/score"] >= PEOPLE), {})
         results.append(
@@ -88,12 +89,12 @@ def groups(rows: Rows, *names: str) -> dict[tuple[str, ...], Rows]:
 
 
 def table(results: Rows) -> str:
-    """Return mean and standard deviation over seeds, a line a learner, boat and reward."""
+    """Return mean and standard deviation over seeds, a line a learner, problem and reward."""
     lines = [
-        "| learner | boat | reward | seeds | score | success | presses | wall | CPU | presses to 1.97 | wall to 1.97 |",
+        "| learner | problem | reward | seeds | score | success | presses | wall | CPU | presses to 1.97 | after |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for (low, boat, reward), rows in groups(results, "low", "boat", "reward").items():
+    for (low, problem, reward), rows in groups(results, "low", "problem", "reward").items():
         score, success = ([float(row[name]) for row in rows] for name in ("score", "success"))
         wall, cpu, presses = (np.mean([float(row[name]) for row in rows]) for name in ("wall_s", "cpu_s", "presses"))
         reached = [row for row in rows if row["presses_to_people"]]
@@ -102,7 +103,7 @@ def table(results: Rows) -> str:
             to = [np.mean([float(row[name]) for row in rows]) for name in ("presses_to_people", "wall_s_to_people")]
             first = [f"{to[0]:,.0f}", f"{to[1]:.0f} s"]
         lines.append(
-            f"| {low} | {boat} | {reward} | {len(rows)} | {np.mean(score):.3f} ± {np.std(score, ddof=1):.3f} | "
+            f"| {low} | {problem} | {reward} | {len(rows)} | {np.mean(score):.3f} ± {np.std(score, ddof=1):.3f} | "
             f"{np.mean(success):.1%} | {presses:,.0f} | {wall:.0f} s | {cpu:.0f} s | {first[0]} | {first[1]} |"
         )
     return "\n".join(lines)
@@ -110,18 +111,18 @@ def table(results: Rows) -> str:
 
 def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
     """Draw the learning curves of one reward, a panel a boat: mean over seeds and one standard deviation."""
-    chosen = [row for row in curves if row["reward"] == reward]
-    boats = sorted({row["boat"] for row in chosen})
+    chosen = [row for row in curves if row["reward"] == reward and row["problem"] in HUMAN]
+    boats = sorted({row["problem"] for row in chosen})
     figure = Figure(figsize=(6.4 * len(boats), 4.2), layout="constrained")
     for axes, boat in zip(figure.subplots(1, len(boats), squeeze=False)[0], boats, strict=True):
-        of_boat = [row for row in chosen if row["boat"] == boat]
+        of_boat = [row for row in chosen if row["problem"] == boat]
         ends = [_draw_learner(axes, runs, low, x) for (low,), runs in groups(of_boat, "low").items() if low in COLOURS]
-        _draw_lines(axes, [row for row in results if row["boat"] == boat], boat)
+        _draw_lines(axes, [row for row in results if row["problem"] == boat], boat)
         axes.legend(loc="lower right", fontsize=8, frameon=False)
         axes.set_xscale("log")
         axes.set_xlim(right=max(ends) * 1.1)
         axes.set_ylim(-1.3, 3.7)
-        axes.set_title(f"{boat} boat, {reward} reward", loc="left", fontweight="bold", fontsize=10)
+        axes.set_title(f"{boat} boat, {_REWARDS[reward]} reward", loc="left", fontweight="bold", fontsize=10)
         axes.set_xlabel("presses" if x == "frames" else "seconds of training, evaluations included")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.spines[["top", "right"]].set_visible(False)
@@ -164,9 +165,9 @@ def main(folders: Iterable[str]) -> None:
         write(HERE / "results.csv", results)
         write(HERE / "curves.csv", curves)
     results, curves = read(HERE / "results.csv"), read(HERE / "curves.csv")
-    for reward in sorted({row["reward"] for row in curves}):
-        draw(curves, results, reward, "frames", HERE / f"curves_{reward}.png")
-    draw(curves, results, "paper", "wall_s", HERE / "curves_seconds.png")
+    draw(curves, results, "given", "frames", HERE / "curves.png")
+    draw(curves, results, "sparse", "frames", HERE / "curves_sparse.png")
+    draw(curves, results, "given", "wall_s", HERE / "curves_seconds.png")
     print(table(results))
 
 
