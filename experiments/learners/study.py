@@ -103,10 +103,15 @@ def table(results: Rows) -> str:
             to = [np.mean([float(row[name]) for row in rows]) for name in ("presses_to_people", "wall_s_to_people")]
             first = [f"{to[0]:,.0f}", f"{to[1]:.0f} s"]
         lines.append(
-            f"| {low} | {problem} | {reward} | {len(rows)} | {np.mean(score):.3f} ± {np.std(score, ddof=1):.3f} | "
+            f"| {low} | {problem} | {reward} | {len(rows)} | {_spread(score)} | "
             f"{np.mean(success):.1%} | {presses:,.0f} | {wall:.0f} s | {cpu:.0f} s | {first[0]} | {first[1]} |"
         )
     return "\n".join(lines)
+
+
+def _spread(values: list[float]) -> str:
+    mean = f"{np.mean(values):.3f}"
+    return f"{mean} ± {np.std(values, ddof=1):.3f}" if len(values) > 1 else mean
 
 
 def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
@@ -137,7 +142,7 @@ def _draw_learner(axes: Axes, runs: Rows, low: str, x: str) -> float:
     at, score = np.mean([s[:num, 0] for s in seeds], 0), np.array([s[:num, 1] for s in seeds])
     mean, deviation = score.mean(0), score.std(0)
     late = at > 0
-    axes.plot(at[late], mean[late], color=COLOURS[low], linewidth=1.8, label=f"{low} {mean[-1]:.2f}")
+    axes.plot(at[late], mean[late], color=COLOURS[low], linewidth=1.8, label=low)
     axes.fill_between(
         at[late], (mean - deviation)[late], (mean + deviation)[late], color=COLOURS[low], alpha=0.18, lw=0
     )

@@ -42,7 +42,7 @@ class EnsembleMLP(nn.Module):
         """Apply all members."""
         x = x.expand(self.num_members, *x.shape)
         for layer in self.layers[:-1]:
-            x = layer(x).relu()
+            x = layer(x).relu_()
         return self.layers[-1](x)
 
 
