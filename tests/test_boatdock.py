@@ -266,6 +266,8 @@ BAD_ARGUMENTS = [
     {"observation": "image"},
     {"slip": 1.5},
     {"motor_noise": -0.1},
+    {"motor_noise": [0.1, 0.2, 0.3]},
+    {"motor_noise": [0.1, math.nan]},
     {"sensor_noise": math.inf},
     {"num_envs": 0},
 ]

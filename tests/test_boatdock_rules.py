@@ -125,6 +125,17 @@ def test_motor_noise_is_lognormal_in_the_executed_duration():
     assert abs(torch.stack(logs).corrcoef()[0, 1]) < 0.03
 
 
+def test_each_boat_may_have_motor_noise_of_its_own():
+    num = 20_000
+    env = BoatDockEnv(num, controller="random", motor_noise=[0.1, 0.3])
+    env.reset(layout([0.0, 0.0], [90.0, 0.0], num))
+    before = env.state.fuel
+    press(env, [1] * num, [0.3] * num)
+    log = ((before - env.state.fuel) / 0.3).log()
+    for controller, deviation in enumerate((0.1, 0.3)):
+        assert log[env.state.controller == controller].std().item() == pytest.approx(deviation, rel=0.05)
+
+
 def test_sensor_noise_blurs_every_position_anew_and_moves_no_boat():
     num = 20_000
     env, exact = (BoatDockEnv(num, controller="congruent", observation="pixels", sensor_noise=s) for s in (4.0, 0.0))

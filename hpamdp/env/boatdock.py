@@ -7,10 +7,11 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 import torch
+from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
@@ -22,6 +23,8 @@ from hpamdp.env.episode import BoatState, Rules
 from hpamdp.env.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.people import people_shares, people_spec
 from hpamdp.env.scores import measure_boats
+
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 
@@ -41,7 +44,8 @@ class BoatDockEnv(PAMDPEnv):
         reward: `paper` (progress, 5 x fuel fraction on success, -1 on failure) or `sparse` (the success term alone).
         observation: `scaled` to about [-1, 1] with goal - boat appended (`[N, 16]`), or the paper's `pixels`
             (`[N, 14]`).
-        motor_noise: standard deviation of the log of the executed duration.
+        motor_noise: standard deviation of the log of the executed duration; two of them: of the incongruent and of the
+            congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
         compile_physics: compile the pure step, reset and observation functions (takes about half a minute).
@@ -71,7 +75,7 @@ class BoatDockEnv(PAMDPEnv):
         keymap: Literal[1, 2, "random"] = 1,
         reward: Literal["paper", "sparse"] = "paper",
         observation: Literal["scaled", "pixels"] = "scaled",
-        motor_noise: float = 0.0,
+        motor_noise: float | Pair = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
         compile_physics: bool = False,
@@ -80,7 +84,8 @@ class BoatDockEnv(PAMDPEnv):
         device: torch.device | str | None = "cpu",
         seed: int = 0,
     ) -> None:
-        rules = Rules(controller, keymap, reward, observation, motor_noise, sensor_noise, slip)
+        each = (motor_noise, motor_noise) if isinstance(motor_noise, int | float) else tuple(motor_noise)
+        rules = Rules(controller, keymap, reward, observation, each, sensor_noise, slip)
         _check_arguments(num_envs, rules)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
@@ -297,6 +302,9 @@ def _check_arguments(num_envs: int, rules: Rules) -> None:
         raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
     if not 0.0 <= rules.slip <= 1.0:
         raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
-    for name in ("motor_noise", "sensor_noise"):
-        if not 0.0 <= getattr(rules, name) < float("inf"):
-            raise ValueError(f"BoatDockEnv: {name}={getattr(rules, name)}, but must be a finite number of at least 0")
+    if len(rules.motor_noise) != 2:
+        raise ValueError(f"BoatDockEnv: motor_noise={list(rules.motor_noise)}, but must be one number or two")
+    for name, values in (("motor_noise", rules.motor_noise), ("sensor_noise", (rules.sensor_noise,))):
+        for value in values:
+            if not 0.0 <= value < float("inf"):
+                raise ValueError(f"BoatDockEnv: {name}={value}, but must be a finite number of at least 0")

@@ -46,7 +46,7 @@ class Rules(NamedTuple):
     keymap: int | str = 1
     reward: str = "paper"
     observation: str = "scaled"
-    motor_noise: float = 0.0
+    motor_noise: tuple[float, float] = (0.0, 0.0)  # of the incongruent and of the congruent boat
     sensor_noise: float = 0.0
     slip: float = 0.0
 
@@ -159,10 +159,11 @@ def _press(
         any_key = (counter_rng.uniform(noise_key, draw + _SLIPPED_KEY) * harbour.NUM_KEYS).to(torch.int32)
         key = torch.where(counter_rng.uniform(noise_key, draw + _SLIP) < rules.slip, any_key, key)
     duration = duration.clamp(0.0, physics.MAX_DURATION)
-    if rules.motor_noise > 0.0:
-        duration = duration * (rules.motor_noise * counter_rng.normal(noise_key, draw // 2 + _MOTOR)).exp()
-        duration = duration.clamp(max=physics.MAX_DURATION)
     controller = torch.where(state.controller == harbour.NOT_CHOSEN, option, state.controller)
+    if max(rules.motor_noise) > 0.0:
+        deviation = torch.where(controller == 0, *rules.motor_noise)
+        duration = duration * (deviation * counter_rng.normal(noise_key, draw // 2 + _MOTOR)).exp()
+        duration = duration.clamp(max=physics.MAX_DURATION)
     dir_x, dir_y = harbour.direction(controller, state.keymap, key)
     pressed = physics.press(state.x, state.y, state.fuel, state.goal_x, state.goal_y, dir_x, dir_y, duration)
     presses = state.presses + 1

@@ -9,6 +9,7 @@ Actions are dicts or, with `action_format="tuple"`, the field's nested tuples: s
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import gymnasium
@@ -48,7 +49,7 @@ class BoatDock(gymnasium.Env):
         keymap: Literal[1, 2, "random"] = 1,
         reward: Literal["paper", "sparse"] = "paper",
         observation: Literal["scaled", "pixels"] = "scaled",
-        motor_noise: float = 0.0,
+        motor_noise: float | Sequence[float] = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
         action_format: ActionFormat = "dict",
@@ -149,7 +150,7 @@ class BoatDockVector(VectorEnv):
         keymap: Literal[1, 2, "random"] = 1,
         reward: Literal["paper", "sparse"] = "paper",
         observation: Literal["scaled", "pixels"] = "scaled",
-        motor_noise: float = 0.0,
+        motor_noise: float | Sequence[float] = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
         action_format: ActionFormat = "dict",

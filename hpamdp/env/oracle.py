@@ -54,7 +54,7 @@ class BoatDockOracle:
     def read(self, state: BoatState) -> TensorDict:
         """Return `option` `[N]` and each option's next press, `key` and `duration` `[N, num_options]`."""
         pressed = state.presses.long()
-        if self.rules.motor_noise > 0.0 or self.rules.slip > 0.0:
+        if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
             pressed = torch.zeros_like(pressed)
         index = pressed.clamp(max=planner.MAX_PRESSES - 1).view(-1, 1, 1).expand(-1, self.keys.shape[1], 1)
