@@ -25,7 +25,7 @@ from hpamdp.specs import PAMDPSpecs
 
 # What the builder supplies; the rest of a constructor's arguments is the yaml's.
 CONTEXT = {
-    "env": ("num_envs", "device", "seed", "oracle", "people"),
+    "env": ("num_envs", "device", "seed", "dtype", "oracle", "people"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "logger": ("output_dir", "config"),
