@@ -98,13 +98,17 @@ def is_within_30_degrees(points: Tensor) -> Tensor:
     return cosines.amax(-1) > math.cos(math.radians(30.0)) + 1e-9
 
 
+def reach(seconds: Tensor) -> Tensor:
+    """Return how far presses carry, px: forwards up to .3 s, beyond it ever further backwards."""
+    frames = seconds / _FRAME
+    return 10.0 * _FRAME * frames.square() * (10.0 - 0.6667 * frames)
+
+
 def press(state: ReleasedState, direction: Tensor, duration: Tensor, max_steps: int) -> tuple[ReleasedState, Tensor]:
     """Press for `duration` (u, float32 `[N]`) along `direction` `[N, 2]`; return the next states and rewards `[N]`."""
     # Rounded in float32, in this order, whatever the type of all else.
     seconds = ((duration + 1.0) / 2.0 * 5.0).to(state.fuel)
-    frames = seconds / _FRAME
-    # From 15 frames on the speed that the boat was meant to lose makes it go backwards.
-    distance = 10.0 * _FRAME * frames.square() * (10.0 - 0.6667 * frames)
+    distance = reach(seconds)
     dir_x, dir_y = direction.unbind(-1)
     x = (state.x.clamp(LOW[0], HIGH[0]) + dir_x * distance).clamp(LOW[0], HIGH[0])
     y = (state.y.clamp(LOW[1], HIGH[1]) + dir_y * distance).clamp(LOW[1], HIGH[1])
