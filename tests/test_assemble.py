@@ -48,6 +48,8 @@ def crossing(*words: str) -> DictConfig:
         ("high=human env=platform", "high=human: env=platform has no record of people"),
         ("high=oracle env=platform", "high=oracle: env=platform has no planner to ask"),
         ("high=none low=planner env=platform", "low=planner: env=platform has no planner to ask"),
+        ("high=none low=planner env=boatdock_released", "low=planner: env=boatdock_released has no planner to ask"),
+        ("high=ucb env=boatdock_released", "high=ucb: env=boatdock_released has no options to choose; use high=none"),
         (
             "high=ucb env.controller=random",
             "high=ucb: env.controller=random leaves nothing to choose; use high=none or env.controller=choose",
