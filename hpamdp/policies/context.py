@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -18,7 +18,6 @@ from hpamdp.policies.payoffs import Discount, Memory
 from hpamdp.specs import PAMDPSpecs
 
 Features = Literal["polynomial", "random_fourier"]
-Positive = Annotated[int, Field(gt=0)]
 
 
 class ContextFeatures(nn.Module):
@@ -72,6 +71,7 @@ class LinearBandit(Selector):
 
     Args:
         specs: of the problem.
+        exploration: factor of the deviation in `draw`.
         inputs, features, degree: of `ContextFeatures`.
         ridge: added to the Gram matrices' diagonals.
         memory, discount, window: which decisions count.
@@ -81,17 +81,18 @@ class LinearBandit(Selector):
         self,
         specs: PAMDPSpecs,
         *,
-        inputs: list[int] | None,
+        exploration: PositiveFloat,
+        inputs: list[NonNegativeInt] | None,
         features: Features,
-        degree: int,
-        ridge: float,
+        degree: PositiveInt,
+        ridge: PositiveFloat,
         memory: Memory,
         discount: Discount,
-        window: int,
+        window: PositiveInt,
     ) -> None:
         super().__init__(specs)
         self.features = ContextFeatures(specs, inputs, features, degree)
-        self.ridge, self.memory = ridge, memory
+        self.exploration, self.ridge, self.memory = exploration, ridge, memory
         self.discount = discount if memory == "discounted" else 1.0
         num, dim = specs.num_options, self.features.num_features
         self.register_buffer("gram", torch.zeros(num, dim, dim, dtype=torch.float64))
