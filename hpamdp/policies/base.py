@@ -8,9 +8,15 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
 from hpamdp.specs import PAMDPSpecs
+
+
+def is_greedy() -> bool:
+    """Return whether policies are to act greedily here; else they explore."""
+    return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
 
 
 class Selector(TensorDictModuleBase):
@@ -69,7 +75,7 @@ class Learner(nn.Module):
     """Learns which key to press and for how long.
 
     A subclass gives `policy`, a module that writes the action leaves (`keys.KEY` `[*B]`, `keys.DURATION`
-    `[*B, num_parameters]`) greedily or exploring by `exploration_type()`, and `learn`. It owns its data and its
+    `[*B, num_parameters]`) greedily or exploring by `is_greedy`, and `learn`. It owns its data and its
     optimisers. Its `__init__` takes `specs`, `device` and its options as keyword arguments, the schema of its yaml.
     """
 

@@ -10,10 +10,9 @@ import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector
+from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.payoffs import Discount, Memory
 from hpamdp.specs import PAMDPSpecs
 
@@ -128,7 +127,7 @@ class LinearBandit(Selector):
         """Return the choices `[*B]`: the best prediction where the policy is greedy, else the best `draw`."""
         observation = td.get(keys.OBSERVATION)
         mean, deviation = self.predict(observation.flatten(0, -2))
-        if exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if not is_greedy():
             # Options never chosen come first, in random order.
             mean = torch.where(self.counts < 1e-9, 1e9 + torch.rand_like(mean), self.draw(mean, deviation))
         return mean.argmax(-1).reshape(observation.shape[:-1])

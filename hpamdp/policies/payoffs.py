@@ -8,10 +8,9 @@ import torch
 from pydantic import Field
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector
+from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.specs import PAMDPSpecs
 
 Memory = Literal["all", "discounted", "sliding_window"]
@@ -103,7 +102,7 @@ class Bandit(Selector):
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the choices `[*B]`: the best option where the policy is greedy, else `draw`s."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
-        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if is_greedy():
             return torch.full_like(is_decision, self.best(), dtype=torch.long)
         choices = torch.zeros_like(is_decision, dtype=torch.long)
         choices[is_decision] = self.draw(int(is_decision.sum()))

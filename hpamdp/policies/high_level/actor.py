@@ -15,10 +15,9 @@ import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector
+from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.nets import mlp
 from hpamdp.specs import PAMDPSpecs
 
@@ -79,7 +78,7 @@ class Actor(Selector):
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return options and log-probabilities `[*B]`: the likeliest where the policy is greedy, else draws."""
         log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
-        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if is_greedy():
             option = log_probs.argmax(-1)
         else:
             # The largest of log-probability + Gumbel noise is a draw.

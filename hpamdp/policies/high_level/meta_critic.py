@@ -17,10 +17,9 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Selector
+from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.nets import EnsembleMLP, move_towards
 from hpamdp.specs import PAMDPSpecs
 
@@ -97,7 +96,7 @@ class MetaCritic(Selector):
         observation = td.get(keys.OBSERVATION)
         q = self.critics(observation.flatten(0, -2))
         value = q.mean(0)
-        if exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if not is_greedy():
             if self.exploration == "ucb":
                 value = value + self.ucb_width * q.std(0, correction=0)
             is_random = torch.rand_like(value[:, :1]) < self.epsilon

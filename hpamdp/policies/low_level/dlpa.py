@@ -29,10 +29,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import LazyTensorStorage, ReplayBuffer
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
+from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel
 from hpamdp.specs import PAMDPSpecs
 
@@ -173,7 +172,7 @@ class DLPAPolicy(TensorDictModuleBase):
         over = td.get(keys.DONE, None)
         if over is not None:
             is_planned = is_planned & ~over.flatten()
-        exploring = exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
+        exploring = not is_greedy()
         if exploring:
             is_planned = is_planned & (torch.rand(state.shape[0], device=state.device) >= self.epsilon)
         if is_planned.any():

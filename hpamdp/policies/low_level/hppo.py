@@ -28,11 +28,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
+from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -124,10 +123,9 @@ class HPPOPolicy(TensorDictModuleBase):
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write key `[*B]`, parameters `[*B, num_parameters]` and what the ratio needs of them."""
-        greedy = exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
         with torch.no_grad():
             distribution = self.actor(td.get(keys.OBSERVATION))
-            key, raw = distribution.mode() if greedy else distribution.sample()
+            key, raw = distribution.mode() if is_greedy() else distribution.sample()
             key_log_prob, parameter_log_prob = distribution.log_prob(key, raw)
             duration = self.specs.from_unit(raw.clamp(-1.0, 1.0))
         written = {RAW: raw, KEY_LOG_PROB: key_log_prob, PARAMETER_LOG_PROB: parameter_log_prob}

@@ -31,9 +31,9 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
+from hpamdp.policies.base import is_greedy
 from hpamdp.policies.nets import KeyCritics, mlp, move_towards
 from hpamdp.policies.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
@@ -92,7 +92,7 @@ class HSACPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write key `[*B]` and parameters `[*B, num_parameters]`."""
         distribution = self.actor(td.get(keys.OBSERVATION))
-        if exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if is_greedy():
             key, unit = distribution.key_log_probs.argmax(-1), distribution.mean.tanh()
         elif self.is_random:
             unit = 2.0 * torch.rand_like(distribution.mean) - 1.0

@@ -26,9 +26,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
+from hpamdp.policies.base import is_greedy
 from hpamdp.policies.nets import EnsembleMLP, mlp, move_towards
 from hpamdp.policies.replay import ReplayLearner, falling_share
 from hpamdp.specs import PAMDPSpecs
@@ -102,7 +102,7 @@ class HyARPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write key `[*B]`, parameters `[*B, num_parameters]` and the latent action `[*B, key_dim + latent_dim]`."""
         state = td.get(keys.OBSERVATION)
-        exploring = exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
+        exploring = not is_greedy()
         with torch.no_grad():
             latent = self.actor(state).tanh()
             if exploring:

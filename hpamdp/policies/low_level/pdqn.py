@@ -29,9 +29,9 @@ from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, Pos
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
+from hpamdp.policies.base import is_greedy
 from hpamdp.policies.nets import KeyCritics, mlp, move_towards
 from hpamdp.policies.replay import ReplayLearner, falling_share
 from hpamdp.specs import PAMDPSpecs
@@ -85,7 +85,7 @@ class PDQNPolicy(TensorDictModuleBase):
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         unit = self.actor(state)
         key = self.critics(state, unit).amin(0).argmax(-1)
-        if exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if not is_greedy():
             is_random = torch.rand(key.shape, device=key.device) < self.epsilon
             noisy = (unit + self.noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
             unit = torch.where(is_random.unsqueeze(-1), 2.0 * torch.rand_like(unit) - 1.0, noisy)

@@ -27,10 +27,9 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
+from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
 from hpamdp.specs import PAMDPSpecs
 
@@ -63,7 +62,7 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         """Write key `[*B]`, parameters and their raw sample `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
         q, raw = self.phi(observation) @ self.w.T, self.psi(observation) @ self.theta.T
-        if exploration_type() not in (ExplorationType.DETERMINISTIC, ExplorationType.MODE):
+        if not is_greedy():
             # The largest of value / temperature + Gumbel noise is a draw from the softmax.
             q = q / self.temperature - torch.empty_like(q).exponential_().log()
             raw = raw + self.sigma * torch.randn_like(raw)
