@@ -94,13 +94,6 @@ def test_densities_are_those_of_torchrls_squashed_gaussian_and_finite_at_the_bou
     assert far.draw_parameters()[1].isfinite().all()
 
 
-def test_keys_are_drawn_with_their_probabilities():
-    torch.manual_seed(0)
-    pi = torch.tensor([0.5, 0.3, 0.2])
-    drawn = HybridDistribution(pi.log().expand(20_000, 3), torch.zeros(()), torch.ones(())).draw_keys()
-    torch.testing.assert_close(drawn.bincount() / 20_000, pi, rtol=0.0, atol=0.015)
-
-
 def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone():
     learner, batch = make(), sample(1)
     learner.target_critics.load_state_dict(make().critics.state_dict())

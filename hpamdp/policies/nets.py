@@ -1,4 +1,4 @@
-"""Networks that several learners share."""
+"""Networks that several learners share, and draws from what they give."""
 
 from __future__ import annotations
 
@@ -53,6 +53,12 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     for i, o in pairwise(dims):
         layers += [nn.Linear(i, o), nn.ReLU()]
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim))
+
+
+def draw_index(logits: Tensor) -> Tensor:
+    """Draw from the softmax of logits `[*B, K]`, int64 `[*B]`."""
+    # The largest of logit + Gumbel noise is a draw: faster than torch.multinomial, and for any `[*B]`.
+    return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
 
 
 def move_towards(target: nn.Module, source: nn.Module, tau: float) -> None:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.nets import mlp
+from hpamdp.policies.nets import draw_index, mlp
 from hpamdp.specs import PAMDPSpecs
 
 LOG_PROB = "option_log_prob"  # of the held option when it was chosen
@@ -78,11 +78,7 @@ class Actor(Selector):
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return options and log-probabilities `[*B]`: the likeliest where the policy is greedy, else draws."""
         log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
-        if is_greedy():
-            option = log_probs.argmax(-1)
-        else:
-            # The largest of log-probability + Gumbel noise is a draw.
-            option = (log_probs - torch.empty_like(log_probs).exponential_().log()).argmax(-1)
+        option = log_probs.argmax(-1) if is_greedy() else draw_index(log_probs)
         return {keys.OPTION: option, LOG_PROB: log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:

@@ -32,6 +32,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
+from hpamdp.policies.nets import draw_index
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -54,10 +55,7 @@ class HybridDistribution(NamedTuple):
 
     def sample(self) -> tuple[Tensor, Tensor]:
         """Draw keys `[*B]` and unbounded parameters `[*B, num_parameters]`, those of the other keys too."""
-        # The largest of log-probability + Gumbel noise is a draw, faster than torch.multinomial.
-        gumbel = -torch.empty_like(self.key_log_probs).exponential_().log()
-        raw = self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
-        return (self.key_log_probs + gumbel).argmax(-1), raw
+        return draw_index(self.key_log_probs), self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
 
     def mode(self) -> tuple[Tensor, Tensor]:
         """Return the likeliest key `[*B]` and the mean parameters `[*B, num_parameters]`."""

@@ -34,7 +34,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.nets import KeyCritics, mlp, move_towards
+from hpamdp.policies.nets import KeyCritics, draw_index, mlp, move_towards
 from hpamdp.policies.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -47,11 +47,6 @@ class HybridDistribution(NamedTuple):
     key_log_probs: Tensor
     mean: Tensor
     scale: Tensor
-
-    def draw_keys(self) -> Tensor:
-        """Draw keys `[B]`."""
-        # The key whose exponential clock of rate pi(k) rings first; faster than torch.multinomial, and for any `[*B]`.
-        return (self.key_log_probs.exp() / torch.empty_like(self.key_log_probs).exponential_()).argmax(-1)
 
     def draw_parameters(self) -> tuple[Tensor, Tensor]:
         """Draw all keys' parameters in [-1, 1], differentiably, and return them with their log-densities."""
@@ -98,7 +93,7 @@ class HSACPolicy(TensorDictModuleBase):
             unit = 2.0 * torch.rand_like(distribution.mean) - 1.0
             key = torch.randint(self.specs.num_keys, unit.shape[:-1], device=unit.device)
         else:
-            key, unit = distribution.draw_keys(), distribution.draw_parameters()[0]
+            key, unit = draw_index(distribution.key_log_probs), distribution.draw_parameters()[0]
         return td.update({keys.ACTION: {"key": key, "duration": self.specs.from_unit(unit)}})
 
 

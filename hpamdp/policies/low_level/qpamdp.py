@@ -31,6 +31,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
+from hpamdp.policies.nets import draw_index
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -62,12 +63,13 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         """Write key `[*B]`, parameters and their raw sample `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
         q, raw = self.phi(observation) @ self.w.T, self.psi(observation) @ self.theta.T
-        if not is_greedy():
-            # The largest of value / temperature + Gumbel noise is a draw from the softmax.
-            q = q / self.temperature - torch.empty_like(q).exponential_().log()
+        if is_greedy():
+            key = q.argmax(-1)
+        else:
+            key = draw_index(q / self.temperature)
             raw = raw + self.sigma * torch.randn_like(raw)
         duration = self.specs.from_unit(raw.clamp(-1.0, 1.0))
-        return td.update({keys.ACTION: {"key": q.argmax(-1), "duration": duration}, RAW: raw})
+        return td.update({keys.ACTION: {"key": key, "duration": duration}, RAW: raw})
 
 
 class SarsaLambda(SizedByData):

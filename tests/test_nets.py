@@ -1,0 +1,12 @@
+"""What several learners share beside their networks: draws."""
+
+import torch
+
+from hpamdp.policies.nets import draw_index
+
+
+def test_indices_are_drawn_with_their_probabilities():
+    torch.manual_seed(0)
+    pi = torch.tensor([0.5, 0.3, 0.2])
+    drawn = draw_index(pi.log().expand(20_000, 3))
+    torch.testing.assert_close(drawn.bincount() / 20_000, pi, rtol=0.0, atol=0.015)
