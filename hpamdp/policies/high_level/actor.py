@@ -9,7 +9,7 @@ option's return, bootstrapped where its episode goes on, less a learned value of
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -19,12 +19,13 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.nets import draw_index, mlp
+from hpamdp.policies.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
 LOG_PROB = "option_log_prob"  # of the held option when it was chosen
 
 
-class Actor(Selector):
+class Actor(OnPolicy, Selector):
     """Draw the option from a softmax over a network of the observation.
 
     Args:
@@ -32,10 +33,9 @@ class Actor(Selector):
         device: where the networks live.
         hidden_dims: of policy and value.
         gamma: discount of a step, for options that end before their episode.
-        epochs, minibatch_size: passes over the decisions of an update, and decisions a step of them takes.
-        clip: the surrogate stops rewarding ratios further from 1.
         entropy: weight of the entropy bonus.
-        lr, max_grad_norm: of the steps.
+        lr: of the steps.
+        epochs, minibatch_size, clip, max_grad_norm: as in `OnPolicy`, whose rows are decisions.
     """
 
     def __init__(
@@ -52,27 +52,13 @@ class Actor(Selector):
         lr: PositiveFloat,
         max_grad_norm: PositiveFloat,
     ) -> None:
-        super().__init__(specs)
+        super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
         self.out_keys = [*self.out_keys, LOG_PROB]
-        self.gamma, self.epochs, self.minibatch_size = gamma, epochs, minibatch_size
-        self.clip, self.entropy, self.max_grad_norm = clip, entropy, max_grad_norm
+        self.gamma, self.entropy = gamma, entropy
         self.logits = mlp(specs.observation_dim, hidden_dims, specs.num_options)
         self.critic = mlp(specs.observation_dim, hidden_dims, 1)
-        self.waiting: list[TensorDict] = []
         self.to(device)
         self.optimiser = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
-
-    def stateful(self) -> dict[str, Any]:
-        """Return the optimiser."""
-        return {"optimiser": self.optimiser}
-
-    def get_extra_state(self) -> list[dict[str, Tensor]]:
-        """Return the decisions that wait for the next update, for the state dict."""
-        return [dict(rows.items()) for rows in self.waiting]
-
-    def set_extra_state(self, state: list[dict[str, Tensor]]) -> None:
-        """Take the decisions back from a state dict."""
-        self.waiting = [TensorDict(rows, batch_size=rows["option"].shape) for rows in state]
 
     @torch.no_grad()
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
@@ -83,17 +69,11 @@ class Actor(Selector):
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; from a minibatch of them on, make `epochs` passes over them."""
-        self.waiting.append(self._rows(decisions))
-        if sum(len(rows) for rows in self.waiting) < self.minibatch_size:
+        rows = self.gather(self._rows(decisions))
+        if rows is None:
             return {}
-        rows, self.waiting = torch.cat(self.waiting), []
-        advantage = rows["target"] - self.critic(rows["state"]).squeeze(-1).detach()
-        rows["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
-        steps = []
-        for _ in range(self.epochs):
-            order = torch.randperm(len(rows), device=rows.device).tensor_split(len(rows) // self.minibatch_size)
-            steps += [self._update(rows[indices]) for indices in order]
-        return {name: torch.stack([step[name] for step in steps]).mean().item() for name in steps[0]}
+        rows["advantage"] = rows["target"] - self.critic(rows["state"]).squeeze(-1).detach()
+        return self.make_passes(rows, self._update)
 
     @torch.no_grad()
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
@@ -111,13 +91,9 @@ class Actor(Selector):
 
     def _update(self, rows: TensorDictBase) -> dict[str, Tensor]:
         log_probs = self.logits(rows["state"]).log_softmax(-1)
-        ratio = (log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1) - rows["log_prob"]).exp()
-        advantage = rows["advantage"]
-        gain = torch.minimum(ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage).mean()
+        log_ratio = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1) - rows["log_prob"]
+        gain = self.surrogate(log_ratio, rows["advantage"]).mean()
         entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
         critic_loss = (self.critic(rows["state"]).squeeze(-1) - rows["target"]).square().mean()
-        self.optimiser.zero_grad(set_to_none=True)
-        (0.5 * critic_loss - gain - self.entropy * entropy).backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
-        self.optimiser.step()
+        self.descend(0.5 * critic_loss - gain - self.entropy * entropy)
         return {"critic": critic_loss.detach(), "entropy": entropy.detach()}

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -33,6 +33,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.nets import draw_index
+from hpamdp.policies.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -130,7 +131,7 @@ class HPPOPolicy(TensorDictModuleBase):
         return td.update({**written, keys.ACTION: {"key": key, "duration": duration}})
 
 
-class HPPO(Learner):
+class HPPO(OnPolicy, Learner):
     """Clipped policy-gradient updates of both actors from the presses just collected."""
 
     has_value: ClassVar[bool] = True
@@ -162,9 +163,8 @@ class HPPO(Learner):
     ) -> None:
         if not min_scale < initial_scale < max_scale:
             raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
-        super().__init__(specs)
-        self.epochs, self.minibatch_size, self.clip, self.critic_weight = epochs, minibatch_size, clip, critic_weight
-        self.gamma, self.gae_lambda, self.max_grad_norm = gamma, gae_lambda, max_grad_norm
+        super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
+        self.gamma, self.gae_lambda, self.critic_weight = gamma, gae_lambda, critic_weight
         self.key_entropy, self.parameter_entropy, self.entropy_final = key_entropy, parameter_entropy, entropy_final
         self.min_scale, self.min_scale_final = min_scale, min_scale_final
         self.lr, self.lr_final, self.anneal_frames = lr, lr_final, anneal_frames
@@ -174,25 +174,12 @@ class HPPO(Learner):
         )
         self.policy = HPPOPolicy(self.actor, specs)
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.waiting: list[TensorDict] = []
         self.to(device)
         self.optimiser = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
 
     def value(self, observation: Tensor) -> Tensor:
         """Return V(s), `[B]`."""
         return self.critic(observation).squeeze(-1)
-
-    def stateful(self) -> dict[str, Any]:
-        """Return the optimiser."""
-        return {"optimiser": self.optimiser}
-
-    def get_extra_state(self) -> list[dict[str, Tensor]]:
-        """Return the rows that wait for the next update, for the state dict."""
-        return [dict(rows.items()) for rows in self.waiting]
-
-    def set_extra_state(self, state: list[dict[str, Tensor]]) -> None:
-        """Take the rows back from a state dict."""
-        self.waiting = [TensorDict(rows, batch_size=rows["advantage"].shape) for rows in state]
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Estimate the own rows' advantages; from a minibatch of rows on, make `epochs` passes over them.
@@ -203,22 +190,15 @@ class HPPO(Learner):
         self.frames += batch.numel()
         if not mask.any():
             return {}
-        self.waiting.append(self._rows(batch, mask))
-        if sum(len(rows) for rows in self.waiting) < self.minibatch_size:
+        rows = self.gather(self._rows(batch, mask))
+        if rows is None:
             return {}
-        rows, self.waiting = torch.cat(self.waiting), []
-        advantage = rows["advantage"]
-        rows["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
         for group in self.optimiser.param_groups:
             group["lr"] = self.lr + progress * (self.lr_final - self.lr)
         entropy_weight = 1.0 + progress * (self.entropy_final - 1.0)
-        losses: list[dict[str, Tensor]] = []
-        num_minibatches = rows.shape[0] // self.minibatch_size
-        for _ in range(self.epochs):
-            order = torch.randperm(rows.shape[0], device=rows.device).tensor_split(num_minibatches)
-            losses += [self._update(rows[indices], entropy_weight) for indices in order]
+        scalars = self.make_passes(rows, lambda minibatch: self._update(minibatch, entropy_weight))
         self.actor.set_min_scale(self.min_scale * (self.min_scale_final / self.min_scale) ** progress)
-        return {name: torch.stack([step[name] for step in losses]).mean().item() for name in losses[0]}
+        return scalars
 
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the generalised advantages and the targets of V, each `[*B, T]`; they count in the rows of `mask`.
@@ -244,11 +224,6 @@ class HPPO(Learner):
         own |= {"key": batch.get(keys.KEY)[mask], "advantage": advantage, "target": target}
         return TensorDict(own, batch_size=advantage.shape)
 
-    def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
-        """Return the clipped surrogate of one actor, `[B]`."""
-        ratio = log_ratio.exp()
-        return torch.minimum(ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage)
-
     def _update(self, rows: TensorDictBase, entropy_weight: float) -> dict[str, Tensor]:
         distribution = self.actor(rows[keys.OBSERVATION])
         key_log_prob, parameter_log_prob = distribution.log_prob(rows["key"], rows[RAW])
@@ -258,11 +233,7 @@ class HPPO(Learner):
         key_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.key_entropy * key_entropy + self.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(rows[keys.OBSERVATION]).squeeze(-1), rows["target"])
-        loss = self.critic_weight * critic_loss - gain.mean() - entropy_weight * bonus
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
-        self.optimiser.step()
+        self.descend(self.critic_weight * critic_loss - gain.mean() - entropy_weight * bonus)
         with torch.no_grad():
             # exp(x) - 1 - x, an estimate of the divergence that is never negative.
             ratios = (key_log_ratio, parameter_log_ratio)
