@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.payoffs import Discount, Memory
+from hpamdp.policies.payoffs import Discount, Memory, Payoffs
 from hpamdp.specs import PAMDPSpecs
 
 Features = Literal["polynomial", "random_fourier"]
@@ -91,16 +91,12 @@ class LinearBandit(Selector):
     ) -> None:
         super().__init__(specs)
         self.features = ContextFeatures(specs, inputs, features, degree)
-        self.exploration, self.ridge, self.memory = exploration, ridge, memory
-        self.discount = discount if memory == "discounted" else 1.0
+        self.exploration, self.ridge = exploration, ridge
+        self.payoffs = Payoffs(specs.num_options, memory, discount, window)
         num, dim = specs.num_options, self.features.num_features
         self.register_buffer("gram", torch.zeros(num, dim, dim, dtype=torch.float64))
         self.register_buffer("moment", torch.zeros(num, dim, dtype=torch.float64))
-        self.register_buffer("counts", torch.zeros(num, dtype=torch.float64))
-        self.register_buffer("squares", torch.zeros(num, dtype=torch.float64))
-        size = window if memory == "sliding_window" else 0
-        self.register_buffer("recent_options", torch.full((size,), -1, dtype=torch.long))
-        self.register_buffer("recent_payoffs", torch.zeros(size, dtype=torch.float64))
+        size = len(self.payoffs.recent_options)
         self.register_buffer("recent_features", torch.zeros(size, dim, dtype=torch.float64))
 
     def predict(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,8 +111,9 @@ class LinearBandit(Selector):
         theta = torch.cholesky_solve((self.moment / size).unsqueeze(-1), factor).squeeze(-1) / size
         # x' A^-1 x is the squared length of L^-1 x.
         spread = torch.linalg.solve_triangular(factor, (x / size.unsqueeze(1)).mT, upper=False)
-        explained = (theta * self.moment).sum() / self.counts.sum().clamp(min=1.0)
-        noise = (self.squares.sum() / self.counts.sum().clamp(min=1.0) - explained).clamp(min=1e-12).sqrt()
+        total = self.payoffs.counts.sum().clamp(min=1.0)
+        explained = (theta * self.moment).sum() / total
+        noise = (self.payoffs.squares.sum() / total - explained).clamp(min=1e-12).sqrt()
         return x @ theta.T, noise * spread.square().sum(1).sqrt().T
 
     def draw(self, mean: Tensor, deviation: Tensor) -> Tensor:
@@ -129,7 +126,7 @@ class LinearBandit(Selector):
         mean, deviation = self.predict(observation.flatten(0, -2))
         if not is_greedy():
             # Options never chosen come first, in random order.
-            mean = torch.where(self.counts < 1e-9, 1e9 + torch.rand_like(mean), self.draw(mean, deviation))
+            mean = torch.where(self.payoffs.is_untried, 1e9 + torch.rand_like(mean), self.draw(mean, deviation))
         return mean.argmax(-1).reshape(observation.shape[:-1])
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
@@ -137,30 +134,24 @@ class LinearBandit(Selector):
         options = decisions.get(keys.OPTION)
         payoffs = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
         x = self.features(decisions.get(("next", keys.DECISION_OBSERVATION)))
-        if self.memory == "sliding_window":
-            size = len(self.recent_options)
-            self.recent_options = torch.cat([self.recent_options, options])[-size:]
-            self.recent_payoffs = torch.cat([self.recent_payoffs, payoffs])[-size:]
-            self.recent_features = torch.cat([self.recent_features, x])[-size:]
-            is_filled = self.recent_options >= 0
-            self._forget(0.0)
-            self._add(self.recent_options[is_filled], self.recent_payoffs[is_filled], self.recent_features[is_filled])
-        else:
-            self._forget(self.discount ** len(options))
-            self._add(options, payoffs, x)
         named = enumerate(self.specs.option_names)
-        return {f"payoff_{n}": payoffs[options == i].mean().item() for i, n in named if (options == i).any()}
-
-    def _forget(self, fade: float) -> None:
-        for total in (self.gram, self.moment, self.counts, self.squares):
-            total.mul_(fade)
+        scalars = {f"payoff_{n}": payoffs[options == i].mean().item() for i, n in named if (options == i).any()}
+        self._add(options, payoffs, x)
+        return scalars
 
     def _add(self, options: Tensor, payoffs: Tensor, x: Tensor) -> None:
-        weights = self.discount ** torch.arange(len(options) - 1, -1, -1, device=options.device).double()
+        known = self.payoffs
+        known.add(options, payoffs)
+        fade = known.discount ** len(options)
+        if known.memory == "sliding_window":
+            self.recent_features = torch.cat([self.recent_features, x])[-len(known.recent_options) :]
+            is_filled, fade = known.recent_options >= 0, 0.0
+            options, payoffs = known.recent_options[is_filled], known.recent_payoffs[is_filled]
+            x = self.recent_features[is_filled]
+        weights = known.weights(len(options))
+        self.gram *= fade
+        self.moment *= fade
         for i in range(self.specs.num_options):
-            weight = weights * (options == i)
-            weighted = x * weight.unsqueeze(-1)
+            weighted = x * (weights * (options == i)).unsqueeze(-1)
             self.gram[i] += weighted.T @ x
             self.moment[i] += weighted.T @ payoffs
-            self.counts[i] += weight.sum()
-            self.squares[i] += (weight * payoffs.square()).sum()

@@ -62,6 +62,10 @@ class Payoffs(nn.Module):
         """Return the option with the highest mean payoff."""
         return int(torch.where(self.is_untried, -torch.inf, self.means).argmax())
 
+    def weights(self, num: int) -> Tensor:
+        """Return the weights of the last `num` decisions, oldest first, `[num]`."""
+        return self.discount ** torch.arange(num - 1, -1, -1, device=self.counts.device).double()
+
     def add(self, options: Tensor, payoffs: Tensor) -> None:
         """Take in the payoffs `[N]` of options `[N]`, oldest first."""
         self.num_decisions += len(options)
@@ -74,7 +78,7 @@ class Payoffs(nn.Module):
             options, payoffs = self.recent_options[is_filled], self.recent_payoffs[is_filled]
             for total in (self.counts, self.sums, self.squares):
                 total.zero_()
-        weights = self.discount ** torch.arange(len(options) - 1, -1, -1, device=options.device).double()
+        weights = self.weights(len(options))
         fade = self.discount ** len(options)
         for total, value in (
             (self.counts, weights),
