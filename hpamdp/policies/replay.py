@@ -103,6 +103,6 @@ class ReplayLearner(Learner):
         optimiser.step()
 
 
-def falling_share(frames: int, over: int, final: float) -> float:
-    """Return a share that falls in a line from 1 to `final` within `over` frames."""
-    return 1.0 + (final - 1.0) * min(1.0, frames / max(1, over))
+def falling_share(time: int, over: int, final: float) -> float:
+    """Return a share that falls in a line from 1 to `final` within a time `over`, in frames or decisions."""
+    return 1.0 + (final - 1.0) * min(1.0, time / max(1, over))

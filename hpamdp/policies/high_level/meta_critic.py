@@ -21,6 +21,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.nets import EnsembleMLP, move_towards
+from hpamdp.policies.replay import falling_share
 from hpamdp.specs import PAMDPSpecs
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -88,7 +89,7 @@ class MetaCritic(Selector):
             return 1.0
         if self.exploration == "ucb":
             return 0.0
-        return 1.0 + (self.epsilon_final - 1.0) * min(1.0, after / max(1, self.epsilon_decisions))
+        return falling_share(after, self.epsilon_decisions, self.epsilon_final)
 
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:
