@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Composite
+from torchrl.data import Binary, Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
@@ -97,6 +97,35 @@ class PAMDPEnv(EnvBase):
 
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations as the other environment does, now and later, where their scale is learned."""
+
+    def make_action_spec(self, low: Tensor, high: Tensor, *, has_option: bool = False) -> Composite:
+        """Return the spec of the action leaves by the bounds `[num_parameters]` of all keys' parameters."""
+        n, device = self.batch_size, self.device
+        low, high = (side.to(device, torch.float32).expand(*n, -1) for side in (low, high))
+        press = Composite(
+            key=Categorical(len(self.parameter_dims), shape=n, device=device),
+            duration=Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device),
+            shape=n,
+        )
+        option = {keys.OPTION: Categorical(len(self.option_names), shape=n, device=device)} if has_option else {}
+        return Composite(**option, action=press, shape=n)
+
+    def check_action(self, tensordict: TensorDictBase) -> None:
+        """Check the action leaves' shapes and types; their values are the subclass's to check.
+
+        Raises:
+            ValueError: a leaf is missing, or has another shape or type.
+        """
+        n = self.batch_size
+        shapes = {keys.KEY: n, keys.DURATION: (*n, sum(self.parameter_dims))}
+        for name, shape in ({**shapes, keys.OPTION: n} if self.has_choice else shapes).items():
+            value = tensordict.get(name)
+            if value is None or value.shape != shape:
+                given = None if value is None else list(value.shape)
+                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
+            if name != keys.DURATION and (value.is_floating_point() or value.dtype == torch.bool):
+                given = str(value.dtype).removeprefix("torch.")
+                raise ValueError(f"step: {name} has type {given}, but must be integer")
 
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""

@@ -179,13 +179,8 @@ class BoatDockEnv(PAMDPEnv):
             fuel=Bounded(0.0, 1.0, shape=(n, 1), device=device),
             shape=(n,),
         )
-        press = Composite(
-            key=Categorical(harbour.NUM_KEYS, shape=(n,), device=device),
-            duration=Bounded(0.0, physics.MAX_DURATION, shape=(n, harbour.NUM_KEYS), device=device),
-            shape=(n,),
-        )
-        option = {keys.OPTION: Categorical(len(harbour.CONTROLLERS), shape=(n,), device=device)}
-        self.action_spec = Composite(**(option if self.has_choice else {}), action=press, shape=(n,))
+        longest = torch.full((harbour.NUM_KEYS,), physics.MAX_DURATION)
+        self.action_spec = self.make_action_spec(torch.zeros_like(longest), longest, has_option=self.has_choice)
         self.reward_spec = Unbounded(shape=(n, 1), device=device)
         self.done_spec = self.make_done_spec()
 
@@ -246,9 +241,9 @@ class BoatDockEnv(PAMDPEnv):
         return columns
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.check_action(tensordict)
         key, durations = tensordict.get(keys.KEY), tensordict.get(keys.DURATION)
         option = tensordict.get(keys.OPTION) if self.has_choice else self._state.controller
-        self._check_leaves(key, durations, option)
         state, reward, is_action = self._pure_step(
             self._state, option, key, durations, self._seed, self._environment, self.rules
         )
@@ -264,20 +259,6 @@ class BoatDockEnv(PAMDPEnv):
             state, reward = episode.where(mask, state, self._state), torch.where(mask, reward, 0.0)
         self._state = state
         return self._read().set(keys.REWARD, reward.unsqueeze(-1))
-
-    def _check_leaves(self, key: Tensor | None, durations: Tensor | None, option: Tensor | None) -> None:
-        n = self.num_envs
-        expected = (
-            (keys.KEY, key, (n,)),
-            (keys.DURATION, durations, (n, harbour.NUM_KEYS)),
-            (keys.OPTION, option, (n,)),
-        )
-        for name, value, shape in expected:
-            if value is None or value.shape != shape:
-                given = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
-            if name != keys.DURATION and value.is_floating_point():
-                raise ValueError(f"step: {name} has type {value.dtype}, but must be integer")
 
     def _read(self) -> TensorDict:
         reading = self._pure_read(self._state, self._seed, self._environment, self.rules)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env.action_spaces import ActionSpace
@@ -169,13 +169,7 @@ class GymnasiumEnv(PAMDPEnv):
             },
             shape=(n,),
         )
-        low, high = (torch.from_numpy(side).expand(n, -1) for side in (self._actions.low, self._actions.high))
-        press = Composite(
-            key=Categorical(len(self.parameter_dims), shape=(n,), device=device),
-            duration=Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device),
-            shape=(n,),
-        )
-        self.action_spec = Composite(action=press, shape=(n,))
+        self.action_spec = self.make_action_spec(*map(torch.from_numpy, (self._actions.low, self._actions.high)))
         self.reward_spec = Unbounded(shape=(n, 1), device=device)
         self.done_spec = self.make_done_spec()
 
@@ -218,17 +212,9 @@ class GymnasiumEnv(PAMDPEnv):
 
     def _checked_action(self, tensordict: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
         """Return the keys `[N]` and the parameters `[N, num_parameters]`."""
-        n, dims = self.num_envs, self.parameter_dims
-        leaves = []
-        for name, shape in ((keys.KEY, (n,)), (keys.DURATION, (n, sum(dims)))):
-            value = tensordict.get(name)
-            if value is None or value.shape != shape:
-                given = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
-            leaves.append(value.detach().cpu().numpy())
-        pressed, parameters = leaves
-        if pressed.dtype.kind not in "iu":
-            raise ValueError(f"step: {keys.KEY} has type {pressed.dtype}, but must be integer")
+        self.check_action(tensordict)
+        dims = self.parameter_dims
+        pressed, parameters = (tensordict.get(name).detach().cpu().numpy() for name in (keys.KEY, keys.DURATION))
         is_own = np.repeat(np.arange(len(dims)), dims) == pressed[:, None]
         is_action = (pressed >= 0) & (pressed < len(dims)) & (np.isfinite(parameters) | ~is_own).all(-1)
         if not is_action.all():

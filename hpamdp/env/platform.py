@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
@@ -148,13 +148,7 @@ class PlatformEnv(PAMDPEnv):
             outcome=Categorical(len(OUTCOMES), shape=(n,), device=device),
             shape=(n,),
         )
-        high = self._parameter_high.expand(n, -1)
-        press = Composite(
-            key=Categorical(len(self.key_names), shape=(n,), device=device),
-            duration=Bounded(torch.zeros_like(high), high, device=device),
-            shape=(n,),
-        )
-        self.action_spec = Composite(action=press, shape=(n,))
+        self.action_spec = self.make_action_spec(torch.zeros_like(self._parameter_high), self._parameter_high)
         self.reward_spec = Unbounded(shape=(n, 1), device=device)
         self.done_spec = self.make_done_spec()
 
@@ -169,8 +163,9 @@ class PlatformEnv(PAMDPEnv):
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        key, parameters = tensordict.get(keys.KEY), tensordict.get(keys.DURATION)
-        parameter = self._checked_parameter(key, parameters)
+        self.check_action(tensordict)
+        key = tensordict.get(keys.KEY)
+        parameter = self._checked_parameter(key, tensordict.get(keys.DURATION))
         before = self._state
         over = before.outcome != ON_THE_WAY
         mask = tensordict.get("_step", None)
@@ -184,19 +179,9 @@ class PlatformEnv(PAMDPEnv):
         self._state = _where(over, before, after)
         return self._read().set(keys.REWARD, ((self._state.x - before.x) / END).unsqueeze(-1))
 
-    def _checked_parameter(self, key: Tensor | None, parameters: Tensor | None) -> Tensor:
+    def _checked_parameter(self, key: Tensor, parameters: Tensor) -> Tensor:
         """Return the pressed keys' parameters `[N]`, clipped to their bounds."""
-        num_keys = len(self.key_names)
-        for name, value, shape in (
-            (keys.KEY, key, (self.num_envs,)),
-            (keys.DURATION, parameters, (self.num_envs, num_keys)),
-        ):
-            if value is None or value.shape != shape:
-                given = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
-        if key.is_floating_point():
-            raise ValueError(f"step: {keys.KEY} has type {key.dtype}, but must be integer")
-        allowed = key.clamp(0, num_keys - 1).long()
+        allowed = key.clamp(0, len(self.key_names) - 1).long()
         parameter = parameters.gather(-1, allowed.unsqueeze(-1)).squeeze(-1)
         is_action = (key == allowed) & parameter.isfinite()
         if not is_action.all():
