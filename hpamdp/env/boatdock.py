@@ -19,6 +19,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from hpamdp import keys
 from hpamdp.env import counter_rng, episode, harbour, physics, planner
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.columns import where
 from hpamdp.env.episode import BoatState, Rules
 from hpamdp.env.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.people import people_shares, people_spec
@@ -199,7 +200,7 @@ class BoatDockEnv(PAMDPEnv):
         mask = torch.ones_like(self._environment, dtype=torch.bool) if mask is None else mask.reshape(self.num_envs)
         self._state = self._pure_reset(self._state, mask, self._seed, self._environment, self.rules)
         if given is not None:
-            self._state = episode.where(mask, self._state._replace(**given), self._state)
+            self._state = where(mask, self._state._replace(**given), self._state)
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)
         return self._read()
@@ -256,7 +257,7 @@ class BoatDockEnv(PAMDPEnv):
         mask = tensordict.get("_step", None)
         if mask is not None:
             mask = mask.reshape(self.num_envs)
-            state, reward = episode.where(mask, state, self._state), torch.where(mask, reward, 0.0)
+            state, reward = where(mask, state, self._state), torch.where(mask, reward, 0.0)
         self._state = state
         return self._read().set(keys.REWARD, reward.unsqueeze(-1))
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng, harbour, physics
+from hpamdp.env.columns import where
 
 MAX_PRESSES = 25
 SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
@@ -144,11 +145,6 @@ def reset(state: BoatState, mask: Tensor, seed: Tensor, environment: Tensor, rul
         episode=episode,
     )
     return where(mask, fresh, state)
-
-
-def where(mask: Tensor, new: BoatState, old: BoatState) -> BoatState:
-    """Take `new` in the rows of `mask` `[N]` and `old` elsewhere."""
-    return BoatState(*(o if n is o else torch.where(mask, n, o) for n, o in zip(new, old, strict=True)))
 
 
 def _press(

@@ -20,6 +20,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.columns import where
 
 RUN, HOP, LEAP = range(3)
 PARAMETER_HIGH = (30.0, 720.0, 430.0)
@@ -159,7 +160,7 @@ class PlatformEnv(PAMDPEnv):
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         fresh = _start(self._state.episode + 1)
-        self._state = fresh if mask is None else _where(mask.reshape(self.num_envs), fresh, self._state)
+        self._state = fresh if mask is None else where(mask.reshape(self.num_envs), fresh, self._state)
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -176,7 +177,7 @@ class PlatformEnv(PAMDPEnv):
         after = _act(before, torch.where(over, RUN, key), parameter, rng, self.noise)
         out_of_time = (after.steps >= self.max_steps) & (after.outcome == ON_THE_WAY)
         after = after._replace(outcome=torch.where(out_of_time, TIME_LIMIT, after.outcome))
-        self._state = _where(over, before, after)
+        self._state = where(over, before, after)
         return self._read().set(keys.REWARD, ((self._state.x - before.x) / END).unsqueeze(-1))
 
     def _checked_parameter(self, key: Tensor, parameters: Tensor) -> Tensor:
@@ -217,10 +218,6 @@ def _start(episode: Tensor) -> PlatformState:
         outcome=none + ON_THE_WAY,
         episode=episode,
     )
-
-
-def _where(mask: Tensor, new: PlatformState, old: PlatformState) -> PlatformState:
-    return PlatformState(*(torch.where(mask, n, o) for n, o in zip(new, old, strict=True)))
 
 
 def _act(state: PlatformState, key: Tensor, parameter: Tensor, rng: Tensor, noise: float) -> PlatformState:
