@@ -20,10 +20,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from hpamdp.metrics import read_rows
+from hpamdp.reference import HUMAN
 
 HERE = Path(__file__).resolve().parent
-HUMAN = {"congruent": 2.012, "incongruent": 1.912}
-PEOPLE = 1.970
+BOATS = ("congruent", "incongruent")
 _REWARDS = {"given": "the paper's", "sparse": "sparse"}
 COLOURS = {
     "hppo": "#0072B2",
@@ -46,7 +46,7 @@ def gather(folder: Path) -> tuple[Rows, Rows]:
         name = {"low": _name(summary["low"], config), "problem": summary.get("controller", summary.get("env"))}
         name |= {"reward": "sparse" if "reward: sparse" in config else "given", "seed": summary["seed"]}
         rows = [row for row in read_rows(file.parent / "metrics.csv") if "eval/score" in row]
-        reached = next((row for row in rows if row["eval/score"] >= PEOPLE), {})
+        reached = next((row for row in rows if row["eval/score"] >= HUMAN["chosen"]["score"]), {})
         results.append(
             name
             | {key: round(summary[key], 4) for key in ("score", "success", "ceiling")}
@@ -116,7 +116,7 @@ def _spread(values: list[float]) -> str:
 
 def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
     """Draw the learning curves of one reward, a panel a boat: mean over seeds and one standard deviation."""
-    chosen = [row for row in curves if row["reward"] == reward and row["problem"] in HUMAN]
+    chosen = [row for row in curves if row["reward"] == reward and row["problem"] in BOATS]
     boats = sorted({row["problem"] for row in chosen})
     figure = Figure(figsize=(6.4 * len(boats), 4.2), layout="constrained")
     for axes, boat in zip(figure.subplots(1, len(boats), squeeze=False)[0], boats, strict=True):
@@ -152,7 +152,7 @@ def _draw_learner(axes: Axes, runs: Rows, low: str, x: str) -> float:
 def _draw_lines(axes: Axes, results: Rows, boat: str) -> None:
     lines = {
         "ceiling": (float(results[0]["ceiling"]), "#2b2b2b", "-"),
-        "people": (HUMAN[boat], "#D98200", "--"),
+        "people": (HUMAN[boat]["score"], "#D98200", "--"),
         "random": (float(results[0]["random"]), "#8c8c8c", ":"),
     }
     for name, (height, colour, style) in lines.items():
