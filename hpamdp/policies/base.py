@@ -19,6 +19,11 @@ def is_greedy() -> bool:
     return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
 
 
+def option_ends(batch: TensorDictBase) -> Tensor:
+    """Return where a batch's episodes or options end, bool `[*B, T, 1]`: another learner's rows can follow."""
+    return batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
+
+
 class Selector(TensorDictModuleBase):
     """Chooses an option where a decision is due and holds it until the next one.
 

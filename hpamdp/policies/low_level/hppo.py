@@ -31,7 +31,7 @@ from torch.nn import functional as F
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, is_greedy
+from hpamdp.policies.base import Learner, is_greedy, option_ends
 from hpamdp.policies.nets import draw_index
 from hpamdp.policies.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
@@ -212,9 +212,8 @@ class HPPO(OnPolicy, Learner):
             next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
             reward[mask] = batch.get(("next", keys.REWARD))[mask]
             terminated = batch.get(("next", keys.TERMINATED))
-            ends = batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
             advantage, target = generalized_advantage_estimate(
-                self.gamma, self.gae_lambda, value, next_value, reward, ends, terminated
+                self.gamma, self.gae_lambda, value, next_value, reward, option_ends(batch), terminated
             )
         return advantage.squeeze(-1), target.squeeze(-1)
 

@@ -31,7 +31,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.nets import KeyCritics, mlp, move_towards
 from hpamdp.policies.replay import ReplayLearner, falling_share
 from hpamdp.specs import PAMDPSpecs
@@ -163,8 +163,7 @@ class PDQN(ReplayLearner):
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state after it and the discount of that state's value."""
         rows = super().transitions(batch)
-        # Another learner's rows can follow where an option ends.
-        done = (batch["next", keys.DONE] | batch["next"].get(keys.IS_DECISION, False)).squeeze(-1)
+        done = option_ends(batch).squeeze(-1)
         reward, last = n_step_returns(rows["reward"], done, self.n_step, self.gamma)
         steps = last - torch.arange(done.shape[-1], device=last.device) + 1
         goes_on = ~batch["next", keys.TERMINATED].squeeze(-1).gather(-1, last)
