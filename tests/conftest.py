@@ -1,8 +1,11 @@
 """What the tests share."""
 
-from collections.abc import Sequence
+import random
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
@@ -22,3 +25,15 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
 def choices(group: str) -> list[str]:
     """Return the names in a group of conf/."""
     return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
+
+
+@contextmanager
+def global_generators_unmoved() -> Iterator[None]:
+    """Assert that what happens inside moves none of the global random generators."""
+
+    def states() -> tuple:
+        return torch.get_rng_state().tolist(), str(np.random.get_state()), random.getstate()
+
+    before = states()
+    yield
+    assert states() == before

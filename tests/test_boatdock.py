@@ -9,6 +9,7 @@ import random
 import numpy as np
 import pytest
 import torch
+from conftest import global_generators_unmoved
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
@@ -24,14 +25,6 @@ MODES = list(
         ("choose", "congruent", "incongruent", "random"), (1, 2, "random"), ("paper", "sparse"), ("scaled", "pixels")
     )
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def action(key, duration, option=None) -> TensorDict:
@@ -101,17 +94,13 @@ def test_global_generators_are_neither_moved_nor_read():
     env = BoatDockEnv(8, controller="random", keymap="random", **NOISE)
     press_all = action([0, 1, 2, 0, 1, 2, 0, 1], [0.3] * 8)
 
-    def states() -> tuple:
-        return torch.get_rng_state().tolist(), str(np.random.get_state()), random.getstate()
-
     def run() -> TensorDictBase:
         env.set_seed(5)
         env.reset()
         return env.step(press_all.clone())["next"]
 
-    before = states()
-    once = run()
-    assert states() == before
+    with global_generators_unmoved():
+        once = run()
     torch.rand(3), np.random.rand(), random.random()
     assert (run() == once).all()
 

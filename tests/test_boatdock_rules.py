@@ -16,14 +16,6 @@ from hpamdp.env.episode import MAX_PRESSES, OBSERVATION_NAMES
 CENTRE = torch.tensor(harbour.CENTRE)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def press(env: BoatDockEnv, key, duration) -> TensorDictBase:
     """Press a key in every boat; `duration` holds one number a boat or `[N, 3]`."""
     key, duration = torch.as_tensor(key), torch.as_tensor(duration, dtype=torch.float32)

@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from conftest import global_generators_unmoved
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
@@ -26,14 +27,6 @@ START, GOAL = np.array([640.0, 512.0]), np.array([640.0, 452.0])  # 60 px straig
 NOISE = {"motor_noise": 0.2, "sensor_noise": 4.0, "slip": 0.2}
 # Gymnasium recommends actions scaled to [-1, 1]; ours are seconds on purpose.
 RECOMMENDATION = "we recommend using a symmetric and normalized space"
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def press(key: int, seconds: float, **option: int) -> dict:
@@ -117,12 +110,10 @@ def test_unseeded_environments_differ_and_take_their_seed_from_np_random():
 
 
 def test_global_generators_are_not_moved():
-    before = torch.get_rng_state(), np.random.get_state()[1].copy()
-    env = BoatDock(**NOISE)
-    env.reset(seed=1)
-    env.step(press(0, 0.3, option=1))
-    assert torch.equal(torch.get_rng_state(), before[0])
-    assert np.array_equal(np.random.get_state()[1], before[1])
+    with global_generators_unmoved():
+        env = BoatDock(**NOISE)
+        env.reset(seed=1)
+        env.step(press(0, 0.3, option=1))
 
 
 def test_info_tells_the_outcome_and_the_score_at_the_end():

@@ -14,14 +14,6 @@ from hpamdp.env.harbour import CONGRUENT, INCONGRUENT, Layout
 NUM = 200_000
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def counter(num: int) -> torch.Tensor:
     return torch.arange(num, dtype=torch.int32)
 

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
@@ -165,10 +166,8 @@ def test_with_both_temperatures_fixed_updates_leave_them_as_they_are():
 
 def test_the_greedy_policy_draws_nothing_and_the_exploring_one_is_uniform_in_the_warm_up_alone():
     learner, td = make(), states(2000)
-    before = torch.get_rng_state()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(td.clone())
-    assert torch.equal(torch.get_rng_state(), before)
     distribution = learner.actor(td[keys.OBSERVATION])
     assert torch.equal(greedy[keys.KEY], distribution.key_log_probs.argmax(-1))
     torch.testing.assert_close(SPECS.to_unit(greedy[keys.DURATION]), distribution.mean.tanh())

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_bandits import CPU, SPECS, by_sign, due, ended, play
@@ -192,7 +193,5 @@ def test_decisions_that_wait_for_an_update_survive_a_state_dict():
 @pytest.mark.parametrize("cls", [MetaCritic, Actor])
 def test_greedy_choices_draw_nothing(cls):
     selector = make(cls)
-    state = torch.get_rng_state()
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
+    with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         selector(due(torch.rand(20, 2, generator=torch.Generator().manual_seed(0))))
-    assert torch.equal(torch.get_rng_state(), state)

@@ -18,14 +18,6 @@ NUM_STEPS = 20_000
 EACH = settings(deadline=None, max_examples=50, derandomize=True)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 class Case(NamedTuple):
     """One press to be; px from the harbour's centre, seconds, radians."""
 

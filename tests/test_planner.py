@@ -16,14 +16,6 @@ from hpamdp.env.planner import Plan, best_plan, best_plans, better_option
 NUM = 1000
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def filled(value: int, num: int) -> Tensor:
     return torch.full((num,), value, dtype=torch.int32)
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from conftest import global_generators_unmoved
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import check_env_specs
@@ -21,14 +22,6 @@ from hpamdp.specs import PAMDPSpecs
 COURSE = 1035.0
 BOUNDS = torch.tensor([30.0, 720.0, 430.0])
 NUMBERS = 512  # random numbers that an action may take
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 class ScalarCourse:
@@ -391,17 +384,13 @@ def test_a_hundred_times_the_noise_still_makes_episodes():
 def test_global_generators_are_neither_moved_nor_read():
     env = PlatformEnv(8)
 
-    def states() -> tuple:
-        return torch.get_rng_state().tolist(), str(np.random.get_state()), random.getstate()
-
     def run() -> TensorDictBase:
         env.set_seed(5)
         env.reset()
         return act(env, [0, 1, 2, 0, 1, 2, 0, 1], [20.0] * 8)
 
-    before = states()
-    once = run()
-    assert states() == before
+    with global_generators_unmoved():
+        once = run()
     torch.rand(3), np.random.rand(), random.random()
     assert (run() == once).all()
 
