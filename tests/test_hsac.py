@@ -8,12 +8,11 @@ from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
+from toy_presses import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
 from hpamdp.policies.low_level.hsac import HSAC, HybridDistribution
 from hpamdp.specs import PAMDPSpecs
-
-SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
     hidden_dims=[64, 64], min_scale=0.01, max_scale=1.0, key_temperature=0.05, parameter_temperature=0.03,
@@ -25,37 +24,6 @@ OPTIONS = dict(
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> HSAC:
     return HSAC(specs, torch.device("cpu"), **{**OPTIONS, **changes})
-
-
-def states(num: int) -> TensorDict:
-    return TensorDict({keys.OBSERVATION: torch.rand(num, 4) * 2 - 1}, [num])
-
-
-def one_step_rows(learner: HSAC, num: int) -> TensorDict:
-    """Play a problem of one step: key 1 pays the more the nearer its parameters are to (s0, -s1), key 2 a bit."""
-    td = learner.policy(states(num))
-    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
-    error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
-    payoff = torch.stack([torch.full_like(error, -0.5), 1.0 - error, torch.full_like(error, 0.2)], -1)
-    is_end = torch.ones(num, 1, dtype=torch.bool)
-    reward = payoff.gather(-1, td[keys.KEY].unsqueeze(-1))
-    td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.TERMINATED: is_end}
-    return td
-
-
-def sample(num: int = 32) -> TensorDict:
-    """Return transitions as they come out of the replay buffer."""
-    return TensorDict(
-        {
-            "state": torch.randn(num, 4),
-            "key": torch.randint(3, (num,)),
-            "unit": torch.rand(num, 3) * 2 - 1,
-            "reward": torch.randn(num),
-            "next_state": torch.randn(num, 4),
-            "discount": torch.full((num,), OPTIONS["gamma"]),
-        },
-        [num],
-    )
 
 
 def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Tensor) -> float:
@@ -79,7 +47,7 @@ def test_the_learner_finds_the_key_and_parameters_that_pay():
     torch.manual_seed(0)
     learner = make()
     for _ in range(40):
-        learner.learn(one_step_rows(learner, 200), torch.ones(200, dtype=torch.bool))
+        learner.learn(one_step_rows(learner, 200), torch.ones(200, 1, dtype=torch.bool))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)
     assert (rows[keys.KEY] == 1).float().mean() > 0.98
@@ -96,7 +64,7 @@ def test_densities_are_those_of_torchrls_squashed_gaussian_and_finite_at_the_bou
 
 
 def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone():
-    learner, batch = make(), sample(1)
+    learner, batch = make(), sample(1).set("discount", torch.tensor([OPTIONS["gamma"]]))
     learner.target_critics.load_state_dict(make().critics.state_dict())
     torch.manual_seed(3)
     target = learner._target(batch)
@@ -109,7 +77,7 @@ def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone
 
 def test_stored_rows_are_discounted_by_0_at_termination_alone_and_those_of_others_dropped():
     learner = make(warmup_frames=10_000)
-    rows = one_step_rows(learner, 4)
+    rows = one_step_rows(learner, 4).squeeze(-1)
     rows["next", keys.TERMINATED] = torch.tensor([[True], [False], [False], [True]])
     rows["next", keys.TRUNCATED] = torch.tensor([[False], [True], [False], [False]])
     rows["next", keys.DONE] = rows["next", keys.TERMINATED] | rows["next", keys.TRUNCATED]

@@ -5,12 +5,11 @@ import torch
 from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_presses import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
 from hpamdp.policies.low_level.pdqn import PDQN, InvertingGradients
 from hpamdp.specs import PAMDPSpecs
-
-SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
     multipass=True, twin_q=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
@@ -25,40 +24,9 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> PDQN:
     return PDQN(specs, torch.device("cpu"), **{**OPTIONS, **changes})
 
 
-def states(num: int) -> TensorDict:
-    return TensorDict({keys.OBSERVATION: torch.rand(num, 4) * 2 - 1}, [num])
-
-
-def one_step_rows(learner: PDQN, num: int) -> TensorDict:
-    """Play a problem of one step: key 1 pays the more the nearer its parameters are to (s0, -s1), key 2 a bit."""
-    td = learner.policy(states(num))
-    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
-    error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
-    payoff = torch.stack([torch.full_like(error, -0.5), 1.0 - error, torch.full_like(error, 0.2)], -1)
-    is_end = torch.ones(num, 1, dtype=torch.bool)
-    reward = payoff.gather(-1, td[keys.KEY].unsqueeze(-1))
-    td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.DONE: is_end, keys.TERMINATED: is_end}
-    return td.unsqueeze(-1)
-
-
 def learn(learner: PDQN, num_batches: int, size: int = 200) -> None:
     for _ in range(num_batches):
         learner.learn(one_step_rows(learner, size), torch.ones(size, 1, dtype=torch.bool))
-
-
-def sample(learner: PDQN, num: int = 32) -> TensorDict:
-    """Return transitions as they come out of the replay buffer."""
-    return TensorDict(
-        {
-            "state": torch.randn(num, 4),
-            "key": torch.randint(3, (num,)),
-            "unit": torch.rand(num, 3) * 2 - 1,
-            "reward": torch.randn(num),
-            "next_state": torch.randn(num, 4),
-            "discount": torch.rand(num),
-        },
-        [num],
-    )
 
 
 @pytest.mark.parametrize("changes", [{}, PUBLISHED, {"bounding": "inverting_gradients", "double_q": True}])
@@ -85,7 +53,7 @@ def test_a_keys_value_depends_on_its_own_parameters_alone_only_with_multipass(mu
 
 @pytest.mark.parametrize("multipass", [True, False])
 def test_the_value_of_the_pressed_key_is_that_of_the_full_pass(multipass):
-    learner, batch = make(multipass=multipass), sample(make())
+    learner, batch = make(multipass=multipass), sample()
     full = learner.critics(batch["state"], batch["unit"])
     expected = full[:, torch.arange(32), batch["key"]]
     torch.testing.assert_close(learner.critics.of_key(batch["state"], batch["key"], batch["unit"]), expected)
@@ -107,7 +75,7 @@ def test_targets_equal_those_computed_by_hand(twin_q, double_q):
     learner, other = make(twin_q=twin_q, double_q=double_q, target_smoothing=0.0), make(twin_q=twin_q)
     learner.target_actor.load_state_dict(other.actor.state_dict())
     learner.target_critics.load_state_dict(other.critics.state_dict())
-    batch = sample(learner, 200)
+    batch = sample(200)
     target = learner._target(batch)
     choices = set()
     for i in range(200):
@@ -124,7 +92,7 @@ def test_targets_equal_those_computed_by_hand(twin_q, double_q):
 
 
 def test_target_smoothing_is_bounded():
-    batch = sample(make())
+    batch = sample()
     learner = make(multipass=False, target_smoothing=100.0, target_smoothing_clip=0.0)
     smooth = learner._target(batch)
     learner.target_smoothing = 0.0
@@ -226,6 +194,6 @@ def test_a_policy_takes_any_batch_shape():
 
 def test_clipped_gradients_have_at_most_the_norm_asked_for():
     learner = make(max_grad_norm=1e-3)
-    learner.update(sample(learner))
+    learner.update(sample())
     norm = torch.stack([p.grad.norm() for p in learner.critics.parameters()]).norm()
     assert norm <= 1.001e-3
