@@ -1,0 +1,202 @@
+"""The command line: a mistake costs one line and exit code 2, a bug keeps its traceback, help is read from conf/."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from conftest import CONF, choices
+from omegaconf import OmegaConf
+from omegaconf.errors import ConfigAttributeError
+
+from hpamdp import train
+from hpamdp.config import GROUPS, ConfigError
+from hpamdp.main import main
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capsys):
+    """Run the command line in an empty folder and return its exit code, its stdout and its stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # so that what `main` sets is undone
+
+    def run(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["run.py", *words])
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+MISTAKES = [
+    # A choice that isn't there, a group that isn't there.
+    (["high=foo"], "high=foo: no such choice; conf/high has actor, "),
+    (["high=3"], "high=3: no such choice; conf/high has actor, "),
+    (["low=null"], "low=null: no such choice; conf/low has "),
+    (["experiment=foo"], "experiment=foo: no such choice; conf/experiment has learners, "),
+    (["hihg=ucb"], "hihg: no such group or value of the run (conf/config.yaml); did you mean high? It has "),
+    (["~low"], "low: nothing chosen; set low=NAME"),
+    # A key that isn't there.
+    (["sed=3"], "sed: no such group or value of the run (conf/config.yaml); did you mean seed? It has "),
+    (["+sed=3"], "sed: no such value of the run (conf/config.yaml); did you mean seed? It has "),
+    (["eval.evry=3"], "eval.evry: no such value of eval; did you mean every? It has every, layouts, seed"),
+    (["+eval.evry=3"], "eval.evry: no such value of the run (conf/config.yaml); did you mean every? It has every, "),
+    (["high=ucb", "high.windw=3"], "high.windw: no such option of UCB (conf/high/ucb.yaml); did you mean window? It"),
+    (["high=ucb", "+high.windw=3"], "high.windw: no such option of UCB (conf/high/ucb.yaml); did you mean window? It"),
+    (["high=none", "high.window=3"], "high.window: no such option of none (conf/high/none.yaml); it has none"),
+    (["low.lrr=1"], "low.lrr: no such option of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
+    (["~low.tua"], "low.tua: no such option of HyAR (conf/low/hyar.yaml); did you mean tau? It has "),
+    (["~low.tau"], "low.tau: missing (HyAR, conf/low/hyar.yaml)"),
+    (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
+    # An override that isn't one.
+    (["high="], "high=: no such choice; conf/high has actor, "),
+    (["=3"], "=3: not understood; write GROUP=CHOICE or KEY=VALUE"),
+    (["low..x=1"], "low..x=1: not understood; write GROUP=CHOICE or KEY=VALUE"),
+    (["low"], "low: not understood; write GROUP=CHOICE or KEY=VALUE"),
+    (["seed=[1"], "seed=[1: not understood; write GROUP=CHOICE or KEY=VALUE"),
+    (["+seed=3"], "Could not append to config. An item is already at 'seed'"),
+    (["high=ucb,fixed"], "high=ucb,fixed: several values; add --multirun"),
+    (["--sed", "3"], "unrecognized arguments: --sed; see --help"),
+    (["--cfg", "jobs"], "argument --cfg/-c: invalid choice: "),
+    (["--multirun", "--cfg", "job"], "--multirun and --cfg do not go together"),
+    (["--config-name", "foo"], "Cannot find primary config 'foo'"),
+    (["hydra.run.dir=/proc/nowhere/x"], "[Errno 2] No such file or directory: '/proc/nowhere"),
+    # A value that cannot be.
+    (["seed=-1"], "seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
+    (["seed=abc"], 'seed="abc": must be a valid integer (conf/config.yaml)'),
+    (["eval.layouts=0"], "eval.layouts=0: must be greater than 0 (conf/config.yaml)"),
+    (["eval=3"], "eval=3: must be "),
+    (["device=tpu"], 'device="tpu": must be auto, cpu, cuda or cuda:N (conf/config.yaml)'),
+    (["mode=eval"], "checkpoint: missing; mode=eval needs the output folder of a run"),
+    (["checkpoint=x"], "checkpoint: goes with mode=eval only"),
+    (["num_envs=${nowhere}"], "num_envs: Interpolation key 'nowhere' not found"),
+    (["low.batch_size=0"], "low.batch_size=0: must be greater than 0 (HyAR, conf/low/hyar.yaml)"),
+    (["low._target_=os.path.join"], "low._target_=os.path.join: there is no class join in os.path"),
+    (["env.slip=2"], "must be "),
+    (["env.reward=big"], "env.reward=\"big\": must be 'paper' or 'sparse' (BoatDockEnv, conf/env/boatdock.yaml)"),
+    (["high=fixed", "high.option=sideways"], "sideways"),
+    # The same in a sweep.
+    (["-m", "high=ucb,foo"], "high=foo: no such choice; conf/high has actor, "),
+    (
+        ["-m", "high=ucb,fixed", "high.window=1,2"],
+        "high.window: no such option of Fixed (conf/high/fixed.yaml); it has",
+    ),
+    (["-m", "low.lrr=1,2"], "low.lrr: no such option of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
+    (["-m", "seed=-1,-2"], "seed=-1: seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
+    (["-m", "seed=range(1"], "seed=range(1: not understood"),
+]
+
+
+@pytest.mark.parametrize(("words", "line"), MISTAKES, ids=[" ".join(words) for words, _ in MISTAKES])
+def test_a_mistake_gives_one_line_and_exit_code_2(command, words, line):
+    code, _, err = command(*words)
+    assert code == 2
+    assert err.endswith("\n") and err.count("\n") == 1
+    assert line in err
+
+
+def test_a_broken_yaml_is_named_with_the_line(command, tmp_path):
+    (tmp_path / "mine/experiment").mkdir(parents=True)
+    (tmp_path / "mine/experiment/broken.yaml").write_text("# @package _global_\nseed: [1\nmode: train\n")
+    code, _, err = command("--config-dir", str(tmp_path / "mine"), "experiment=broken")
+    assert code == 2 and err.count("\n") == 1
+    assert "broken.yaml, line 3: " in err
+
+
+def test_a_refused_run_leaves_no_folder_behind(command, tmp_path):
+    command("seed=-1", "hydra.run.dir=out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_jobs_get_their_config_folder_and_overrides(command, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(train, "run", lambda cfg, folder, overrides: seen.append((cfg.seed, folder, overrides)))
+    assert command("seed=3", "hydra.run.dir=out")[0] == 0
+    assert seen == [(3, tmp_path / "out", ["seed=3"])]
+    assert list((tmp_path / "out").iterdir()) == []
+
+    code, out, _ = command("-m", "seed=4,5", "hydra.sweep.dir=sweep")
+    assert code == 0
+    assert [job[:2] for job in seen[1:]] == [(4, tmp_path / "sweep/0"), (5, tmp_path / "sweep/1")]
+    assert out == "Job 0: seed=4\nJob 1: seed=5\n"
+
+
+def test_a_mistake_in_one_job_ends_the_sweep_with_its_overrides(command, monkeypatch):
+    seen = []
+
+    def run(cfg, folder, overrides):
+        seen.append(cfg.seed)
+        if cfg.seed == 1:
+            raise ConfigError("these two\ndo not go together")
+
+    monkeypatch.setattr(train, "run", run)
+    code, _, err = command("-m", "seed=0,1,2", "high=fixed")
+    assert (code, err, seen) == (2, "seed=1 high=fixed: these two do not go together\n", [0, 1])
+
+
+@pytest.mark.parametrize("bug", [ZeroDivisionError("bug"), ValueError("bug"), ConfigAttributeError("bug")])
+@pytest.mark.parametrize("words", [[], ["-m", "seed=1,2"]])
+def test_a_bug_keeps_its_traceback(command, monkeypatch, bug, words):
+    def run(cfg, folder, overrides):
+        raise bug
+
+    monkeypatch.setattr(train, "run", run)
+    with pytest.raises(type(bug), match="bug"):
+        command(*words)
+
+
+def test_an_interrupted_run_exits_with_130_and_ends_a_sweep(command, monkeypatch):
+    seen = []
+    monkeypatch.setattr(train, "run", lambda cfg, folder, overrides: seen.append(cfg.seed) or 130)
+    assert command("-m", "seed=1,2")[0] == 130
+    assert seen == [1]
+
+    def interrupted(cfg, folder, overrides):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "run", interrupted)
+    assert command()[0] == 130
+
+
+def test_help_shows_groups_values_with_comments_and_examples(command):
+    code, out, err = command("--help")
+    assert code == 0 and not err
+    for group in (*GROUPS, "experiment"):
+        assert f"  {group:<12}{', '.join(choices(group))}\n" in out
+    cfg = OmegaConf.load(CONF / "config.yaml")
+    lines = out.splitlines()
+    for name in set(cfg) - {"defaults", "hydra", "eval", "agent", "low"}:
+        place = next(i for i, line in enumerate(lines) if line.startswith(f"  {name}:"))
+        assert lines[place - 1].startswith("  # ")
+    assert out.count("  python run.py ") >= 3
+    assert "hydra:" not in out
+
+
+def run_script(*words: str, cwd: str | os.PathLike[str]) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(CONF.parent)}
+    script = str(CONF.parent / "run.py")
+    return subprocess.run([sys.executable, script, *words], cwd=cwd, env=environment, capture_output=True, text=True)
+
+
+def test_the_script_tells_a_mistake_in_one_line(tmp_path):
+    done = run_script("low.lrr=1", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("low.lrr: no such option of HyAR") and done.stderr.count("\n") == 1
+
+
+def test_the_script_tells_a_mistake_inside_a_job_in_one_line(tmp_path):
+    done = run_script("--multirun", "high.exploration=0", "low=random", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith("high.exploration=0 low=random: high.exploration=0: must be greater than 0 (UCB, ")
+    assert done.stderr.count("\n") == 1
+
+
+def test_help_does_not_wait_for_torch():
+    code = "import sys; from hpamdp.main import main; main(); assert 'torch' not in sys.modules"
+    done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=CONF.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
