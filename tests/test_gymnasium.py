@@ -5,41 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from gymnasium_players import TOY, action, make, reset_rows, step
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 from toy_environments import ALL, FORMS, native_action
 
-from hpamdp import keys
 from hpamdp.config import ConfigError, build
 from hpamdp.env.boatdock import BoatDockEnv
 from hpamdp.env.gymnasium import GymnasiumEnv
 from hpamdp.specs import PAMDPSpecs
-
-TOY = "toy_environments:Toy"
-
-
-def make(num_envs: int = 1, *, form: str = "nested", max_steps: int | None = 6, **options) -> GymnasiumEnv:
-    kwargs = {"form": form, **options.pop("kwargs", {})}
-    options = {"entry_point": TOY, "parameter_dims": FORMS[form][1], "observation_scaling": "none", **options}
-    return GymnasiumEnv(num_envs, kwargs=kwargs, max_steps=max_steps, **options)
-
-
-def action(env: GymnasiumEnv, pressed, parameters) -> TensorDict:
-    press = {"key": torch.as_tensor(pressed), "duration": torch.as_tensor(parameters, dtype=torch.float32)}
-    return TensorDict({"action": TensorDict(press, env.batch_size)}, env.batch_size)
-
-
-def step(env: GymnasiumEnv, pressed=None, parameters=None) -> TensorDict:
-    """Press the first key, or those given, and return what comes of it."""
-    n = env.num_envs
-    pressed = torch.zeros(n, dtype=torch.int64) if pressed is None else pressed
-    parameters = torch.zeros(n, sum(env.parameter_dims)) if parameters is None else parameters
-    return env.step(action(env, pressed, parameters))["next"]
-
-
-def reset_rows(env: GymnasiumEnv, after: TensorDict, mask: list[bool]) -> TensorDict:
-    return env.reset(after.exclude(keys.REWARD).set("_reset", torch.tensor(mask).unsqueeze(-1)))
 
 
 def native(env: GymnasiumEnv, row: int = 0) -> list:
@@ -238,83 +213,6 @@ def test_the_time_limit_is_the_environments_own_or_the_one_given():
         assert env.max_steps == limit
         env.reset()
         assert [step(env)["truncated"].item() for _ in range(limit)] == [False] * (limit - 1) + [True]
-
-
-def test_observations_of_any_form_are_one_vector():
-    env = GymnasiumEnv(2, entry_point="toy_environments:Mixed", max_steps=2)
-    assert env.reset()["observation"].shape == (2, 7)
-    check_env_specs(env)
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "complaint"),
-    [({"size": 1}, "1 values, but its space has 2"), ({"value": float("nan")}, "that is not finite")],
-)
-def test_an_observation_that_the_space_does_not_have_is_refused(kwargs, complaint):
-    env = GymnasiumEnv(entry_point="toy_environments:Wrong", kwargs=kwargs, max_steps=5)
-    with pytest.raises(ValueError, match=f"Wrong: environment 0: gave an observation.*{complaint}"):
-        env.reset()
-
-
-def running(num_envs: int = 3, **options) -> GymnasiumEnv:
-    return make(num_envs, observation_scaling="running", **options)
-
-
-def test_running_statistics_are_those_of_all_observations_so_far():
-    env, plain = running(kwargs={"length": 3}), make(3, kwargs={"length": 3})
-    so_far = [plain.reset()["observation"]]
-    assert torch.allclose(env.reset()["observation"].mean(0), torch.zeros(2), atol=1e-6)
-    for number in range(5):
-        so_far.append(step(plain)["observation"][: 3 if number < 3 else 0])
-        after = step(env)["observation"]
-    everything = torch.cat(so_far).double()
-    mean, deviation = everything.mean(0), everything.std(0, correction=0)
-    assert torch.allclose(env.observations.statistics.mean, mean) and torch.allclose(
-        env.observations.statistics.variance.sqrt(), deviation
-    )
-    assert torch.allclose(after.double(), (so_far[3].double() - mean) / deviation, atol=1e-5)
-    check_env_specs(env)
-
-
-def test_running_statistics_are_saved_and_restored():
-    one, other = running(seed=1), running(seed=2)
-    one.reset()
-    step(one)
-    columns = one.state_columns()
-    kept = {name: column.clone() for name, column in columns.items()}
-    step(one)
-    assert all(torch.equal(columns[name], kept[name]) for name in kept)
-    other.set_state_columns(columns)
-    assert all(torch.equal(other.state_columns()[name], kept[name]) for name in kept)
-    other.reset()
-    assert all(torch.equal(columns[name], kept[name]) for name in kept)
-    with pytest.raises(ValueError, match="must have shape"):
-        other.set_state_columns({name: column[..., None] for name, column in columns.items()})
-    assert make().state_columns() == {}
-    make().set_state_columns({})
-
-
-def test_an_environment_for_evaluation_follows_the_statistics_and_adds_nothing():
-    training, evaluation = running(), running(kwargs={"form": "split"}, parameter_dims=[2, 0, 1])
-    evaluation.set_scaling_from(training)
-    plain = make(3).reset()["observation"]
-    assert torch.equal(evaluation.reset()["observation"], plain.clamp(-10.0, 10.0))
-    training.reset()
-    before = training.state_columns()
-    step(evaluation)
-    evaluation.set_seed(0)
-    seen = evaluation.reset()["observation"].double()
-    assert all(torch.equal(column, before[name]) for name, column in training.state_columns().items())
-    deviation = training.observations.statistics.variance.sqrt().where(
-        training.observations.statistics.variance > 0, 1.0
-    )
-    assert torch.allclose(seen, (plain - training.observations.statistics.mean) / deviation, atol=1e-5)
-    training.set_state_columns({name: column + 1.0 for name, column in before.items()})
-    evaluation.set_seed(0)
-    assert not torch.equal(evaluation.reset()["observation"].double(), seen)
-    make().set_scaling_from(make())
-    with pytest.raises(ValueError, match="scaling can be shared only"):
-        make().set_scaling_from(training)
 
 
 def test_success_is_what_the_infos_say():
