@@ -111,7 +111,7 @@ def step(
     noise_key = counter_rng.key_for(seed, counter_rng.NOISE, environment, state.episode)
     moved = _press(state, option.to(torch.int32), allowed_key.to(torch.int32), duration, noise_key, rules)
     over = state.outcome != physics.SAILING
-    reward = torch.where(over, 0.0, _reward(state, moved, rules))
+    reward = torch.where(over, 0.0, reward_of(state, moved, rules))
     return where(over, state, moved), reward, is_action
 
 
@@ -176,7 +176,8 @@ def _press(
     )
 
 
-def _reward(before: BoatState, after: BoatState, rules: Rules) -> Tensor:
+def reward_of(before: BoatState, after: BoatState, rules: Rules) -> Tensor:
+    """Return what the step from one state to another earns, `[N]`."""
     is_success = after.outcome == physics.SUCCESS
     final = torch.where(is_success, SUCCESS_REWARD * after.fuel / physics.TANK, 0.0)
     if rules.reward == "sparse":
