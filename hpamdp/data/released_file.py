@@ -48,7 +48,8 @@ class HumanData(NamedTuple):
     """What people did: one row an episode, one row a logged press. Lengths are screen px (y points down).
 
     episodes `[E]`: `person`, `index` (of the person's episodes), `block` (of 60), `controller` (0 incongruent,
-    1 congruent), `keymap` (1 or 2), `presses` (logged), `outcome` (as `physics.OUTCOMES`), `tank` (frames left of 360), all int64; `complete` bool; `start`, `goal`, `centre` `[E, 2]`.
+    1 congruent), `keymap` (1 or 2), `presses` (logged), `outcome` (as `physics.OUTCOMES`), `tank` (frames left of 360),
+    all int64; `complete` bool; `start`, `goal`, `centre` `[E, 2]`.
 
     presses `[N]`, the transitions: `episode` (row of the other table), `press` (its number in the episode), `key`
     int64; `is_final` bool; `position`, `next_position` `[N, 2]` (where this press and the next began, the latter NaN
