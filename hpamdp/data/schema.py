@@ -127,6 +127,9 @@ def _episode_rules(columns: Columns, episode: np.ndarray) -> Iterator[tuple[str,
     yield "boatchoice is not 0 or 1", _is_one_of(f["boatchoice"], 0, 1)
     yield "incongkm is not 1 or 2", _is_one_of(f["incongkm"], 1, 2)
     yield "tank is no number of frames from 0 to 360", _is_one_of(f["tank"], *range(361))
+    last = np.cumsum(np.maximum(columns.num_presses, 1)) - 1
+    marks = np.add.reduceat(f["terminals"][:, 0] != 0, last - np.maximum(columns.num_presses, 1) + 1)
+    yield "terminals does not mark the final press alone", (f["terminals"][last, 0] == 1) & (marks == 1)
     yield "center is not on the screen", ((f["center"] >= 0) & (f["center"] <= 10_000)).all(1)
     x, y = directions(f["boatchoice"][:, 0], f["incongkm"][:, 0])
     error = np.abs(f["boatdir"] - _DIRECTION_UNIT * np.stack([x, y], 2).reshape(-1, 6)).max(1)

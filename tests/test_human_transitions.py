@@ -1,0 +1,230 @@
+"""People's presses as a batch are what BoatDockEnv would have given for the same layouts and actions."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+import synthetic_human
+import torch
+from tensordict import TensorDict
+
+from hpamdp import keys
+from hpamdp.data import minari
+from hpamdp.data.dataset import HumanExperienceReplay, slices, whole_episodes
+from hpamdp.data.episodes import keep, scores_of_people, select
+from hpamdp.data.errors import HumanDataError
+from hpamdp.data.released_file import PATH_VARIABLE, HumanData, read
+from hpamdp.data.transitions import TRAJECTORY, transitions
+from hpamdp.env import harbour, physics
+from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.decisions import with_decisions
+
+REAL = os.environ.get(PATH_VARIABLE)
+needs_real = pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory) -> Path:
+    return synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat")
+
+
+@pytest.fixture(scope="module")
+def data(path) -> HumanData:
+    return read(path, checksum=None, one_frame=True)
+
+
+def replayed(data: HumanData, **arguments) -> list[TensorDict]:
+    """Play the logged presses of the episodes through the environment; return one batch `[rows]` a press number."""
+    episodes = data.episodes
+    env = BoatDockEnv(len(episodes), **arguments)
+    names = ("start", "goal", "keymap") if env.has_choice else ("start", "goal", "keymap", "controller")
+    td = env.reset(episodes.select(*names))
+    batch, played = transitions(data, has_choice=env.has_choice), []
+    for number in range(int(episodes["presses"].max())):
+        rows = data.presses["press"] == number
+        at = data.presses["episode"][rows]
+        td[keys.KEY] = torch.zeros(len(episodes), dtype=torch.long).index_put((at,), batch[keys.KEY][rows])
+        td[keys.DURATION] = torch.zeros(len(episodes), 3).index_put((at,), batch[keys.DURATION][rows])
+        if env.has_choice:
+            td[keys.OPTION] = episodes["controller"]
+        td = env.step(td)
+        played.append(td[at].clone())
+        td = td["next"].exclude(keys.REWARD).clone()
+    return played
+
+
+def is_fully_logged(data: HumanData) -> torch.Tensor:
+    # Of a short press too little is missing to tell by the tank.
+    return (data.episodes["index"] % 7 != 3) & data.episodes["complete"]
+
+
+@pytest.mark.parametrize("reward", ["paper", "sparse"])
+@pytest.mark.parametrize("observation", ["scaled", "pixels"])
+@pytest.mark.parametrize("controller", ["choose", "random"])
+def test_batch_is_what_the_environment_gives_for_the_same_presses(data, reward, observation, controller):
+    data = keep(data, is_fully_logged(data))
+    batch = transitions(data, reward=reward, observation=observation, has_choice=controller == "choose")
+    for number, rows in enumerate(replayed(data, controller=controller, reward=reward, observation=observation)):
+        ours = batch[data.presses["press"] == number]
+        if number == 0:
+            assert torch.equal(ours[keys.OBSERVATION], rows[keys.OBSERVATION])
+        scale = 1.0 if observation == "scaled" else 120.0
+        for name in (keys.OBSERVATION, ("next", keys.OBSERVATION)):
+            # The tank is recorded in whole frames.
+            torch.testing.assert_close(ours[name], rows[name], atol=2e-3 * scale, rtol=1e-3)
+        torch.testing.assert_close(ours["next", keys.REWARD], rows["next", keys.REWARD], atol=2e-2, rtol=0)
+        for name in (keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED):
+            assert torch.equal(ours["next", name], rows["next", name]), name
+
+
+def test_batch_has_the_environments_keys_shapes_and_types(data):
+    env = with_decisions(BoatDockEnv(2))
+    rollout = env.rollout(2, auto_reset=True)
+    batch = transitions(data)
+    tracked = {"option_return", "option_steps", "decision_observation", "episode_return", "episode_steps"}
+    expected = {name: value for name, value in rollout.items(True, True) if not tracked & {name, name[-1]}}
+    assert set(expected) | {TRAJECTORY} == set(batch.keys(True, True))
+    for name, value in expected.items():
+        assert batch[name].dtype == value.dtype and batch[name].shape[1:] == value.shape[2:], name
+
+
+def test_decisions_options_and_trajectories_mark_the_episodes(data):
+    batch = transitions(data)
+    episode = data.presses["episode"]
+    assert torch.equal(batch[TRAJECTORY], episode)
+    assert torch.equal(batch[keys.OPTION], data.episodes["controller"][episode])
+    starts = torch.cat([torch.tensor([True]), episode[1:] != episode[:-1]])
+    assert torch.equal(batch[keys.IS_DECISION].squeeze(-1), starts)
+    assert torch.equal(batch["next", keys.DONE].squeeze(-1), starts.roll(-1))
+    shown = batch[keys.OBSERVATION][:, 7]
+    assert (shown[starts] == harbour.NOT_CHOSEN).all() and torch.equal(
+        shown[~starts], batch[keys.OPTION][~starts] * 1.0
+    )
+    pressed = batch[keys.DURATION].gather(1, batch[keys.KEY].unsqueeze(1)).squeeze(1)
+    assert torch.equal(pressed, data.presses["duration"])
+    assert torch.equal(batch[keys.DURATION].count_nonzero(1), torch.ones(len(batch), dtype=torch.long))
+
+
+def test_fuel_counts_logged_presses_until_the_recorded_tank_says_what_was_left(data):
+    batch = transitions(data)
+    for number in range(len(data.episodes)):
+        rows = batch[batch[TRAJECTORY] == number]
+        if not len(rows):
+            assert data.episodes["presses"][number] == 0
+            continue
+        spent = rows[keys.DURATION].sum(1).cumsum(0)
+        torch.testing.assert_close(rows["next", keys.FUEL][:-1, 0], 1 - spent[:-1] / physics.TANK, atol=1e-5, rtol=0)
+        assert rows[keys.FUEL][0] == 1.0
+        assert rows["next", keys.FUEL][-1, 0] == pytest.approx(data.episodes["tank"][number].item() / 360)
+
+
+def test_only_one_frame_and_known_forms_are_taken(path, data):
+    with pytest.raises(HumanDataError, match="one_frame=True"):
+        transitions(read(path, checksum=None))
+    with pytest.raises(HumanDataError, match="reward='dense', but must be one of paper, sparse"):
+        transitions(data, reward="dense")
+
+
+@needs_real
+def test_people_see_the_environments_first_observation_and_glide_near_its_later_ones():
+    data = read(REAL, one_frame=True)
+    data = select(data, complete=True)
+    batch = transitions(data)
+    near = []
+    for number, rows in enumerate(replayed(data, controller="choose")):
+        ours = batch[data.presses["press"] == number]
+        if number == 0:
+            assert torch.equal(ours[keys.OBSERVATION], rows[keys.OBSERVATION])
+        if number == 1:  # both boats began at the start; the next press cuts people's glide short
+            near.append((ours[keys.OBSERVATION][:, 8:10] - rows[keys.OBSERVATION][:, 8:10]).norm(dim=1))
+    near = torch.cat(near) * physics.HARBOUR_RADIUS
+    assert near.median() < 8.0 and near.quantile(0.9) < 20.0
+
+
+@needs_real
+def test_all_of_peoples_transitions_are_finite_and_start_as_the_environment_starts():
+    data = read(REAL, one_frame=True)
+    batch = transitions(data)
+    assert len(batch) == 46_757
+    assert all(value.isfinite().all() for value in batch.values(True, True))
+    # Of five episodes not even the first press was logged: the boat is already on its way.
+    first = batch[batch[keys.IS_DECISION].squeeze(-1)][keys.OBSERVATION]
+    assert (first[:, :2] != first[:, 8:10]).any(1).sum() == 5
+    success = batch["next", keys.OUTCOME] == physics.SUCCESS
+    to_goal = batch["next", keys.OBSERVATION][success][:, 14:].norm(dim=1) * physics.HARBOUR_RADIUS
+    torch.testing.assert_close(to_goal, torch.full_like(to_goal, physics.DOCK_RADIUS), atol=1e-3, rtol=0)
+
+
+def test_selected_episodes_meet_every_condition_and_keep_their_presses(data):
+    chosen = select(data, complete=True, successes=True, best_people=1, controller="congruent")
+    best = int(scores_of_people(data).argmax())
+    assert (chosen.episodes["person"] == best).all() and chosen.episodes["complete"].all()
+    assert (chosen.episodes["outcome"] == physics.SUCCESS).all() and (chosen.episodes["controller"] == 1).all()
+    assert torch.equal(chosen.presses["episode"].bincount(minlength=len(chosen.episodes)), chosen.episodes["presses"])
+    of = data.episodes[data.presses["episode"]]
+    kept = (of["person"] == best) & of["complete"] & (of["outcome"] == physics.SUCCESS) & (of["controller"] == 1)
+    assert torch.equal(chosen.presses["duration"], data.presses["duration"][kept])
+    with pytest.raises(HumanDataError, match="best_people=9, but must be 1 to 3"):
+        select(data, best_people=9)
+
+
+def test_replay_buffer_is_memory_mapped_shared_and_whole(path, tmp_path, data):
+    arguments = dict(path=path, root=tmp_path, checksum=None)
+    buffer = HumanExperienceReplay(32, reward="sparse", **arguments)
+    assert len(buffer) == len(data.presses) and buffer.sample().shape == (32,)
+    assert buffer[:].exclude("index")[keys.OBSERVATION].equal(transitions(data)[keys.OBSERVATION])
+    assert (buffer.data_path / "observation.memmap").exists()
+    assert [folder.name for folder in tmp_path.iterdir()] == [buffer.data_path.name]
+    with pytest.raises(HumanDataError):
+        HumanExperienceReplay(32, best_people=9, **arguments)
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_replay_buffer_made_once_is_found_again(path, tmp_path):
+    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
+    made = HumanExperienceReplay(4, path=path, root=tmp_path, checksum=checksum, complete=True)
+    found = HumanExperienceReplay(4, path="nowhere", root=tmp_path, checksum=checksum, complete=True)
+    assert found.data_path == made.data_path and len(found) == len(made)
+    with pytest.raises(HumanDataError, match="no such file"):
+        HumanExperienceReplay(4, path="nowhere", root=tmp_path, checksum=checksum, complete=False)
+
+
+def test_replay_buffer_samples_whole_episodes_and_slices(path, tmp_path, data):
+    arguments = dict(path=path, root=tmp_path, checksum=None)
+    episodes = HumanExperienceReplay(200, sampler=whole_episodes(), **arguments).sample()
+    starts, ends = episodes[keys.IS_DECISION].squeeze(-1), episodes["next", keys.DONE].squeeze(-1)
+    assert starts.sum() == ends.sum() == 8 and starts[0] and torch.equal(starts.roll(-1), ends)
+    for number in episodes[TRAJECTORY].unique():
+        assert (episodes[TRAJECTORY] == number).sum() % data.episodes["presses"][number] == 0
+    pairs = HumanExperienceReplay(40, sampler=slices(2), **arguments).sample()
+    same = pairs[TRAJECTORY][1:] == pairs[TRAJECTORY][:-1]
+    follows = torch.isclose(pairs["next", keys.OBSERVATION][:-1], pairs[keys.OBSERVATION][1:]).all(1)
+    inside = same & ~pairs["next", keys.DONE].squeeze(-1)[:-1] & ~pairs[keys.IS_DECISION].squeeze(-1)[1:]
+    assert follows[inside].float().mean() > 0.9  # two slices of one episode may lie side by side
+
+
+@pytest.mark.parametrize("has_choice", [True, False])
+def test_minari_gives_back_what_it_was_given(data, tmp_path, monkeypatch, has_choice):
+    library = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    batch = transitions(select(data, complete=True, best_people=1), has_choice=has_choice)
+    dataset = minari.export(batch, "hpamdp/people-v0")
+    assert dataset.total_steps == len(batch)
+    episode = dataset[0]
+    assert dataset.action_space.contains({name: value[0] for name, value in episode.actions.items()})
+    assert dataset.observation_space.contains(episode.observations[0])
+    assert library.load_dataset("hpamdp/people-v0").recover_environment().unwrapped.spec.id == "hpamdp/BoatDock-v0"
+    loaded = minari.load("hpamdp/people-v0")
+    assert set(loaded.keys(True, True)) == set(batch.keys(True, True))
+    loaded[TRAJECTORY] = batch[TRAJECTORY].unique()[loaded[TRAJECTORY]]  # episodes without a press have no number there
+    for name, value in batch.items(True, True):
+        assert loaded[name].dtype == value.dtype and torch.equal(loaded[name], value), name
+    with pytest.raises(HumanDataError, match="minari delete hpamdp/people-v0"):
+        minari.export(batch, "hpamdp/people-v0")
+    with pytest.raises(HumanDataError, match="no data set of people's presses"):
+        minari.load("hpamdp/nobody-v0")
+    with pytest.raises(HumanDataError, match="it must be like hpamdp/people-v0"):
+        minari.export(batch, "people")
