@@ -1,0 +1,219 @@
+"""`python -m hpamdp.data.human`: what it tells, what it writes, and how it refuses."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import re
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+import synthetic_human
+from tensordict import TensorDict
+
+from hpamdp.data import human
+from hpamdp.data.download import download
+from hpamdp.data.errors import HumanDataError
+from hpamdp.data.released_file import PATH_VARIABLE, read
+from hpamdp.data.transitions import transitions
+
+REAL = os.environ.get(PATH_VARIABLE)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory) -> Path:
+    return synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat")
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert human.main([str(a) for a in arguments]) == 0
+    output = capsys.readouterr()
+    assert not output.err
+    return output.out
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    try:
+        code = human.main([str(a) for a in arguments])
+    except SystemExit as end:
+        code = end.code
+    output = capsys.readouterr()
+    assert code == 2 and output.err.count("\n") == 1
+    return output.err
+
+
+def test_check_and_summary_tell_what_is_in_a_file(capsys, path):
+    output = told(capsys, "check", path, "--any-file")
+    assert "3 people, 210 episodes" in output and "the boat may still have been gliding" in output
+    output = told(capsys, "summary", path, "--any-file")
+    assert re.search(r"^all +210 ", output, re.MULTILINE)
+    figures = json.loads(told(capsys, "summary", path, "--any-file", "--json"))
+    assert figures["all"]["episodes"] == 210 and len(figures["person"]) == 3
+
+
+@pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")
+def test_check_and_summary_of_the_released_file_are_the_tasks_facts(capsys):
+    output = told(capsys, "check")
+    for line in (
+        "40 people, 14400 episodes, 46757 presses",
+        "without a press 15, with a single one 1823, completely logged 675",
+        "harbour at [640, 512]: 20 people; harbour at [672, 504]: 20 people",
+        "key map 1: 36 people; key map 2: 4 people",
+        "94.6% of 204 single presses",
+        "98.1% of 427",
+    ):
+        assert line in output
+    output = told(capsys, "summary")
+    for name, score, success in (
+        ("all", "1.970", "86.0%"),
+        ("congruent", "2.012", "86.5%"),
+        ("incongruent", "1.912", "85.4%"),
+        ("episodes 301 to 360", "2.241", "90.0%"),
+        (r"best person \(11\)", "3.021", "98.9%"),
+    ):
+        assert re.search(rf"^{name} +\d+ +{score} +{success}", output, re.MULTILINE), name
+    assert "0-10: 0.788, 10-20: 0.741, 20-30: 0.654, 30-40: 0.502, 40-50: 0.427, 50-60: 0.370" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["check", "none.mat"], "there is no such file"),
+        (["chek"], "invalid choice: 'chek'"),
+        (["export", "--to", "x", "--format", "xls"], "invalid choice: 'xls'"),
+        (["download"], "required: --url"),
+    ],
+)
+def test_mistakes_cost_one_line(capsys, arguments, says):
+    assert says in refused(capsys, *arguments)
+
+
+def test_altered_files_are_refused_in_one_line(capsys, path):
+    assert "truncated, altered or another file" in refused(capsys, "summary", path)
+
+
+def test_csv_and_npz_hold_both_tables(capsys, path, tmp_path):
+    data = read(path, checksum=None)
+    told(capsys, "export", path, "--any-file", "--format", "csv", "--to", tmp_path / "tables")
+    told(capsys, "export", path, "--any-file", "--format", "npz", "--to", tmp_path / "tables.npz")
+    arrays = np.load(tmp_path / "tables.npz")
+    for name, table in data._asdict().items():
+        rows = list(csv.DictReader((tmp_path / "tables" / f"{name}.csv").open()))
+        for column, values in table.items():
+            assert np.array_equal(arrays[f"{name}/{column}"], values.numpy(), equal_nan=values.is_floating_point())
+            parts = [column] if values.ndim == 1 else [f"{column}_x", f"{column}_y"]
+            written = np.array([[row[part] or "nan" for part in parts] for row in rows], np.float32)
+            assert np.array_equal(written.reshape(values.shape), values.numpy().astype(np.float32), equal_nan=True)
+
+
+def test_memmap_holds_the_transitions_that_were_asked_for(capsys, path, tmp_path):
+    wanted = ("--complete", "--reward", "sparse", "--observation", "pixels")
+    told(capsys, "export", path, "--any-file", "--format", "memmap", "--to", tmp_path / "batch", *wanted)
+    data = read(path, checksum=None, one_frame=True)
+    kept = data.episodes["complete"][data.presses["episode"]]
+    batch = transitions(data, reward="sparse", observation="pixels")[kept]
+    written = TensorDict.load_memmap(tmp_path / "batch")
+    assert written["observation"].equal(batch["observation"]) and written["next"]["reward"].equal(
+        batch["next"]["reward"]
+    )
+
+
+def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, path, tmp_path, monkeypatch):
+    target = tmp_path / "tables.npz"
+    target.write_text("mine")
+    assert "exists" in refused(capsys, "export", path, "--any-file", "--format", "npz", "--to", target)
+    assert target.read_text() == "mine"
+    (tmp_path / "full").mkdir()
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", fail)
+    to = tmp_path / "full" / "tables.npz"
+    assert "No space left" in refused(capsys, "export", path, "--any-file", "--format", "npz", "--to", to)
+    assert not list((tmp_path / "full").iterdir())
+    assert "best_people=4" in refused(
+        capsys, "export", path, "--any-file", "--format", "npz", "--to", to, "--best-people", 4
+    )
+
+
+class Server(ThreadingHTTPServer):
+    """Serves `body`; the first answer breaks off after `breaks_after` bytes."""
+
+    body, breaks_after, honours_range = b"", None, True
+    asked: list[str | None]
+
+
+class Handler(BaseHTTPRequestHandler):
+    server: Server
+
+    def do_GET(self) -> None:
+        server = self.server
+        asked = self.headers.get("Range")
+        server.asked.append(asked)
+        start = int(re.findall(r"\d+", asked)[0]) if asked and server.honours_range else 0
+        if start >= len(server.body):
+            self.send_error(416)
+            return
+        self.send_response(206 if start else 200)
+        self.send_header("Content-Length", str(len(server.body) - start))
+        self.end_headers()
+        end = server.breaks_after if server.breaks_after and len(server.asked) == 1 else len(server.body)
+        self.wfile.write(server.body[start:end])
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server(monkeypatch) -> Iterator[Server]:
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    with Server(("127.0.0.1", 0), Handler) as server:
+        server.body, server.asked = np.random.default_rng(0).bytes(300_000), []
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def address(server: Server) -> str:
+    return f"http://127.0.0.1:{server.server_address[1]}/people.mat"
+
+
+@pytest.mark.parametrize("honours_range", [True, False])
+def test_an_interrupted_download_goes_on_where_it_stopped(server, tmp_path, honours_range):
+    server.breaks_after, server.honours_range = 100_000, honours_range
+    target, checksum = tmp_path / "cache" / "people.mat", hashlib.sha256(server.body).hexdigest()
+    with pytest.raises(HumanDataError, match=r"broke after 100000 of 300000 bytes.*; 100000 bytes are kept"):
+        download(address(server), target, checksum=checksum)
+    assert not target.exists()
+    assert download(address(server), target, checksum=checksum) == target
+    assert server.asked == [None, "bytes=100000-"]
+    assert target.read_bytes() == server.body and list(target.parent.iterdir()) == [target]
+    download(address(server), target, checksum=checksum)
+    assert len(server.asked) == 2
+
+
+def test_a_download_of_another_file_is_thrown_away(server, tmp_path):
+    with pytest.raises(HumanDataError, match="truncated, altered or another file"):
+        download(address(server), tmp_path / "people.mat")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "url", ["http://127.0.0.1:9/people.mat", "http://nowhere.invalid/a.mat", "nonsense", "http://"]
+)
+def test_a_download_without_a_network_says_so_in_one_line(capsys, tmp_path, monkeypatch, url):
+    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    message = refused(capsys, "download", "--url", url, "--to", tmp_path / "people.mat")
+    assert "cannot be fetched" in message
+    assert not (tmp_path / "people.mat").exists()

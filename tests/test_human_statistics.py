@@ -1,0 +1,129 @@
+"""People's figures are those of the released file, and their boats move as ours do."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import synthetic_human
+import torch
+
+from hpamdp import reference
+from hpamdp.data import statistics, validation
+from hpamdp.data.episodes import keep, score, scores_of_people
+from hpamdp.data.released_file import PATH_VARIABLE, HumanData, read
+from hpamdp.data.validation import Singles
+from hpamdp.env import harbour, physics
+
+REAL = os.environ.get(PATH_VARIABLE)
+needs_real = pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> HumanData:
+    return read(synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat"), checksum=None)
+
+
+@pytest.fixture(scope="module")
+def people() -> HumanData:
+    return read(REAL)
+
+
+def test_scores_are_five_times_the_tank_left_or_minus_one(data):
+    expected = [
+        5 * tank / 360 if outcome == physics.SUCCESS else -1.0
+        for outcome, tank in zip(data.episodes["outcome"].tolist(), data.episodes["tank"].tolist(), strict=True)
+    ]
+    torch.testing.assert_close(score(data), torch.tensor(expected))
+    whole = statistics.figures(data)
+    assert whole["score"] == pytest.approx(np.mean(expected), abs=1e-6) and whole["episodes"] == 210
+    by_person = statistics.figures_by(data, "person")
+    assert [f["score"] for f in by_person.values()] == pytest.approx(scores_of_people(data).tolist(), abs=1e-5)
+    assert sum(whole[name] for name in physics.OUTCOMES[1:]) == pytest.approx(1.0)
+
+
+def test_no_player_of_our_physics_beats_the_best_plan(data):
+    data = keep(data, torch.arange(len(data.episodes)) < 40)
+    gaps = statistics.optimality_gaps(data, statistics.best_scores(data))
+    assert (gaps["press_gap"] > -0.05).all()  # the tank is recorded in whole frames, .014 of score each
+    assert (gaps["choice_gap"] >= 0).all() and (gaps["choice_gap"] > 0).any()
+    torch.testing.assert_close(gaps["gap"], gaps["choice_gap"] + gaps["press_gap"])
+
+
+def test_choice_curve_counts_the_congruent_boat_by_bearing(data):
+    offset = harbour.bearing_offset(statistics.layouts(data)).numpy()
+    congruent = data.episodes["controller"].numpy() == harbour.CONGRUENT
+    expected = [congruent[(offset >= low) & (offset < low + 10)].mean() for low in range(0, 60, 10)]
+    assert statistics.choice_curve(data) == pytest.approx(expected)
+    none = torch.zeros(len(data.episodes), dtype=torch.bool)
+    assert np.isnan(statistics.choice_curve(data, none)).all()
+
+
+@needs_real
+def test_figures_of_the_released_file_are_the_built_in_references(people):
+    figures = statistics.figures(people)
+    for name, value in reference.HUMAN["chosen"].items():
+        assert figures[name] == pytest.approx(value, abs=5e-3 if name == "presses" else 1e-3), name
+    for option, by in statistics.figures_by(people, "controller").items():
+        for name, value in reference.HUMAN[harbour.CONTROLLERS[option]].items():
+            assert by[name] == pytest.approx(value, abs=1e-3), name
+    blocks = statistics.figures_by(people, "block")
+    assert [b["success"] for b in blocks.values()] == pytest.approx(reference.HUMAN_SUCCESS_BY_BLOCK, abs=1e-3)
+    assert blocks[5]["score"] == pytest.approx(reference.HUMAN_LAST_60["score"], abs=1e-3)
+    best = statistics.figures_by(people, "person")[int(scores_of_people(people).argmax())]
+    assert best["score"] == pytest.approx(reference.BEST_PERSON["score"], abs=1e-3)
+    assert best["success"] == pytest.approx(reference.BEST_PERSON["success"], abs=1e-3)
+    curve = statistics.choice_curve(people)
+    assert curve == pytest.approx(reference.HUMAN_CONGRUENT_BY_OFFSET, abs=1e-3)
+
+
+@needs_real
+def test_peoples_single_presses_end_in_our_physics_as_recorded(people):
+    singles = validation.single_presses(people)
+    assert len(singles.outcome) == 204
+    assert validation.agreement(singles) >= 0.94
+
+
+@needs_real
+def test_peoples_first_presses_go_as_far_as_our_physics_allows(people):
+    ways = validation.first_presses(people)
+    assert len(ways.is_inside) == 427
+    assert ways.is_inside.double().mean() >= 0.98
+
+
+def test_players_of_our_physics_agree_with_it(data):
+    singles, ways = validation.single_presses(data), validation.first_presses(data)
+    assert len(singles.outcome) >= 20 and validation.agreement(singles) == 1.0
+    assert len(ways.is_inside) >= 100 and ways.is_inside.all()
+
+
+def simulated_singles(num: int, glide: float, limit: float) -> Singles:
+    generator = torch.Generator().manual_seed(0)
+    x = 0.6 + 0.9 * torch.rand(num, generator=generator, dtype=torch.float64)
+    pressed = physics.pressed_distance(x)
+    to_dock = pressed * (1.0 + 1.1 * torch.rand(num, generator=generator, dtype=torch.float64))
+    noise = torch.randn(2, num, generator=generator, dtype=torch.float64)
+    spare = (1.0 + glide) * pressed - to_dock + 0.5 * noise[0]
+    speed = physics.speed(physics.duration_for(spare.clamp(min=0.0) / glide)) + 2.0 * noise[1]
+    docked = torch.where(speed > limit, physics.TOO_FAST, physics.SUCCESS)
+    outcome = torch.where(spare < 0, physics.OUT_OF_FUEL, docked)
+    return Singles(pressed, to_dock, outcome, outcome)
+
+
+def test_fit_finds_the_constants_that_the_presses_were_made_with():
+    fit = validation.fit(simulated_singles(400, glide=1.1, limit=80.0), num_bootstraps=50)
+    for glide in (fit.likely_glide, fit.agreeing_glide):
+        assert glide[0] == pytest.approx(1.1, abs=0.05) and glide[1] <= 1.1 <= glide[2]
+    for speed in (fit.likely_speed, fit.agreeing_speed):
+        assert speed[0] == pytest.approx(80.0, abs=4.0) and speed[1] <= 80.0 <= speed[2]
+    assert fit.agreement.max() > 0.9
+
+
+@needs_real
+def test_our_constants_lie_within_what_peoples_presses_speak_for(people):
+    fit = validation.fit(validation.single_presses(people), num_bootstraps=100)
+    for name, value in (("likely_glide", physics.GLIDE), ("agreeing_glide", physics.GLIDE)):
+        _, low, high = getattr(fit, name)
+        assert low <= value <= high, name
+    assert fit.agreeing_speed[1] <= physics.DOCKING_SPEED <= fit.agreeing_speed[2]
