@@ -48,6 +48,13 @@ def test_environments_and_policies_do_not_know_each_other():
     assert not importers("hpamdp.env", inside="hpamdp.policies")
 
 
+def test_the_data_knows_the_environments_and_nobody_below_knows_the_data():
+    allowed = ("data", "env", "keys", "specs", "reference")
+    known = {name for module in FILES if is_in(module, "hpamdp.data") for name in imports(module)}
+    assert not [n for n in known if is_in(n, "hpamdp") and not any(is_in(n, f"hpamdp.{room}") for room in allowed)]
+    assert not importers("hpamdp.data", inside="hpamdp.env") | importers("hpamdp.data", inside="hpamdp.policies")
+
+
 def test_the_levels_do_not_know_each_other():
     assert not importers(LOW, inside=HIGH)
     assert not importers(HIGH, inside=LOW)
@@ -65,9 +72,10 @@ def test_learners_and_selectors_know_neither_the_config_nor_the_agent():
         assert not importers(forbidden, inside=LOW) | importers(forbidden, inside=HIGH)
 
 
-def test_hydra_and_wandb_stay_in_their_rooms():
+def test_hydra_wandb_and_minari_stay_in_their_rooms():
     assert importers("hydra") <= {"hpamdp.main", "hpamdp.config"}
     assert importers("wandb") <= {"hpamdp.metrics"}
+    assert importers("minari") <= {"hpamdp.data.minari"}
 
 
 def test_the_run_gets_concrete_classes_only_through_build():
