@@ -201,14 +201,14 @@ def draw_singles(axes: Axes) -> None:
         axes.scatter(
             rows["pressed"][wrong], rows["to_dock"][wrong], s=38, facecolor="none", edgecolor=INK, linewidth=0.8
         )
-    x = np.linspace(0, 90, 200)
+    x = np.linspace(0, 115, 200)
     axes.plot(x, (1 + physics.GLIDE) * x, color=INK, linewidth=1)
-    axes.annotate("at rest", (62, 1.95 * 62), xytext=(-38, 4), textcoords="offset points")
+    axes.annotate("at rest", (84, 1.95 * 84), xytext=(-40, 2), textcoords="offset points")
     slow = physics.pressed_distance(duration_at(physics.DOCKING_SPEED)).item()
     way = np.where(x > slow, (1 + physics.GLIDE) * x - physics.GLIDE * slow, np.nan)
     axes.plot(x, way, color=INK, linewidth=1, linestyle="--")
-    axes.annotate("74 px/s", (75, 1.95 * 75 - 0.95 * slow), xytext=(3, -10), textcoords="offset points")
-    axes.set(xlabel="px covered while the key is down", ylabel="px to the dock", xlim=(0, 95), ylim=(0, 175))
+    axes.annotate("74 px/s", (93, 1.95 * 93 - 0.95 * slow), xytext=(4, -10), textcoords="offset points")
+    axes.set(xlabel="px covered while the key is down", ylabel="px to the dock", xlim=(0, 118), ylim=(0, 200))
     axes.set_title("Single presses (ringed: told wrong)")
     axes.legend(frameon=False, loc="upper left")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers import Sampler
 
 from hpamdp.data.episodes import select
+from hpamdp.data.errors import HumanDataError
 from hpamdp.data.export import write_memmap
-from hpamdp.data.released_file import SHA256, read
+from hpamdp.data.released_file import SHA256, default_path, load_bytes, read
 from hpamdp.data.transitions import TRAJECTORY, transitions
 from hpamdp.env.episode import MAX_PRESSES
 
@@ -79,12 +79,16 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         self.root = user_cache_path("hpamdp") / "datasets" if root is None else root
         which = dict(complete=complete, successes=successes, best_people=best_people, controller=controller)
         form = dict(reward=reward, observation=observation, has_choice=has_choice)
-        # Without a checksum the file may change under its name: what was made of it is made anew.
-        self._name = None if checksum is None else _name(checksum=checksum, **which, **form)
+        if checksum is None:
+            checksum = hashlib.sha256(load_bytes(default_path() if path is None else Path(path))).hexdigest()
+        self._name = _name(checksum=checksum, **which, **form)
         if not self._is_downloaded():
             made = transitions(select(read(path, checksum=checksum, one_frame=True), **which), **form)
-            self._name = self._name or f"human-{uuid.uuid4().hex[:16]}"
-            write_memmap(made, self.data_path)
+            try:
+                write_memmap(made, self.data_path)
+            except HumanDataError:
+                if not self._is_downloaded():  # else another process was faster
+                    raise
         storage = TensorStorage(TensorDict.load_memmap(self.data_path))
         super().__init__(
             storage=storage,
@@ -103,10 +107,10 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
     @property
     def data_path(self) -> Path:
         """Folder of this data set's files."""
-        return self.root / str(self._name)
+        return self.root / self._name
 
     def _is_downloaded(self) -> bool:
-        return self._name is not None and self.data_path.exists()
+        return self.data_path.exists()
 
 
 def _name(**settings: Any) -> str:

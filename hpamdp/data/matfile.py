@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,7 @@ _COMPLEX = 0x0800
 _FORMATS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 _DTYPES = {code: np.dtype(name) for code, name in _FORMATS.items()}
 _MAX_INFLATED = 64 * 2**20  # bytes; the released file has about 20 million
+_MAX_OTHERS = 100  # variables looked at before the one that is wanted; the released file has no other
 
 _tag = struct.Struct("<II").unpack_from
 
@@ -74,7 +75,7 @@ class MatArray:
         self._kind, self._is_complex = word & 0xFF, bool(word & _COMPLEX)
         self.shape: tuple[int, ...] = struct.unpack(f"<{len(dims.content) // 4}i", dims.content)
         if min(self.shape) < 0:
-            raise HumanDataError(f"an array has the shape {self.shape}")
+            raise HumanDataError(f"an array has a negative dimension in {self.shape}")
         self.size = math.prod(self.shape)
         self.name = bytes(name.content).decode("latin-1")
         self._content, self._start = content, name.end
@@ -145,7 +146,14 @@ def read_variable(data: bytes, name: str) -> MatArray:
         if array.name == name:
             return array
         others.append(array.name)
-    raise HumanDataError(f"there is no variable {name}, but {', '.join(map(repr, others)) or 'none at all'}")
+        if len(others) > _MAX_OTHERS:
+            break
+    raise HumanDataError(f"there is no variable {name}, but {some(others) or 'none at all'}")
+
+
+def some(names: Sequence[str]) -> str:
+    """Return names to be told in a message, however many and long they are."""
+    return ", ".join(repr(name[:20]) for name in names[:20]) + ", …" * (len(names) > 20)
 
 
 def _inflate(compressed: memoryview, limit: int) -> memoryview:

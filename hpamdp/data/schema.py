@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from hpamdp.data.errors import HumanDataError
-from hpamdp.data.matfile import MatArray
+from hpamdp.data.matfile import MatArray, some
 from hpamdp.env import harbour, physics
 
 SPEED_UNIT = 10.0  # px/s of the column `velocity`
@@ -66,7 +66,7 @@ def columns(trajectories: MatArray) -> Columns:
 def _num_presses(fields: dict[str, np.ndarray]) -> int:
     """Return how many presses an episode has, once its fields are the right ones and have the right sizes."""
     if set(fields) != _FIELDS:
-        raise HumanDataError(f"the fields are {', '.join(map(repr, sorted(fields)))}")
+        raise HumanDataError(f"the fields are {some(sorted(fields))}")
     num = len(fields["gas"])
     sizes = {
         **{name: width * num for name, width in _A_PRESS.items()},
