@@ -203,7 +203,7 @@ def draw_singles(axes: Axes) -> None:
         )
     x = np.linspace(0, 115, 200)
     axes.plot(x, (1 + physics.GLIDE) * x, color=INK, linewidth=1)
-    axes.annotate("at rest", (84, 1.95 * 84), xytext=(-40, 2), textcoords="offset points")
+    axes.annotate("at rest", (60, 1.95 * 60), xytext=(-40, 4), textcoords="offset points")
     slow = physics.pressed_distance(duration_at(physics.DOCKING_SPEED)).item()
     way = np.where(x > slow, (1 + physics.GLIDE) * x - physics.GLIDE * slow, np.nan)
     axes.plot(x, way, color=INK, linewidth=1, linestyle="--")
