@@ -97,7 +97,10 @@ def _states(data: HumanData, of: TensorDict, has_choice: bool) -> tuple[BoatStat
         episode=torch.zeros_like(number),
     )
     (x, y), (velocity_x, velocity_y) = place.unbind(1), after_velocity.unbind(1)
-    outcome = torch.where(is_final, of["outcome"], physics.SAILING).to(torch.int32)
+    # Where the final press is gone (`settled`) the episode is cut, not over: its last state bootstraps.
+    episode_number = presses["episode"]
+    is_last = torch.cat([episode_number[1:] != episode_number[:-1], torch.ones_like(is_final[:1])])
+    outcome = torch.where(is_final, of["outcome"], torch.where(is_last, physics.TIME_LIMIT, physics.SAILING)).int()
     moved = dict(x=x, y=y, velocity_x=velocity_x, velocity_y=velocity_y, fuel=after_left)
     return before, before._replace(**moved, controller=controller, presses=number + 1, outcome=outcome)
 

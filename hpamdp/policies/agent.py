@@ -134,8 +134,26 @@ class HierarchicalAgent(nn.Module):
             batch = with_option(batch, self.specs.num_options)
         for i, learner in enumerate(self.learners):
             is_own = everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i
-            prefix = "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[i]}"
-            scalars |= {f"{prefix}/{name}": value for name, value in learner.learn(batch, is_own).items()}
+            scalars |= {f"{self._name_of(i)}/{name}": value for name, value in learner.learn(batch, is_own).items()}
+        return scalars
+
+    def _name_of(self, learner: int) -> str:
+        return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
+
+    def remember(self, batch: TensorDictBase) -> None:
+        """Let the learners keep a data set's transitions `[*B, T]`, each its own option's."""
+        everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
+        if self.is_shared:
+            batch = with_option(batch, self.specs.num_options)
+        for i, learner in enumerate(self.learners):
+            learner.remember(batch, everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i)
+
+    def practise(self, num_updates: int) -> dict[str, float]:
+        """Let each learner make updates from what it remembers; return scalars named `low/...`."""
+        scalars: dict[str, float] = {}
+        for i, learner in enumerate(self.learners):
+            made = learner.practise(num_updates)
+            scalars |= {f"{self._name_of(i)}/{name}": value for name, value in made.items()}
         return scalars
 
     def stateful(self) -> dict[str, Any]:

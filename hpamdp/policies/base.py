@@ -85,6 +85,8 @@ class Learner(nn.Module):
     """
 
     needs: ClassVar[tuple[str, ...]] = ()  # as of a selector
+    # What it can learn from: `train`, its own presses; `offline`, a data set of others' presses.
+    modes: ClassVar[tuple[str, ...]] = ("train",)
     has_value: ClassVar[bool] = False  # whether `value` is there
 
     policy: TensorDictModuleBase
@@ -99,6 +101,17 @@ class Learner(nn.Module):
         Return scalars to log, averaged over the updates made.
         """
         return {}
+
+    def remember(self, batch: TensorDictBase, mask: Tensor) -> None:
+        """Keep those of a data set's transitions `[*B, T]` that are in `mask`, beside what the learner will collect.
+
+        Only for learners with the mode `offline`.
+        """
+        raise NotImplementedError
+
+    def practise(self, num_updates: int) -> dict[str, float]:
+        """Make updates from what is remembered; return scalars to log, averaged over them."""
+        raise NotImplementedError
 
     def value(self, observation: Tensor) -> Tensor:
         """Return what the learner expects to earn from observations `[B, observation_dim]` on, `[B]`."""

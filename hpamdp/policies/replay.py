@@ -1,8 +1,8 @@
-"""What the off-policy learners have in common: store transitions, then update from samples of them."""
+"""What the off-policy and offline learners have in common: store transitions, then update from samples of them."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -19,6 +19,8 @@ class ReplayLearner(Learner):
 
     A subclass fills `optimisers` and writes `update`; the other methods are there to be extended.
     """
+
+    modes: ClassVar[tuple[str, ...]] = ("train", "offline")
 
     optimisers: dict[str, torch.optim.Optimizer]
 
@@ -57,11 +59,23 @@ class ReplayLearner(Learner):
         if before < self.warmup_frames:
             self.start()
         self.explore(frames - self.warmup_frames)
-        due = int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
+        return self._updates(int(frames * self.updates_per_frame) - int(before * self.updates_per_frame))
+
+    def remember(self, batch: TensorDictBase, mask: Tensor) -> None:
+        """Store the transitions in `mask`."""
+        self.buffer.extend(self.transitions(batch)[mask])
+
+    def practise(self, num_updates: int) -> dict[str, float]:
+        """Make updates from what is stored."""
+        if int(self.frames) == int(self.updates) == 0:
+            self.start()
+        return self._updates(num_updates)
+
+    def _updates(self, num_updates: int) -> dict[str, float]:
         losses: dict[str, list[Tensor]] = {}
-        if due:
+        if num_updates:
             # One draw for all updates: the buffer's own overhead is as long as a forward pass.
-            for sample in self.buffer.sample(due * self.batch_size).split(self.batch_size):
+            for sample in self.buffer.sample(num_updates * self.batch_size).split(self.batch_size):
                 self.updates += 1
                 for name, value in self.update(sample).items():
                     losses.setdefault(name, []).append(value.detach())

@@ -1,0 +1,104 @@
+"""Implicit Q-learning: the value of the better part of the data's own presses, and a policy that imitates these.
+
+V(s) is an upper expectile of Q(s, k, x) over the presses in the data, Q follows r + gamma V(s'), and the policy weighs
+the presses' likelihood by exp(temperature * (Q - V)): nothing is ever asked of Q that the data doesn't hold.
+
+Source: Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q-Learning*, arXiv 2110.06169,
+equations 5 to 7.
+
+Differs from the source: a press is a key and its own parameters, so the policy is H-PPO's (Fan et al. 2019, arXiv
+1903.01344) and Q sees the pressed key's parameters alone, as in MP-DQN (Bester et al. 2019, arXiv 1905.04388).
+TorchRL's IQLLoss takes one action leaf, hence not the losses of this file.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Annotated, ClassVar
+
+import torch
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.nn import functional as F
+
+from hpamdp.policies.hybrid_actor import HybridActor, HybridPolicy
+from hpamdp.policies.nets import KeyCritics, mlp, move_towards
+from hpamdp.policies.replay import ReplayLearner
+from hpamdp.specs import PAMDPSpecs
+
+Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
+
+
+class IQL(ReplayLearner):
+    """Twin critics, an expectile of them, and an advantage-weighted policy, from a data set or a replay buffer."""
+
+    has_value: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
+        min_scale: PositiveFloat,
+        max_scale: PositiveFloat,
+        expectile: Annotated[float, Field(ge=0.5, lt=1.0)],
+        temperature: PositiveFloat,
+        max_weight: PositiveFloat,
+        gamma: Fraction,
+        tau: Fraction,
+        actor_lr: PositiveFloat,
+        critic_lr: PositiveFloat,
+        warmup_frames: NonNegativeInt,
+        buffer_size: PositiveInt,
+        batch_size: PositiveInt,
+        updates_per_frame: PositiveFloat,
+    ) -> None:
+        if not min_scale < max_scale:
+            raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
+        super().__init__(
+            specs,
+            device,
+            gamma=gamma,
+            warmup_frames=warmup_frames,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=updates_per_frame,
+        )
+        self.expectile, self.temperature, self.max_weight, self.tau = expectile, temperature, max_weight, tau
+        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
+        self.state_value = mlp(specs.observation_dim, hidden_dims, 1)
+        self.critics = KeyCritics(specs, 2, hidden_dims, is_multipass=True)
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.policy = HybridPolicy(self.actor, specs)
+        self.to(device)
+        self.optimisers = {
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
+            "state_value": torch.optim.Adam(self.state_value.parameters(), lr=critic_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
+        }
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return V(s), `[B]`."""
+        return self.state_value(observation).squeeze(-1)
+
+    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update V, then Q, then the policy from transitions `[batch_size]`."""
+        state, key, unit = sample["state"], sample["key"], sample["unit"]
+        with torch.no_grad():
+            q = self.target_critics.of_key(state, key, unit).amin(0)
+        excess = q - self.value(state)
+        value_loss = (torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile) * excess.square()).mean()
+        self.descend("state_value", value_loss)
+        with torch.no_grad():
+            advantage = q - self.value(state)
+            target = sample["reward"] + sample["discount"] * self.value(sample["next_state"])
+        critics = self.critics.of_key(state, key, unit)
+        critic_loss = F.mse_loss(critics, target.expand_as(critics))
+        self.descend("critics", critic_loss)
+        move_towards(self.target_critics, self.critics, self.tau)
+        weight = (self.temperature * advantage).exp().clamp(max=self.max_weight)
+        of_key, of_parameters = self.actor(state).log_prob(key, unit)
+        self.descend("actor", -(weight * (of_key + of_parameters)).mean())
+        return {"critic": critic_loss, "value": value_loss, "q": q.mean(), "advantage_weight": weight.mean()}
