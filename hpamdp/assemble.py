@@ -164,9 +164,11 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, RunC
         return cfg, settings, None
     file = checkpoint.find(source, where)
     saved = OmegaConf.create(checkpoint.progress_of(file)["config"])
+    for key in ("mode", "resume", "checkpoint"):  # what that run began with is no matter of this one
+        saved[key] = cfg[key]
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")
-        if key.split(".")[0] in ("high", "low", "agent", "experiment"):
+        if key.split(".")[0] in ("high", "low", "agent", "experiment", "search"):
             raise ConfigError(f"{override}: {where} takes the agent from {file}; leave this out")
         OmegaConf.update(saved, key, OmegaConf.select(cfg, key), merge=False)
     return saved, run_config(saved), file

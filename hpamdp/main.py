@@ -8,6 +8,8 @@ import os
 import re
 import sys
 import textwrap
+import uuid
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -23,9 +25,15 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from hpamdp import sweep
 from hpamdp.config import GROUPS, RUN_FILE, ConfigError, no_such, no_such_option
 
 _MISTAKE, _INTERRUPTED = 2, 130
+# Launchers and sweepers of packages of their own, and the extra of pyproject.toml that brings each.
+_EXTRAS = {
+    "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray"},
+    "hydra/sweeper": {"optuna": "optuna"},
+}
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
 
 _HELP = """\
@@ -47,7 +55,9 @@ Examples
   {program} mode=eval checkpoint=outputs/2025-01-31/12-00-00 eval.layouts=5000
       scores the agent of an earlier run
   {program} --multirun high=ucb,uniform seed=0,1,2 eval.every=50000
-      six runs one after another, in multirun/
+      six runs one after another, in multirun/; with hydra.sweep.dir=FOLDER a second start does what is left
+  {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
+      the same, two at a time; needs hpamdp[joblib]
 
   {program} low=hyar --cfg job     shows every value and option without running
   {program} --hydra-help           shows Hydra's own flags
@@ -66,11 +76,12 @@ def conf_dir() -> Path:
 def main() -> None:
     """Run the command line; exit with 0, 1 (a bug, with its traceback), 2 (a user's mistake) or 130 (interrupted)."""
     has_started = False
+    start = uuid.uuid4().hex
 
-    def job(cfg: DictConfig) -> None:
+    def job(cfg: DictConfig) -> float | None:
         nonlocal has_started
         has_started = True
-        _run_job(cfg)
+        return _run_job(cfg, start)
 
     # Hydra then raises what it would print, in several lines, itself.
     os.environ["HYDRA_FULL_ERROR"] = "1"
@@ -83,7 +94,14 @@ def main() -> None:
             print(help_page(conf))
             return
         _check_groups(arguments.overrides, conf)
-        hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
+        try:
+            hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
+            if not sweep.has_begun(start):
+                raise
+            sys.exit(sweep.report(start, error))
+        if sweep.has_begun(start):
+            sys.exit(sweep.report(start))
     except ConfigError as error:
         _exit_with(str(error))
     except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError) as error:
@@ -145,25 +163,24 @@ def _check_groups(words: list[str], conf: Path) -> None:
             )
 
 
-def _run_job(cfg: DictConfig) -> None:
-    """Run one job. A mistake of the user's or an interruption ends a sweep, too, at once."""
+def _run_job(cfg: DictConfig, start: str) -> float | None:
+    """Run one job; return its score if it is one of a sweep."""
+    job = HydraConfig.get()
+    if job.mode == RunMode.MULTIRUN:
+        return sweep.run_job(cfg, start)
     from hpamdp import train  # takes seconds, which --help need not wait for
 
-    job = HydraConfig.get()
     output_dir = Path(job.runtime.output_dir)
-    is_sweep = job.mode == RunMode.MULTIRUN
-    overrides = OmegaConf.to_container(job.overrides.task)
-    if is_sweep:
-        print(f"Job {job.job.num}: {' '.join(overrides)}", flush=True)
     try:
-        code = train.run(cfg, output_dir, overrides)
+        code = train.run(cfg, output_dir, OmegaConf.to_container(job.overrides.task))
     except ConfigError as error:
         # Not raised any further: Hydra would announce it in a line of its own.
         with suppress(OSError):
             output_dir.rmdir()  # Hydra made it; it stays if there is something in it
-        _exit_with(f"{' '.join(overrides)}: {error}" if is_sweep else str(error))
+        _exit_with(str(error))
     if code:
         sys.exit(code)
+    return None
 
 
 def _exit_with(mistake: str) -> NoReturn:
@@ -177,6 +194,8 @@ def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str
         return f"{error.override}: {_GRAMMAR}"
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
+        if group in _EXTRAS:
+            return _missing_plugin(group, name, error.options)
         return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted(error.options))}"
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
@@ -185,6 +204,12 @@ def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str
         if override.is_sweep_override() and not arguments.multirun:
             return f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
     return _wrong_key(overrides, conf) or _first_lines(error)
+
+
+def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
+    if name in _EXTRAS[group]:
+        return f"{group}={name}: not installed; pip install 'hpamdp[{_EXTRAS[group][name]}]'"
+    return f"{group}={name}: no such choice; there is {', '.join(sorted({*installed, *_EXTRAS[group]}))}"
 
 
 def _first_lines(error: Exception) -> str:
@@ -196,7 +221,7 @@ def _first_lines(error: Exception) -> str:
 
 def _wrong_key(overrides: list[Override], conf: Path) -> str | None:
     """Return what is wrong with the first override whose key is not in the config, if there is one."""
-    groups = [override for override in overrides if (conf / override.key_or_group).is_dir()]
+    groups = [o for o in overrides if "/" in o.key_or_group or (conf / o.key_or_group).is_dir()]
     others = [o for o in overrides if o not in groups and not o.is_add() and not o.is_force_add()]
     for choices in itertools.product(*map(_written_out, groups)):
         try:

@@ -18,13 +18,14 @@ from hpamdp.config import ConfigError, RunConfig
 from hpamdp.recorder import Recorder
 
 
-def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = ()) -> int:
+def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stopped_at: Path | None = None) -> int:
     """Train or score an agent as `cfg` says, write everything under `output_dir`, return the exit code.
 
     Args:
         cfg: the composed config.
         output_dir: a folder, made if need be.
         overrides: the command line's words, which change a resumed run's config.
+        stopped_at: the checkpoint of this very run, to go on from there.
 
     Raises:
         ConfigError: a value, a path or a pair of choices that cannot be.
@@ -34,8 +35,8 @@ def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = ()) -> int
     torch.manual_seed(settings.seed)
     parts = assemble(cfg, settings, output_dir)
     trainer = Trainer(cfg, settings, parts, output_dir)
-    if source is not None:
-        trainer.restore(source)
+    if stopped_at is not None or source is not None:
+        trainer.restore(stopped_at or source)
     output_dir.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
     is_interrupted = settings.mode == "train" and trainer.train()

@@ -73,7 +73,7 @@ def test_learners_and_selectors_know_neither_the_config_nor_the_agent():
 
 
 def test_hydra_wandb_and_minari_stay_in_their_rooms():
-    assert importers("hydra") <= {"hpamdp.main", "hpamdp.config"}
+    assert importers("hydra") <= {"hpamdp.main", "hpamdp.config", "hpamdp.sweep"}
     assert importers("wandb") <= {"hpamdp.metrics"}
     assert importers("minari") <= {"hpamdp.data.minari"}
 
