@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
+import signal
 import sys
+import threading
+import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from hpamdp.config import ConfigError
 
 _MISTAKE, _INTERRUPTED = 2, 130
+_PATIENCE_S = 30.0
 # What can become of a job; the first until it has ended.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
@@ -96,6 +101,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":
         os.environ.setdefault("TQDM_DISABLE", "1")  # the bars of jobs side by side overwrite each other
+        _stop_with_parent()
     folder = Path(job.folder)
     records.write(job)
     print(f"Job {job.number}: {job.overrides}", flush=True)
@@ -173,15 +179,29 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+@functools.cache  # once a process, which may run several jobs
+def _stop_with_parent() -> None:
+    """See to it that this process saves and stops when the one that started it is killed, which joblib does not."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while True:
+            time.sleep(1.0)
+            if os.getppid() != parent:
+                os.kill(os.getpid(), signal.SIGTERM)  # training saves on the first, and nothing survives the second
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out, such as a worker that has outlived the killed sweep it belongs to."""
+    """Keep other processes out; wait for those that are about to stop, the workers of a sweep that was killed."""
     file = folder / ".lock"
-    lock = FileLock(file)
+    lock = FileLock(file, timeout=_PATIENCE_S)
     try:
-        lock.acquire(blocking=False)
+        lock.acquire()
     except Timeout as error:
-        raise ConfigError("another process is still at work in its folder; start the sweep again later") from error
+        raise ConfigError("another process is at work in its folder; start the sweep again after it") from error
     try:
         yield
     finally:
