@@ -108,6 +108,10 @@ def main() -> None:
         if has_started:  # then it is not about the command line
             raise
         _exit_with(_explain(error, conf, arguments))
+    except RuntimeError as error:
+        if "srun" not in str(error):  # which submitit looks for
+            raise
+        _exit_with(f"hydra/launcher=submitit_slurm: {error}")
     except KeyboardInterrupt:
         sys.exit(_INTERRUPTED)
 

@@ -165,7 +165,7 @@ def test_an_experiment_sets_groups_and_values(tmp_path, monkeypatch):
 def test_every_yaml_value_has_a_comment_and_every_group_a_folder():
     for file in CONF.rglob("*.yaml"):
         assert file.read_text().startswith("#"), f"{file} does not say what it is"
-    assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, "experiment"}
+    assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, "experiment", "search"}
 
 
 def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):

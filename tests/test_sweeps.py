@@ -1,0 +1,256 @@
+"""Sweeps: what fails loses nothing else, what is finished is not repeated, what was stopped goes on."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+from conftest import CONF, choices, compose_config
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from hpamdp import train
+from hpamdp.assemble import CONTEXT
+from hpamdp.config import ConfigError, validate
+
+TINY = ["num_envs=32", "steps_per_batch=4", "eval.layouts=10", "eval.every=0", "log_every=0", "low=random"]
+
+
+def is_installed(package: str) -> bool:
+    try:
+        return bool(version(package))
+    except PackageNotFoundError:
+        return False
+
+
+def needs(package: str) -> pytest.MarkDecorator:
+    return pytest.mark.skipif(not is_installed(package), reason=f"{package} is not installed")
+
+
+@pytest.fixture
+def jobs(monkeypatch):
+    """Replace training by a function that writes what a run does; return what each run was started with."""
+    started = []
+
+    def run(cfg, folder, overrides, stopped_at=None):
+        started.append((cfg.seed, stopped_at))
+        OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+        if cfg.seed == 1:
+            raise ConfigError("these two\ndo not go together")
+        if cfg.seed == 2:
+            raise ZeroDivisionError("a bug")
+        frames = 5 if cfg.seed == 3 and stopped_at is None else cfg.total_frames
+        (folder / "checkpoint.zip").touch()
+        (folder / "summary.json").write_text(json.dumps({"score": float(cfg.seed), "frames": frames}))
+        return 130 if frames == 5 else 0
+
+    monkeypatch.setattr(train, "run", run)
+    return started
+
+
+def test_a_failing_job_loses_no_other_and_is_named_at_the_end(command, jobs, tmp_path):
+    code, out, err = command("-m", "seed=0,1,2,4", "high=fixed", "hydra.sweep.dir=sweep")
+    assert code == 1 and [seed for seed, _ in jobs] == [0, 1, 2, 4]
+    assert err.splitlines() == [
+        "seed=1 high=fixed: these two do not go together (sweep/1)",
+        "seed=2 high=fixed: ZeroDivisionError: a bug (sweep/2/error.txt)",
+    ]
+    assert "Traceback" in (tmp_path / "sweep/2/error.txt").read_text()
+    assert out.endswith("4 jobs: 2 finished; 1 refused; 1 failed\nBest score 4.000: seed=4 high=fixed (sweep/3)\n")
+    assert {path.name for path in (tmp_path / "sweep").iterdir()} == {"0", "1", "2", "3", "multirun.yaml"}
+
+
+def test_a_sweep_that_fails_by_mistakes_alone_exits_with_2(command, jobs):
+    assert command("-m", "seed=0,1", "hydra.sweep.dir=sweep")[0] == 2
+
+
+def test_a_sweep_started_again_does_what_is_left(command, jobs):
+    words = ["-m", "seed=0,3,4,2", "hydra.sweep.dir=sweep"]
+    code, out, _ = command(*words)
+    assert code == 130 and "To go on: the same command with hydra.sweep.dir=sweep\n" in out
+    jobs.clear()
+    code, out, err = command(*words)
+    assert code == 1 and err.startswith("seed=2: ZeroDivisionError") and err.count("\n") == 1
+    assert [seed for seed, _ in jobs] == [3, 4, 2]
+    assert [file and file.parts[-2:] for _, file in jobs] == [("1", "checkpoint.zip"), None, None]
+    assert "Job 0: skipped, finished before\n" in out and "Job 1: resumed and finished\n" in out
+    jobs.clear()
+    assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
+
+
+def test_the_results_of_another_config_stay_as_they_are(command, jobs, tmp_path):
+    command("-m", "seed=4", "hydra.sweep.dir=sweep")
+    before = {file: file.read_bytes() for file in (tmp_path / "sweep/0").iterdir()}
+    code, _, err = command("-m", "seed=5,6", "eval.layouts=7", "hydra.sweep.dir=sweep")
+    assert code == 2 and [seed for seed, _ in jobs] == [4, 6]
+    assert err.startswith(
+        "seed=5 eval.layouts=7: its folder has the results of another config, with seed=4 for 5 and 1 "
+    )
+    assert err.count("\n") == 1
+    assert {file: file.read_bytes() for file in (tmp_path / "sweep/0").iterdir()} == before
+
+
+def test_a_run_without_a_checkpoint_starts_afresh(command, jobs, tmp_path):
+    (tmp_path / "sweep/0").mkdir(parents=True)
+    (tmp_path / "sweep/0/config.yaml").write_text("seed: 9\n")
+    assert command("-m", "seed=4", "hydra.sweep.dir=sweep")[0] == 0
+    assert jobs == [(4, None)]
+
+
+def test_a_sweep_that_breaks_off_tells_the_jobs_it_leaves(command, jobs, monkeypatch):
+    from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+
+    launch = BasicLauncher.launch
+
+    def break_off(self, overrides, initial_job_idx):
+        launch(self, overrides[:1], initial_job_idx)
+        raise BrokenPipeError("a worker died")
+
+    monkeypatch.setattr(BasicLauncher, "launch", break_off)
+    code, out, err = command("-m", "seed=0,4", "hydra.sweep.dir=sweep")
+    assert (code, err) == (1, "The sweep broke off: BrokenPipeError: a worker died (sweep/error.txt)\n")
+    assert "1 jobs: 1 finished\n" in out and "hydra.sweep.dir=sweep" in out
+
+
+def sweep(folder: Path, *words: str) -> subprocess.Popen[str]:
+    environment = os.environ | {"PYTHONPATH": str(CONF.parent), "OMP_NUM_THREADS": "1"}
+    words = (str(CONF.parent / "run.py"), "-m", *TINY, *words, "hydra.sweep.dir=sweep")
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, *words], cwd=folder, env=environment, **pipes)
+
+
+def kill_once_there(process: subprocess.Popen[str], file: Path) -> None:
+    deadline = time.monotonic() + 120
+    while not file.exists():
+        assert process.poll() is None and time.monotonic() < deadline, process.communicate()
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+
+
+def frames_of(folder: Path) -> list[float]:
+    with (folder / "metrics.csv").open() as file:
+        return [float(row["frames"]) for row in csv.DictReader(file)]
+
+
+# Seed -1 is refused; the log rows tell a run that went on from one that began anew.
+STUDY = ["high=uniform,fixed", "seed=0,-1,1", "total_frames=16384", "checkpoint_every=1024", "log_every=1024"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "launcher",
+    [
+        [],
+        pytest.param(["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], marks=needs("hydra-joblib-launcher")),
+        pytest.param(["hydra/launcher=submitit_local"], marks=needs("hydra-submitit-launcher")),
+    ],
+    ids=["basic", "joblib", "submitit"],
+)
+def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path, launcher):
+    jobs = tmp_path / "sweep"
+    kill_once_there(sweep(tmp_path, *STUDY, *launcher), jobs / "2/checkpoint.zip")
+    second = sweep(tmp_path, *STUDY, *launcher)
+    out, err = second.communicate(timeout=300)
+    assert second.returncode == 2, err
+    failed = [line for line in err.splitlines() if "(sweep/" in line]
+    assert [" seed=-1: " in line for line in failed] == [True, True]
+    assert "resumed and finished" in out and "2 refused" in out
+    for job in (0, 2, 3, 5):
+        assert frames_of(jobs / str(job)) == [float(n) for n in range(0, 16385, 1024)]
+        assert json.loads((jobs / f"{job}/summary.json").read_text())["frames"] == 16384
+    assert not (jobs / "1").exists() and not (jobs / "4").exists()
+    finished = {job: (jobs / f"{job}/summary.json").stat().st_mtime_ns for job in (0, 2, 3, 5)}
+    third = sweep(tmp_path, *STUDY, *launcher)
+    out, _ = third.communicate(timeout=300)
+    assert "6 jobs: 4 skipped, finished before; 2 refused\n" in out and third.returncode == 2
+    assert finished == {job: (jobs / f"{job}/summary.json").stat().st_mtime_ns for job in (0, 2, 3, 5)}
+
+
+@pytest.mark.parametrize(
+    ("word", "package", "extra"),
+    [
+        ("hydra/launcher=joblib", "hydra-joblib-launcher", "joblib"),
+        ("hydra/launcher=submitit_local", "hydra-submitit-launcher", "slurm"),
+        ("hydra/launcher=submitit_slurm", "hydra-submitit-launcher", "slurm"),
+        ("hydra/launcher=ray", "hydra-ray-launcher", "ray"),
+        ("hydra/sweeper=optuna", "hydra-optuna-sweeper", "optuna"),
+        ("search=hppo", "hydra-optuna-sweeper", "optuna"),
+    ],
+)
+def test_a_missing_launcher_or_sweeper_is_told_with_its_extra(command, word, package, extra):
+    if is_installed(package):
+        pytest.skip(f"{package} is installed")
+    code, _, err = command("-m", word, "seed=0,1")
+    assert code == 2 and err.count("\n") == 1
+    assert err.endswith(f"not installed; pip install 'hpamdp[{extra}]'\n")
+
+
+def test_a_launcher_that_is_none_is_told_with_those_there_are(command):
+    code, _, err = command("-m", "hydra/launcher=jobli")
+    assert (code, err) == (
+        2,
+        "hydra/launcher=jobli: no such choice; there is basic, joblib, ray, submitit_local, submitit_slurm\n",
+    )
+
+
+@needs("hydra-submitit-launcher")
+def test_the_slurm_launcher_is_composed_with_its_options(command):
+    code, out, _ = command("hydra/launcher=submitit_slurm", "hydra.launcher.partition=long", "--cfg", "hydra")
+    assert code == 0 and "SlurmLauncher" in out and "partition: long" in out
+
+
+@needs("hydra-submitit-launcher")
+def test_a_missing_cluster_is_told_in_one_line(command, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    code, _, err = command("-m", "hydra/launcher=submitit_slurm", "seed=0,1")
+    assert code == 2 and err.count("\n") == 1 and err.startswith("hydra/launcher=submitit_slurm: ")
+
+
+@needs("hydra-optuna-sweeper")
+def test_a_search_maximises_the_score_skips_finished_trials_and_survives_failed_ones(command, monkeypatch, tmp_path):
+    tried = []
+
+    def run(cfg, folder, overrides, stopped_at=None):
+        tried.append(cfg.low.clip)
+        if len(tried) == 2:
+            raise ZeroDivisionError("a bug")
+        OmegaConf.save(cfg, folder / "config.yaml", resolve=True)
+        (folder / "summary.json").write_text(json.dumps({"score": cfg.low.clip, "frames": cfg.total_frames}))
+
+    monkeypatch.setattr(train, "run", run)
+    words = ["search=hppo", "hydra.sweep.dir=sweep"]
+    code, _, err = command(*words, "hydra.sweeper.n_trials=4")
+    assert code == 1 and "ZeroDivisionError: a bug (sweep/1/error.txt)" in err
+    best = OmegaConf.load(tmp_path / "sweep/optimization_results.yaml")
+    assert best.best_value == max(tried[:1] + tried[2:]) == best.best_params["low.clip"]
+    tried[:] = tried[1:2]  # the failed one, which fails once more
+    assert command(*words, "hydra.sweeper.n_trials=5")[0] == 1
+    assert len(tried) == 3 and tried[0] == tried[1]
+
+
+def values_of(word: str) -> list:
+    """Return the ends, or the choices, of what a search may give a value."""
+    override = OverridesParser.create().parse_overrides([word])[0]
+    assert override.is_sweep_override(), word
+    value = override.value()
+    return [value.start, value.end] if override.is_interval_sweep() else list(override.sweep_iterator())
+
+
+@pytest.mark.parametrize("name", [low for low in choices("low") if low not in ("random", "planner")])
+def test_every_learner_has_a_search_space_of_allowed_values(name):
+    space = OmegaConf.load(CONF / f"search/{name}.yaml").hydra.sweeper.params
+    node = compose_config([f"low={name}"]).low
+    assert len(space) >= 3
+    for key, word in space.items():
+        default = OmegaConf.select(node, key.removeprefix("low."), throw_on_missing=True)
+        values = values_of(f"{key}={word}")
+        assert default in values or min(values) <= default <= max(values), key
+        for value in values:
+            validate("low", OmegaConf.merge(node, {key.removeprefix("low."): value}), CONTEXT["low"])
