@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hpamdp.main import main
@@ -48,6 +49,7 @@ def command(tmp_path, monkeypatch, capsys):
     """Run the command line in an empty folder and return its exit code, its stdout and its stderr."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")  # so that what `main` sets is undone
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)  # and what Hydra does
 
     def run(*words: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["run.py", *words])
