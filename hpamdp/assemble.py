@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import inspect
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
@@ -20,15 +22,19 @@ from hpamdp.env.choice import ControllerChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.evaluate import Evaluation
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.base import Learner
 from hpamdp.specs import PAMDPSpecs
+
+if TYPE_CHECKING:
+    from hpamdp.collection.base import Collection
 
 # What the builder supplies; the rest of a constructor's arguments is the yaml's.
 CONTEXT = {
-    "env": ("num_envs", "device", "seed", "dtype", "oracle", "people"),
+    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "people"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "logger": ("output_dir", "config"),
+    "collector": ("cfg", "settings", "parts", "frames"),
 }
 
 
@@ -52,25 +58,43 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
     """
     classes = {group: validate(group, cfg[group], context)[0] for group, context in CONTEXT.items()}
     device = settings.resolve_device()
-    asked = _asked_of_env(cfg, classes) | {"device": device}
-    env = build("env", cfg.env, num_envs=settings.num_envs, seed=settings.seed, **asked)
+    env = make_env(cfg, settings.num_envs, device, settings.seed)
     specs = PAMDPSpecs.from_env(env)
     _check_levels(cfg, settings, env, classes)
-    selector = build("high", cfg.high, specs=specs, device=device) if specs.num_options else None
-    agent = _make_agent(cfg, settings, specs, selector, device)
+    _check_collector(cfg, settings, env, classes["collector"])
+    agent = make_agent(cfg, settings, specs, device)
     _check_values(cfg, agent)
     if settings.low.checkpoint is not None and settings.resume is None and settings.mode == "train":
         checkpoint.load_learners(checkpoint.find(settings.low.checkpoint, "low.checkpoint"), agent, device)
-    test_env = build("env", cfg.env, num_envs=settings.eval.layouts, seed=0, **asked)
+    test_env = make_env(cfg, settings.eval.layouts, device, seed=0)
     test_env.set_scaling_from(env)
     evaluation = Evaluation(_with_decisions(test_env, settings), settings.eval.seed)
-    policy = agent.policy
-    if settings.low.freeze:
-        env, policy = ControllerChoiceEnv(agent.router, env), agent.selector
     config = OmegaConf.to_container(cfg, resolve=True)
     logger = build("logger", cfg.logger, output_dir=output_dir, config=config)
-    gamma = 1.0 if selector is None else selector.gamma
-    return Parts(_with_decisions(env, settings, gamma), policy, evaluation, agent, logger, device)
+    return Parts(*acting(env, agent, settings), evaluation, agent, logger, device)
+
+
+def make_env(cfg: DictConfig, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:
+    """Build the environments from number `first_env` on, with all that the two levels need of them.
+
+    Those of a class without an argument `first_env` get a seed of their own.
+
+    Raises:
+        ConfigError: a wrong option, or something that this environment does not have.
+    """
+    classes = {group: validate(group, cfg[group], CONTEXT[group])[0] for group in ("env", "high", "low")}
+    if first_env > 0 and "first_env" not in inspect.signature(classes["env"].__init__).parameters:
+        seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
+    asked = _asked_of_env(cfg, classes)
+    return build("env", cfg.env, num_envs=num_envs, device=device, seed=seed, first_env=first_env, **asked)
+
+
+def acting(env: PAMDPEnv, agent: HierarchicalAgent, settings: RunConfig) -> tuple[TransformedEnv, TensorDictModuleBase]:
+    """Return the environment to train in, with its decisions tracked, and the policy that acts there."""
+    gamma, policy = 1.0 if agent.selector is None else agent.selector.gamma, agent.policy
+    if settings.low.freeze:
+        env, policy = ControllerChoiceEnv(agent.router, env), agent.selector
+    return _with_decisions(env, settings, gamma), policy
 
 
 def _asked_of_env(cfg: DictConfig, classes: dict[str, type | None]) -> dict[str, Any]:
@@ -123,9 +147,33 @@ def _check_values(cfg: DictConfig, agent: HierarchicalAgent) -> None:
         )
 
 
-def _make_agent(
-    cfg: DictConfig, settings: RunConfig, specs: PAMDPSpecs, selector: Selector | None, device: torch.device
-) -> HierarchicalAgent:
+def _check_collector(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, collection: type[Collection]) -> None:
+    name, num_workers = name_of(cfg.collector), cfg.collector.get("num_workers", 1)
+    if settings.mode == "eval":  # which collects nothing
+        return
+    if collection.package is not None and importlib.util.find_spec(collection.package) is None:
+        raise ConfigError(
+            f"collector={name}: {collection.package} is not installed; pip install hpamdp[{collection.package}]"
+        )
+    if settings.num_envs % num_workers:
+        raise ConfigError(
+            f"collector.num_workers={num_workers}: must divide num_envs={settings.num_envs}, of which each worker has "
+            "an equal share"
+        )
+    if num_workers > 1 and not env.is_divisible:
+        raise ConfigError(
+            f"collector={name}: env={name_of(cfg.env)} learns the scale of its observations from all environments "
+            "together; use collector=single or env.observation_scaling=bounds"
+        )
+
+
+def make_agent(cfg: DictConfig, settings: RunConfig, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:
+    """Build both levels, as they begin.
+
+    Raises:
+        ConfigError: a wrong option.
+    """
+    selector = build("high", cfg.high, specs=specs, device=device) if specs.num_options else None
     is_shared = settings.agent.sharing == "shared" and specs.num_options > 0
     learner_specs, num_learners = specs, max(1, specs.num_options)
     if is_shared:
@@ -163,7 +211,8 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, RunC
     if source is None:
         return cfg, settings, None
     file = checkpoint.find(source, where)
-    saved = OmegaConf.create(checkpoint.progress_of(file)["config"])
+    # Early runs chose no collector.
+    saved = OmegaConf.create({"collector": cfg.collector, **checkpoint.progress_of(file)["config"]})
     for key in ("mode", "resume", "checkpoint"):  # what that run began with is no matter of this one
         saved[key] = cfg[key]
     for override in overrides:

@@ -33,7 +33,7 @@ from pydantic import (
 if TYPE_CHECKING:
     import torch  # takes seconds, and the help page needs this module too
 
-GROUPS = ("env", "high", "low", "logger")
+GROUPS = ("env", "high", "low", "logger", "collector")
 RUN_FILE = "conf/config.yaml"
 # Entries of a class's part of the config that are not options of the class.
 _TARGET, _RUNS_OWN = "_target_", ("budget", "checkpoint", "freeze")

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, OmegaConf
-from torchrl.collectors import Collector
 from tqdm import tqdm
 
 from hpamdp import checkpoint
 from hpamdp.assemble import Parts, assemble, resolve
-from hpamdp.config import ConfigError, RunConfig
+from hpamdp.collection.base import Collection
+from hpamdp.config import ConfigError, RunConfig, build
 from hpamdp.recorder import Recorder
 
 
@@ -73,18 +73,13 @@ class Trainer:
     def train(self) -> bool:
         """Run until `total_frames`; return whether the user stopped it before. Either way the agent is saved."""
         settings = self.settings
+        context = {"cfg": self.cfg, "settings": settings, "parts": self.parts, "frames": self.frames}
+        collection = build("collector", self.cfg.collector, **context)
         unit = " decisions" if settings.low.freeze else " presses"
         bar = tqdm(total=settings.total_frames, initial=self.frames, unit=unit, unit_scale=True, mininterval=1.0)
-        collector = Collector(
-            self.parts.env,
-            self.parts.policy,
-            frames_per_batch=settings.num_envs * settings.steps_per_batch,
-            total_frames=-1,
-            auto_register_policy_transforms=False,
-        )
         previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # a cluster's stop is a Ctrl-C
         try:
-            self._loop(collector, bar)
+            self._loop(collection, bar)
             return False
         except KeyboardInterrupt:
             return True
@@ -92,22 +87,22 @@ class Trainer:
             # Nothing may cut the saving short.
             handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
             bar.close()
-            self.save()
-            collector.shutdown(close_env=False)
+            self.save(collection)
+            collection.close()
             signal.signal(signal.SIGINT, handlers[signal.SIGINT])
             signal.signal(signal.SIGTERM, previous)
 
-    def _loop(self, collector: Collector, bar: tqdm) -> None:
+    def _loop(self, collection: Collection, bar: tqdm) -> None:
         settings = self.settings
         wall_before, cpu_before = self.wall_s - time.perf_counter(), self.cpu_s - time.process_time()
         if self.frames == 0:
             self._log(bar, is_evaluated=True)
-        batches = iter(collector)
         while self.frames < settings.total_frames:
-            batch = next(batches)
+            batch = collection.next()
             self.recorder.take(batch, self.parts.agent.learn(batch))
             last, self.frames = self.frames, self.frames + batch.numel()
-            self.wall_s, self.cpu_s = wall_before + time.perf_counter(), cpu_before + time.process_time()
+            self.wall_s = wall_before + time.perf_counter()
+            self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
             bar.update(batch.numel())
             is_over = self.frames >= settings.total_frames
             if is_over or _is_due(last, self.frames, settings.eval.every):
@@ -115,7 +110,7 @@ class Trainer:
             elif _is_due(last, self.frames, settings.log_every):
                 self._log(bar, is_evaluated=False)
             if not is_over and _is_due(last, self.frames, settings.checkpoint_every):
-                self.save()
+                self.save(collection)
 
     def _log(self, bar: tqdm, is_evaluated: bool) -> None:
         row = self.recorder.log(self.frames, self.wall_s, is_evaluated)
@@ -123,7 +118,7 @@ class Trainer:
             success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
             bar.set_postfix_str(f"score {row['eval/score']:.2f}{success}")
 
-    def save(self) -> None:
+    def save(self, collection: Collection) -> None:
         """Write the checkpoint."""
         progress = {
             "config": OmegaConf.to_container(self.cfg, resolve=True),
@@ -132,7 +127,7 @@ class Trainer:
             "cpu_s": self.cpu_s,
         }
         path = self.output_dir / checkpoint.FILE_NAME
-        checkpoint.save(path, self.parts.agent, self.parts.env.state_columns(), progress)
+        checkpoint.save(path, self.parts.agent, collection.state_columns(), progress)
 
 
 def _is_due(before: int, now: int, every: int) -> bool:

@@ -38,6 +38,11 @@ class PAMDPEnv(EnvBase):
         return keys.OPTION in self.full_action_spec.keys()
 
     @property
+    def is_divisible(self) -> bool:
+        """Whether several processes can each step a share of the environments: these learn nothing from one another."""
+        return True
+
+    @property
     def position(self) -> Tensor | None:
         """Where the agents are, for drawing, `[N, 2]`; None where that means nothing."""
         return None
@@ -82,7 +87,7 @@ class PAMDPEnv(EnvBase):
         return {}
 
     def state_columns(self) -> dict[str, Tensor]:
-        """Return all that an episode's future depends on, for a checkpoint; empty where that cannot be had."""
+        """Return what episodes' future depends on, each `[N, ...]`, for a checkpoint; empty where it cannot be had."""
         return {}
 
     def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:

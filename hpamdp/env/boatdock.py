@@ -54,6 +54,7 @@ class BoatDockEnv(PAMDPEnv):
         people: also write people's shares of the options under `people` (`option` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
+        first_env: number of the first boat, where other processes have those before.
 
     `reset` also takes layouts to play: a tensordict with `start` and `goal` `[N, 2]` in screen px and, optionally,
     `controller` and `keymap` int `[N]`.
@@ -84,6 +85,7 @@ class BoatDockEnv(PAMDPEnv):
         people: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
+        first_env: int = 0,
     ) -> None:
         each = (motor_noise, motor_noise) if isinstance(motor_noise, int | float) else tuple(motor_noise)
         rules = Rules(controller, keymap, reward, observation, each, sensor_noise, slip)
@@ -97,7 +99,7 @@ class BoatDockEnv(PAMDPEnv):
                 torch.compile(function, **episode.COMPILE_ARGUMENTS)
                 for function in (episode.step, episode.reset, episode.read)
             )
-        self._environment = torch.arange(num_envs, dtype=torch.int32, device=self.device)
+        self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
         self._has_people, self._oracle = people, None
         if people:

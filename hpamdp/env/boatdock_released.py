@@ -48,6 +48,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         dtype: `float32` or `float64`, of what is computed and given; durations are rounded in float32 always.
         device: where the boats live.
         seed: of layouts and key maps; the global generators are neither read nor moved.
+        first_env: number of the first boat, where other processes have those before.
 
     `reset` also takes layouts to play, and keep: a tensordict with `start` and `goal` `[N, 2]` in screen px and, for
     the incongruent boat, optionally `keymap` int `[N]`.
@@ -72,6 +73,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         dtype: Literal["float32", "float64"] = "float32",
         device: torch.device | str | None = "cpu",
         seed: int = 0,
+        first_env: int = 0,
     ) -> None:
         for name, value, allowed in (
             ("controller", controller, tuple(released.DIRECTIONS)),
@@ -92,7 +94,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         self.controller, self.keymap, self.test_mode = controller, keymap, test_mode
         self.frozen_layouts, self.is_scaled = frozen_layouts, observation == "scaled"
         self._directions = torch.tensor(released.DIRECTIONS[controller], dtype=self.float_type, device=self.device)
-        self._environment = torch.arange(num_envs, dtype=torch.int32, device=self.device)
+        self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
         self._set_seed(seed)
 

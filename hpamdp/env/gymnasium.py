@@ -47,6 +47,7 @@ class GymnasiumEnv(PAMDPEnv):
         observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
         device: where the tensors live.
         seed: see above.
+        first_env: number of the first copy, where other processes have those before.
 
     Raises:
         ValueError: an argument, a space or an action that cannot be; after such an action no copy has moved.
@@ -66,10 +67,11 @@ class GymnasiumEnv(PAMDPEnv):
         observation_scaling: Scaling = "bounds",
         device: torch.device | str | None = "cpu",
         seed: int = 0,
+        first_env: int = 0,
     ) -> None:
         _check_arguments(num_envs, id, entry_point, max_steps)
         super().__init__(device=device, batch_size=[num_envs])
-        self.num_envs = num_envs
+        self.num_envs, self.first_env = num_envs, first_env
         self._name = f"GymnasiumEnv: {id if entry_point is None else entry_point}"
         self.envs = [self._make(id, entry_point, kwargs or {}, max_steps) for _ in range(num_envs)]
         self.is_closed = False  # from here on there is something to close
@@ -89,6 +91,11 @@ class GymnasiumEnv(PAMDPEnv):
         self._tells_success = False
         self._set_seed(seed)
 
+    @property
+    def is_divisible(self) -> bool:
+        """Whether no running statistics are kept."""
+        return self.observations.statistics is None
+
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return seeds to `reset` with, one for each copy, other than those with which training begins."""
         seeds = torch.tensor(_seeds(seed, self.num_envs, _FIXED), device=self.device)
@@ -96,6 +103,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]`, if the info of any step so far told it."""
+        self._tells_success |= bool(last.get(_SUCCESS).any())  # steps in another process
         return {_SUCCESS: last.get(_SUCCESS)} if self._tells_success else {}
 
     def set_scaling_from(self, other: GymnasiumEnv) -> None:
@@ -174,7 +182,9 @@ class GymnasiumEnv(PAMDPEnv):
         self.done_spec = self.make_done_spec()
 
     def _set_seed(self, seed: int | None) -> None:
-        self._next_seeds: list[int | None] = [*_seeds(0 if seed is None else seed, self.num_envs, _TRAINING)]
+        self._next_seeds: list[int | None] = [
+            *_seeds(0 if seed is None else seed, self.num_envs, _TRAINING, self.first_env)
+        ]
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         tensordict = self._asked_of_reset(tensordict)
@@ -255,9 +265,10 @@ def _check_arguments(num_envs: int, id: str | None, entry_point: str | None, max
         raise ValueError(f"GymnasiumEnv: max_steps={max_steps}, but must be at least 1 or null")
 
 
-def _seeds(seed: int, num: int, stream: int) -> list[int]:
-    """Return a seed for each of `num` copies, in 31 bits, which every generator takes."""
-    return [int(np.random.SeedSequence((seed, row, stream)).generate_state(1)[0] >> 1) for row in range(num)]
+def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:
+    """Return a seed for each of `num` copies from number `first` on, in 31 bits, which every generator takes."""
+    rows = range(first, first + num)
+    return [int(np.random.SeedSequence((seed, row, stream)).generate_state(1)[0] >> 1) for row in rows]
 
 
 def _rows(mask: Tensor) -> np.ndarray:

@@ -78,10 +78,10 @@ class PlatformEnv(PAMDPEnv):
         max_steps: actions after which an episode is truncated; gym-platform has 200.
         noise: factor on the published noise of jumps, of the agent's speed and of the enemies'; 0 is none.
         device: where the courses live.
-        seed: of the noise; the global generators are neither read nor moved.
-
-    Nothing else is random, so `fixed_episodes` is None: `set_seed` and `reset` fix an evaluation's episodes. With the
-    seed of training they have the noise of training's first episodes, which no observation tells beforehand.
+        seed: of the noise; the global generators are neither read nor moved. Nothing else is random, so
+            `fixed_episodes` is None: `set_seed` and `reset` fix an evaluation's episodes. With the seed of training
+            they have the noise of training's first episodes, which no observation tells beforehand.
+        first_env: number of the first course, where other processes have those before.
 
     Raises:
         ValueError: an argument or action that is out of range; the agents are left as they were.
@@ -99,6 +99,7 @@ class PlatformEnv(PAMDPEnv):
         noise: float = 1.0,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
+        first_env: int = 0,
     ) -> None:
         for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
             if value < 1:
@@ -107,7 +108,7 @@ class PlatformEnv(PAMDPEnv):
             raise ValueError(f"PlatformEnv: noise={noise}, but must be a finite number of at least 0")
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs, self.max_steps, self.noise = num_envs, max_steps, noise
-        self._environment = torch.arange(num_envs, dtype=torch.int32, device=self.device)
+        self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         self._parameter_high = torch.tensor(PARAMETER_HIGH, device=self.device)
         self._make_specs()
         self._set_seed(seed)
