@@ -43,9 +43,10 @@ class RayCollection(WorkerCollection):
         # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
         own = {"address": "local", "num_cpus": len(shares), "include_dashboard": False}
         init = own if self.address is None else {"address": self.address}
-        with children_without(signal.SIGINT), warnings.catch_warnings():
-            # It misses weights that it could send; `receive` does.
-            warnings.filterwarnings("ignore", category=UserWarning, module="torchrl")
+        # It misses weights to send; `receive` is there for them.
+        for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
+            warnings.filterwarnings("ignore", message=warning)
+        with children_without(signal.SIGINT):
             return RayCollector(
                 [share.make_env for share in shares],
                 policy_factory=[share.make_policy for share in shares],

@@ -82,7 +82,8 @@ class Share:
         if self.low is not None:
             unpack(agent.router, self.low)
         env = make_env(cfg, self.num_envs, _CPU, settings.seed, self.first_env)
-        env.set_state_columns(self.columns)
+        if self.columns:
+            env.set_state_columns(self.columns)
         return acting(env, agent, settings)[0]
 
     def make_policy(self) -> PolicyCopy:

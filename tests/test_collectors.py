@@ -1,0 +1,261 @@
+"""Collection beyond one process: the same batches, the learner's weights, and nothing left running."""
+
+import importlib.util
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+from conftest import CONF, choices, compose_config
+
+from hpamdp.assemble import assemble
+from hpamdp.collection.worker import PolicyCopy, Share, packed
+from hpamdp.config import ConfigError, build, run_config
+from hpamdp.recorder import Recorder
+from hpamdp.train import run
+
+SMALL = ["num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=hppo", "low.minibatch_size=16"]
+BOATS = ["start_x", "start_y", "goal_x", "goal_y", "episode"]
+GYMNASIUM = ["env.id=hpamdp/BoatDock-v0", "env.kwargs={controller:congruent}", "env.max_steps=9"]
+WORKERS = [
+    "multi",
+    pytest.param(
+        "ray",
+        marks=[
+            pytest.mark.slow,
+            pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray"),
+        ],
+    ),
+]
+
+
+def make(folder, *overrides):
+    cfg = compose_config([*SMALL, *overrides])
+    settings = run_config(cfg)
+    parts = assemble(cfg, settings, folder)
+    return parts, build("collector", cfg.collector, cfg=cfg, settings=settings, parts=parts, frames=0)
+
+
+def share(folder, *overrides, first_env=0, num_envs=8, low=None, columns=None):
+    cfg = compose_config([*SMALL, *overrides])
+    specs = assemble(cfg, run_config(cfg), folder).agent.specs
+    return Share(cfg, specs, first_env, num_envs, exploration_seed=0, columns=columns or {}, low=low)
+
+
+def leaves(batch):
+    return {name: (leaf.shape, leaf.dtype) for name, leaf in batch.items(True, True)}
+
+
+def assert_same_state(one, other):
+    assert list(one) == list(other)
+    for name, value in one.items():
+        if torch.is_tensor(value):
+            torch.testing.assert_close(value, other[name], rtol=0.0, atol=0.0)
+
+
+@pytest.fixture(scope="module", params=WORKERS)
+def workers(request, tmp_path_factory):
+    parts, collection = make(tmp_path_factory.mktemp(request.param), f"collector={request.param}")
+    yield parts, collection
+    collection.close()
+    assert not multiprocessing.active_children()
+
+
+def test_workers_give_the_batches_of_a_single_process(workers, tmp_path):
+    collection = workers[1]
+    _, single = make(tmp_path, "collector=single")
+    batch, expected = collection.next(), single.next()
+    assert batch.shape == expected.shape == (8, 4)
+    assert leaves(batch) == leaves(expected)
+    # The same boats in the same order, no two of them alike.
+    start = batch["observation"][:, 0]
+    torch.testing.assert_close(start, expected["observation"][:, 0])
+    assert len(start.unique(dim=0)) == 8
+
+
+def test_the_next_batch_goes_on_where_the_last_one_ended(workers):
+    collection = workers[1]
+    last, following = collection.next(), collection.next()
+    is_on = ~last["next", "done"][:, -1, 0]
+    assert is_on.any()
+    assert torch.equal(last["next", "observation"][:, -1][is_on], following["observation"][:, 0][is_on])
+    columns = collection.state_columns()
+    assert all(len(column) == 8 for column in columns.values())
+    # Scaled observations end in goal - boat, px over the harbour's radius.
+    offset = following["next", "observation"][:, -1, -2:]
+    scale = (columns["goal_x"] - columns["x"]) / offset[:, 0]
+    is_on = ~following["next", "done"][:, -1, 0]
+    torch.testing.assert_close(scale[is_on], scale[is_on][:1].expand(int(is_on.sum())), rtol=1e-3, atol=0.0)
+
+
+def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
+    parts, collection = workers
+    before = {name: value.clone() for name, value in parts.policy.state_dict().items() if torch.is_tensor(value)}
+    for _ in range(3):
+        parts.agent.learn(collection.next())
+    now = parts.policy.state_dict()
+    assert any(not torch.equal(value, now[name]) for name, value in before.items())
+    collection.next()
+    for theirs in collection._call("policy.policy.state_dict"):
+        assert_same_state(now, theirs)
+    assert collection.cpu_s > 0.0
+
+
+@pytest.mark.parametrize("low", choices("low"))
+def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
+    warmup = ["low.warmup_frames=8"] if low in ("hyar", "hsac", "pdqn", "qpamdp") else []
+    warmup += ["low.codec_pretrain_updates=2"] if low == "hyar" else []
+    cfg = compose_config(["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "high=ucb", f"low={low}", *warmup])
+    parts = assemble(cfg, run_config(cfg), tmp_path)
+    collection = build("collector", cfg.collector, cfg=cfg, settings=run_config(cfg), parts=parts, frames=0)
+    torch.manual_seed(1)
+    copy = Share(cfg, parts.agent.specs, 0, 8, exploration_seed=1, columns={}, low=None).make_policy()
+    for _ in range(2):
+        parts.agent.learn(collection.next())
+    assert copy.receive(packed(parts.policy)) > 0.0
+    assert_same_state(parts.policy.state_dict(), copy.policy.state_dict())
+    batch = collection.next()[:, 0].select(*parts.policy.in_keys, strict=False)
+    torch.manual_seed(2)
+    expected = parts.policy(batch.clone())
+    torch.manual_seed(2)
+    acted = copy(batch.clone())
+    for name, leaf in expected.items(True, True):
+        torch.testing.assert_close(acted[name], leaf, equal_nan=True, msg=str(name))
+
+
+@pytest.mark.parametrize("env", ["boatdock", "boatdock_released", "platform", "gymnasium"])
+def test_shares_together_are_the_environments_of_a_single_process(env, tmp_path):
+    of_env = {
+        "boatdock": ["high=ucb", "env.sensor_noise=1"],
+        "boatdock_released": ["high=none", "env.frozen_layouts=false"],
+        "platform": ["high=none"],
+        "gymnasium": ["high=none", *GYMNASIUM],
+    }
+    overrides = [f"env={env}", *of_env[env]]
+    whole = share(tmp_path, *overrides).make_env()
+    halves = [share(tmp_path, *overrides, first_env=first, num_envs=4).make_env() for first in (0, 4)]
+    torch.manual_seed(0)
+    actions = whole.rand_action(whole.reset()).select(*whole.action_keys)
+    starts = [half.reset() for half in halves]
+    expected = whole.step(whole.reset().update(actions))
+    acted = torch.cat([h.step(h.reset().update(a)) for h, a in zip(halves, actions.split(4), strict=True)])
+    assert starts[0].shape == (4,)
+    for name in ("observation", "reward"):
+        torch.testing.assert_close(acted["next", name], expected["next", name])
+
+
+def test_a_share_goes_on_where_its_environments_stood(tmp_path):
+    env = share(tmp_path, first_env=4, num_envs=4).make_env()
+    env.reset()
+    columns = env.state_columns()
+    again = share(tmp_path, first_env=4, num_envs=4, columns=columns).make_env()
+    again.reset()
+    assert again.state_columns()["episode"].tolist() == [1] * 4
+    env.reset()
+    for name in BOATS:
+        assert torch.equal(again.state_columns()[name], env.state_columns()[name])
+
+
+def test_a_frozen_presser_goes_with_the_share(tmp_path):
+    cfg = compose_config([*SMALL, "high=ucb", "low.freeze=true"])
+    parts = assemble(cfg, run_config(cfg), tmp_path)
+    torch.manual_seed(5)
+    work = share(tmp_path, "high=ucb", "low.freeze=true", low=packed(parts.agent.router))
+    env, policy = work.make_env(), work.make_policy()
+    policy.receive(packed(parts.policy))
+    one, other = parts.env.reset(), env.reset()
+    option = torch.tensor([0, 1] * 4)
+    one, other = parts.env.step(one.set("option", option)), env.step(other.set("option", option))
+    torch.testing.assert_close(one["next", "reward"], other["next", "reward"])
+    assert isinstance(policy, PolicyCopy) and policy.out_keys == ["option"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["collector=multi", "collector.num_workers=3"], "collector.num_workers=3: must divide num_envs=8"),
+        (["collector=multi", "collector.num_workers=16"], "collector.num_workers=16: must divide num_envs=8"),
+        (["collector=multi", "collector.num_workers=0"], "collector.num_workers=0"),
+        (
+            [
+                *("collector=multi", "high=none", "env=gymnasium", *GYMNASIUM),
+                "env.observation_scaling=running",
+            ],
+            "collector=multi: env=gymnasium learns the scale",
+        ),
+    ],
+)
+def test_what_workers_cannot_do_is_refused(overrides, message, tmp_path):
+    with pytest.raises(ConfigError, match=message):
+        run(compose_config([*SMALL, *overrides]), tmp_path)
+
+
+def test_a_missing_ray_is_told_with_its_cure(monkeypatch, tmp_path):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
+    with pytest.raises(ConfigError, match=r"collector=ray: ray is not installed; pip install hpamdp\[ray\]"):
+        run(compose_config([*SMALL, "collector=ray"]), tmp_path)
+
+
+@pytest.mark.slow
+def test_when_a_worker_dies_the_run_fails_with_its_agent_saved_and_no_process_left(tmp_path, monkeypatch):
+    others = multiprocessing.active_children()
+
+    def take(self, batch, scalars):
+        os.kill(next(child.pid for child in multiprocessing.active_children() if child not in others), signal.SIGKILL)
+
+    monkeypatch.setattr(Recorder, "take", take)
+    with pytest.raises((RuntimeError, OSError, EOFError)):
+        run(compose_config([*SMALL, "collector=multi", "total_frames=4096"]), tmp_path)
+    assert (tmp_path / "checkpoint.zip").is_file()
+    assert not set(multiprocessing.active_children()) - set(others)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", WORKERS)
+def test_a_terminals_ctrl_c_stops_all_processes_and_the_run_goes_on_in_one(collector, tmp_path):
+    command = [sys.executable, str(CONF.parent / "run.py"), f"collector={collector}", *SMALL, "total_frames=100000000"]
+    folder = f"hydra.run.dir={tmp_path}"
+    # A session of its own is what a terminal gives: the signal goes to all of its processes.
+    process = subprocess.Popen([*command, "log_every=32", folder], start_new_session=True, cwd=tmp_path)
+    metrics = tmp_path / "metrics.csv"
+    for _ in range(1200):
+        if metrics.is_file() and len(metrics.read_text().splitlines()) > 3:
+            break
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(60) == 130
+    for _ in range(50):
+        if not processes_of(process.pid):
+            break
+        time.sleep(0.1)
+    assert not processes_of(process.pid)
+    frames = len(metrics.read_text().splitlines())
+    overrides = [f"resume={tmp_path}", "collector=single", "total_frames=32"]
+    assert run(compose_config(overrides), tmp_path / "resumed", overrides) == 0 and frames > 3
+
+
+def processes_of(session):
+    """Return the processes of a session, whatever their parents."""
+    listed = subprocess.run(["ps", "-eo", "sid=,pid=,stat="], capture_output=True, text=True, check=True).stdout
+    rows = [line.split() for line in listed.splitlines()]
+    return [pid for sid, pid, state in rows if int(sid) == session and not state.startswith("Z")]
+
+
+@pytest.mark.slow
+def test_two_workers_learn_as_well_as_one_process(tmp_path):
+    scores = {}
+    for collector in ("single", "multi"):
+        overrides = [
+            *("high=none", "low=hppo", "env.controller=congruent", f"collector={collector}"),
+            *("total_frames=300000", "eval.every=0", "eval.layouts=500"),
+        ]
+        run(compose_config(overrides), tmp_path / collector)
+        rows = (tmp_path / collector / "metrics.csv").read_text().splitlines()
+        scores[collector] = float(rows[-1].split(",")[rows[0].split(",").index("eval/score")])
+    assert min(scores.values()) > 2.8
+    assert scores["multi"] == pytest.approx(scores["single"], abs=0.25)
