@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Sequence
+from multiprocessing import resource_tracker
 
 from omegaconf import DictConfig
 from pydantic import PositiveInt
@@ -24,6 +25,8 @@ class MultiCollection(WorkerCollection):
         super().__init__(cfg, settings, parts, frames, num_workers)
 
     def _start(self, shares: Sequence[Share], settings: RunConfig) -> MultiSyncCollector:
+        # multiprocessing unblocks the signals when it starts this helper of its own.
+        resource_tracker.ensure_running()
         # A terminal sends its Ctrl-C, and a cluster its stop, to every process of a run.
         with children_without(signal.SIGINT, signal.SIGTERM):
             return MultiSyncCollector(
