@@ -223,11 +223,13 @@ def test_success_is_what_the_infos_say():
         for _ in range(2):
             last = step(env)
         assert last["success"].tolist() == [env is telling, False]
-    assert silent.results(last) == {}
+    assert silent.results(last.clone().fill_("success", False)) == {}
     assert telling.results(last)["success"].tolist() == [True, False]
     assert step(telling)["success"].tolist() == [True, False]
     assert telling.reset()["success"].tolist() == [False, False]
     assert set(GymnasiumEnv.result_keys) <= set(last.keys())
+    # What other processes' copies told: this one has never been stepped.
+    assert make(2).results(last)["success"].tolist() == [True, False]
 
 
 def test_closing_closes_every_copy():
