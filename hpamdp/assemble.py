@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
@@ -33,6 +34,7 @@ CONTEXT = {
     "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "people"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
+    "data": ("env",),
     "logger": ("output_dir", "config"),
     "collector": ("cfg", "settings", "parts", "frames"),
 }
@@ -47,6 +49,7 @@ class Parts:
     evaluation: Evaluation
     agent: HierarchicalAgent
     logger: Any
+    data: TensorDict | None  # others' presses `[1, M]` to learn from
     device: torch.device
 
 
@@ -64,14 +67,19 @@ def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
     _check_collector(cfg, settings, env, classes["collector"])
     agent = make_agent(cfg, settings, specs, device)
     _check_values(cfg, agent)
-    if settings.low.checkpoint is not None and settings.resume is None and settings.mode == "train":
+    _check_data(cfg, settings, classes)
+    # Who goes on or is only scored has learned from it already.
+    is_new = settings.mode != "eval" and settings.resume is None
+    demonstrations = build("data", cfg.data, env=env) if is_new else None
+    data = None if demonstrations is None else demonstrations.batch
+    if settings.low.checkpoint is not None and settings.resume is None and settings.mode != "eval":
         checkpoint.load_learners(checkpoint.find(settings.low.checkpoint, "low.checkpoint"), agent, device)
     test_env = make_env(cfg, settings.eval.layouts, device, seed=0)
     test_env.set_scaling_from(env)
     evaluation = Evaluation(_with_decisions(test_env, settings), settings.eval.seed)
     config = OmegaConf.to_container(cfg, resolve=True)
     logger = build("logger", cfg.logger, output_dir=output_dir, config=config)
-    return Parts(*acting(env, agent, settings), evaluation, agent, logger, device)
+    return Parts(*acting(env, agent, settings), evaluation, agent, logger, data, device)
 
 
 def make_env(cfg: DictConfig, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:
@@ -138,6 +146,22 @@ def _check_levels(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, classes: 
         raise ConfigError(
             f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
         )
+
+
+_SOURCES = {"train": "its own presses", "offline": "data sets"}  # by the mode of a run
+
+
+def _check_data(cfg: DictConfig, settings: RunConfig, classes: dict[str, type | None]) -> None:
+    low, modes = name_of(cfg.low), classes["low"].modes
+    can = f"low={low} learns from {' and '.join(_SOURCES[mode] for mode in modes)}"
+    if settings.mode == "train" and "train" not in modes:
+        raise ConfigError(f"mode=train: {can} only; use mode=offline data=human, or another low")
+    if settings.mode == "offline" and classes["data"] is None:
+        raise ConfigError("mode=offline: data=none leaves nothing to learn from; use data=human")
+    if settings.mode != "eval" and classes["data"] is not None and "offline" not in modes:
+        raise ConfigError(f"data={name_of(cfg.data)}: {can} only; use data=none, or another low")
+    if settings.mode == "offline" and settings.low.freeze:
+        raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
 
 
 def _check_values(cfg: DictConfig, agent: HierarchicalAgent) -> None:
@@ -211,8 +235,13 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, RunC
     if source is None:
         return cfg, settings, None
     file = checkpoint.find(source, where)
-    # Early runs chose no collector.
-    saved = OmegaConf.create({"collector": cfg.collector, **checkpoint.progress_of(file)["config"]})
+    # Early runs chose no collector and no data.
+    later = {"collector": cfg.collector, "data": {"_target_": None}, "offline": cfg.offline}
+    saved = OmegaConf.create(later | checkpoint.progress_of(file)["config"])
+    if settings.resume is not None and settings.mode != saved.mode:
+        raise ConfigError(
+            f"resume={source}: a run with mode={saved.mode}; resume it so, or start one with low.checkpoint={source}"
+        )
     for key in ("mode", "resume", "checkpoint"):  # what that run began with is no matter of this one
         saved[key] = cfg[key]
     for override in overrides:

@@ -33,7 +33,8 @@ from pydantic import (
 if TYPE_CHECKING:
     import torch  # takes seconds, and the help page needs this module too
 
-GROUPS = ("env", "high", "low", "logger", "collector")
+GROUPS = ("env", "high", "low", "data", "logger", "collector")
+_CAN_BE_NONE = ("high", "data")
 RUN_FILE = "conf/config.yaml"
 # Entries of a class's part of the config that are not options of the class.
 _TARGET, _RUNS_OWN = "_target_", ("budget", "checkpoint", "freeze")
@@ -72,6 +73,15 @@ class AgentConfig(BaseModel):
     option_length: Literal["episode"] | PositiveInt
 
 
+class OfflineConfig(BaseModel):
+    """How much is learned from a data set alone."""
+
+    model_config = _STRICT
+
+    updates: PositiveInt
+    eval_every: NonNegativeInt
+
+
 class StartConfig(BaseModel):
     """Where the learners begin."""
 
@@ -86,7 +96,7 @@ class RunConfig(BaseModel):
 
     model_config = _STRICT
 
-    mode: Literal["train", "eval"]
+    mode: Literal["train", "offline", "eval"]
     seed: Seed
     device: Annotated[str, AfterValidator(_check_device)]
     threads: Annotated[int, Field(ge=1, le=1024)]
@@ -96,10 +106,16 @@ class RunConfig(BaseModel):
     num_envs: PositiveInt
     steps_per_batch: PositiveInt
     log_every: NonNegativeInt
+    offline: OfflineConfig
     eval: EvalConfig
     checkpoint_every: NonNegativeInt
     checkpoint: str | None
     resume: str | None
+
+    @property
+    def num_frames(self) -> int:
+        """How long the run is to train: in updates with mode=offline, else in presses or decisions."""
+        return self.offline.updates if self.mode == "offline" else self.total_frames
 
     def resolve_device(self) -> torch.device:
         """Return the device to run on.
@@ -134,10 +150,10 @@ def run_config(cfg: DictConfig) -> RunConfig:
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
     if run.mode == "eval" and run.checkpoint is None:
         raise ConfigError("checkpoint: missing; mode=eval needs the output folder of a run")
-    if run.mode == "train" and run.checkpoint is not None:
+    if run.mode != "eval" and run.checkpoint is not None:
         raise ConfigError("checkpoint: goes with mode=eval only; to go on with a run, set resume")
     if run.mode == "eval" and run.resume is not None:
-        raise ConfigError("resume: goes with mode=train only; to score an agent, set checkpoint")
+        raise ConfigError("resume: goes with mode=train and mode=offline; to score an agent, set checkpoint")
     return run
 
 
@@ -150,7 +166,7 @@ def validate(group: str, node: Any, context_names: Iterable[str] = ()) -> tuple[
         context_names: constructor arguments that the program gives, which no yaml may.
 
     Returns:
-        The class and its options; None and no options for `high=none`, where nothing chooses.
+        The class and its options; None and no options for `high=none`, where nothing chooses, and `data=none`.
 
     Raises:
         ConfigError: all that is wrong with this group, in one line.
@@ -159,8 +175,8 @@ def validate(group: str, node: Any, context_names: Iterable[str] = ()) -> tuple[
     for name in _RUNS_OWN:
         options.pop(name, None)
     target = options.pop(_TARGET, None)
-    # Only the selector can be none: where the environment gives the option, nothing chooses.
-    cls = None if target is None and group == "high" else _load_target(group, target)
+    # Where the environment gives the option, nothing chooses.
+    cls = None if target is None and group in _CAN_BE_NONE else _load_target(group, target)
     name = "none" if cls is None else cls.__name__
     schema = create_model(name, __config__=_STRICT) if cls is None else _schema(cls, set(context_names))
     what, where = f"option of {name} ({_file(group)})", f"{name}, {_file(group)}"
@@ -169,7 +185,7 @@ def validate(group: str, node: Any, context_names: Iterable[str] = ()) -> tuple[
 
 
 def build(group: str, node: Any, **context: Any) -> Any:
-    """Build the object that a group's part of the config describes; None for `high=none`.
+    """Build the object that a group's part of the config describes; None for `high=none` and `data=none`.
 
     Args:
         group: such as `low`.

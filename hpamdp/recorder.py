@@ -39,15 +39,17 @@ class Recorder:
         """Start the metrics with those that the run in `folder` had written by then."""
         self.metrics = MetricsFile(self.metrics.path, folder / "metrics.csv", frames)
 
-    def take(self, batch: TensorDictBase, scalars: dict[str, float]) -> None:
-        """Take note of a collected batch `[N, T]` and of what the agent said while learning from it."""
+    def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
+        """Take note of a collected batch `[N, T]`, if there is one, and of what the agent said while learning."""
+        self._scalars |= scalars
+        self._played = None
+        if batch is None:
+            return
         is_end = batch.get(("next", keys.DONE)).squeeze(-1)
         ended = batch.get("next").select(*self.parts.env.result_keys, keys.EPISODE_RETURN, keys.EPISODE_STEPS)[is_end]
         if keys.OPTION in batch.keys():
             ended.set(keys.OPTION, batch.get(keys.OPTION)[is_end])
         self._ended.append(ended)
-        self._scalars |= scalars
-        self._played = None
 
     def log(self, frames: int, wall_s: float, is_evaluated: bool) -> dict[str, float]:
         """Write a row, with an evaluation if asked for, and return it."""

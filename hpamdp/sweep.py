@@ -152,7 +152,8 @@ def _final_score(wanted: DictConfig, folder: Path) -> float | None:
         summary = json.loads((folder / "summary.json").read_text())
     except (OSError, ValueError):  # not there, or cut off in the middle
         return None
-    if wanted.mode == "train" and summary["frames"] < wanted.total_frames:
+    num_frames = wanted.offline.updates if wanted.mode == "offline" else wanted.total_frames
+    if wanted.mode != "eval" and summary["frames"] < num_frames:
         return None
     return summary["score"]
 

@@ -17,6 +17,8 @@ from hpamdp.collection.base import Collection
 from hpamdp.config import ConfigError, RunConfig, build
 from hpamdp.recorder import Recorder
 
+_UPDATES_A_TURN = 50  # with mode=offline, between two looks at what is due
+
 
 def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stopped_at: Path | None = None) -> int:
     """Train or score an agent as `cfg` says, write everything under `output_dir`, return the exit code.
@@ -39,11 +41,12 @@ def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stoppe
         trainer.restore(stopped_at or source)
     output_dir.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
-    is_interrupted = settings.mode == "train" and trainer.train()
+    is_interrupted = settings.mode != "eval" and trainer.train()
     print(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s))
     print(f"Everything is in {output_dir}")
     if is_interrupted:
-        print(f"Stopped at {trainer.frames:,} presses; to go on: python run.py resume={output_dir}")
+        mode = "" if settings.mode == "train" else f"mode={settings.mode} "
+        print(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: python run.py {mode}resume={output_dir}")
     return 130 if is_interrupted else 0
 
 
@@ -54,10 +57,19 @@ class Trainer:
         self.cfg, self.settings, self.parts, self.output_dir = cfg, settings, parts, output_dir
         self.recorder = Recorder(cfg, parts, output_dir)
         self.frames, self.wall_s, self.cpu_s = 0, 0.0, 0.0
+        # A frame is what the run is counted in.
+        self.unit = " updates" if self.is_offline else " decisions" if settings.low.freeze else " presses"
+        self.total = settings.num_frames
+        self.eval_every = settings.offline.eval_every if self.is_offline else settings.eval.every
+
+    @property
+    def is_offline(self) -> bool:
+        """Whether all there is to learn from is a data set."""
+        return self.settings.mode == "offline"
 
     def restore(self, source: Path) -> None:
         """Take the agent from a checkpoint and, to train on, where its run stood."""
-        is_training = self.settings.mode == "train"
+        is_training = self.settings.mode != "eval"
         env_state = checkpoint.load(source, self.parts.agent, self.parts.device, is_training)
         progress = checkpoint.progress_of(source)
         self.frames, self.wall_s, self.cpu_s = (progress[name] for name in ("frames", "wall_s", "cpu_s"))
@@ -71,12 +83,10 @@ class Trainer:
         self.recorder.resume_from(source.parent, self.frames)
 
     def train(self) -> bool:
-        """Run until `total_frames`; return whether the user stopped it before. Either way the agent is saved."""
-        settings = self.settings
-        context = {"cfg": self.cfg, "settings": settings, "parts": self.parts, "frames": self.frames}
+        """Run until `total` frames; return whether the user stopped it before. Either way the agent is saved."""
+        context = {"cfg": self.cfg, "settings": self.settings, "parts": self.parts, "frames": self.frames}
         collection = build("collector", self.cfg.collector, **context)
-        unit = " decisions" if settings.low.freeze else " presses"
-        bar = tqdm(total=settings.total_frames, initial=self.frames, unit=unit, unit_scale=True, mininterval=1.0)
+        bar = tqdm(total=self.total, initial=self.frames, unit=self.unit, unit_scale=True, mininterval=1.0)
         previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # a cluster's stop is a Ctrl-C
         try:
             self._loop(collection, bar)
@@ -97,20 +107,31 @@ class Trainer:
         wall_before, cpu_before = self.wall_s - time.perf_counter(), self.cpu_s - time.process_time()
         if self.frames == 0:
             self._log(bar, is_evaluated=True)
-        while self.frames < settings.total_frames:
-            batch = collection.next()
-            self.recorder.take(batch, self.parts.agent.learn(batch))
-            last, self.frames = self.frames, self.frames + batch.numel()
+            if self.parts.data is not None:
+                self.parts.agent.remember(self.parts.data)
+        while self.frames < self.total:
+            num = self._learn(collection)
+            last, self.frames = self.frames, self.frames + num
             self.wall_s = wall_before + time.perf_counter()
             self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
-            bar.update(batch.numel())
-            is_over = self.frames >= settings.total_frames
-            if is_over or _is_due(last, self.frames, settings.eval.every):
+            bar.update(num)
+            is_over = self.frames >= self.total
+            if is_over or _is_due(last, self.frames, self.eval_every):
                 self._log(bar, is_evaluated=True)
             elif _is_due(last, self.frames, settings.log_every):
                 self._log(bar, is_evaluated=False)
             if not is_over and _is_due(last, self.frames, settings.checkpoint_every):
                 self.save(collection)
+
+    def _learn(self, collection: Collection) -> int:
+        """Let the agent learn, from presses or from the data set; return how many frames that took."""
+        if self.is_offline:
+            num = min(_UPDATES_A_TURN, self.total - self.frames)
+            self.recorder.take(None, self.parts.agent.practise(num))
+            return num
+        batch = collection.next()
+        self.recorder.take(batch, self.parts.agent.learn(batch))
+        return batch.numel()
 
     def _log(self, bar: tqdm, is_evaluated: bool) -> None:
         row = self.recorder.log(self.frames, self.wall_s, is_evaluated)

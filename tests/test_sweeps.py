@@ -181,7 +181,7 @@ def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path, launcher):
         ("hydra/launcher=joblib", "hydra-joblib-launcher", "joblib"),
         ("hydra/launcher=submitit_local", "hydra-submitit-launcher", "slurm"),
         ("hydra/launcher=submitit_slurm", "hydra-submitit-launcher", "slurm"),
-        ("hydra/launcher=ray", "hydra-ray-launcher", "ray"),
+        ("hydra/launcher=ray", "hydra-ray-launcher", "ray-launcher"),
         ("hydra/sweeper=optuna", "hydra-optuna-sweeper", "optuna"),
         ("search=hppo", "hydra-optuna-sweeper", "optuna"),
     ],

@@ -119,14 +119,7 @@ class HierarchicalAgent(nn.Module):
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
         if self.selector is not None:
-            is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
-            if is_end.any():
-                # Time first, so that the selector meets the decisions oldest first.
-                decisions = batch.transpose(0, -1)[is_end.transpose(0, -1)]
-                if self.selector.needs_values:
-                    decided_at = decisions.get(("next", keys.DECISION_OBSERVATION))
-                    decisions.set(keys.OPTION_VALUES, self.option_values(decided_at))
-                scalars |= {f"high/{name}": value for name, value in self.selector.learn(decisions).items()}
+            scalars |= {f"high/{name}": value for name, value in self._teach_selector(batch).items()}
         if self.is_frozen:
             return scalars
         everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
@@ -140,8 +133,21 @@ class HierarchicalAgent(nn.Module):
     def _name_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
 
+    def _teach_selector(self, batch: TensorDictBase) -> dict[str, float]:
+        is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
+        if not is_end.any():
+            return {}
+        # Time first, so that the selector meets the decisions oldest first.
+        decisions = batch.transpose(0, -1)[is_end.transpose(0, -1)]
+        if self.selector.needs_values:
+            decided_at = decisions.get(("next", keys.DECISION_OBSERVATION))
+            decisions.set(keys.OPTION_VALUES, self.option_values(decided_at))
+        return self.selector.learn(decisions)
+
     def remember(self, batch: TensorDictBase) -> None:
-        """Let the learners keep a data set's transitions `[*B, T]`, each its own option's."""
+        """Let the learners keep a data set's transitions `[*B, T]`, each its own option's; the selector learns."""
+        if self.selector is not None:
+            self._teach_selector(batch)
         everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
         if self.is_shared:
             batch = with_option(batch, self.specs.num_options)

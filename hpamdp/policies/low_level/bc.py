@@ -48,8 +48,14 @@ class BC(ReplayLearner):
         if not min_scale < max_scale:
             raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
         super().__init__(
-            specs, device, gamma=1.0, warmup_frames=0, buffer_size=buffer_size, batch_size=batch_size, updates_per_frame=0.0
-        )  # fmt: skip
+            specs,
+            device,
+            gamma=1.0,
+            warmup_frames=0,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=0.0,
+        )
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)

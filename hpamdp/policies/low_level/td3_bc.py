@@ -1,9 +1,9 @@
 """TD3+BC for parameterised actions: P-DQN whose parameters stay near the data's, and whose keys the data holds.
 
-Source: Fujimoto and Gu 2021, *A Minimalist Approach to Offline Reinforcement Learning*, arXiv 2106.06860, equation 5, on
-the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twins, smoothing and delay of TD3 (Fujimoto et al.
-2018, arXiv 1802.09477). Which keys count as in the data: discrete BCQ (Fujimoto et al. 2019, arXiv 1910.01708, equation
-in section 4).
+Source: Fujimoto and Gu 2021, *A Minimalist Approach to Offline Reinforcement Learning*, arXiv 2106.06860, equation 5,
+on the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twins, smoothing and delay of TD3 (Fujimoto et
+al. 2018, arXiv 1802.09477). Which keys count as in the data: discrete BCQ (Fujimoto et al. 2019, arXiv 1910.01708,
+equation in section 4).
 
 Differs from the sources: every key has its parameters, so the actor ascends the keys' values in proportion to how often
 the data presses them, and is held to the data at the pressed key alone.
@@ -31,7 +31,7 @@ Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class TD3BCPolicy(TensorDictModuleBase):
-    """Of the keys that the data presses in such a state, the one of the highest Q; explores with noise on parameters."""
+    """Of the keys that the data presses in such a state, that of the highest Q; explores with noise on parameters."""
 
     def __init__(
         self,
