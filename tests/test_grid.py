@@ -20,11 +20,16 @@ SHORT = {
         *("low.num_samples=16", "low.num_elites=4", "low.num_iterations=2"),
     ],
     "hppo": ["low.minibatch_size=16"],
+    "iql": ["low.warmup_frames=64", "low.batch_size=16"],
+    "td3_bc": ["low.warmup_frames=64", "low.batch_size=16"],
     "hsac": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "hyar": ["low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
+# These learn from data sets alone.
+OFFLINE = {"bc"}
+TRAINED = [low for low in choices("low") if low not in OFFLINE]
 SMALL = ["num_envs=16", "steps_per_batch=4", "total_frames=256", "eval.layouts=10", "eval.every=0", "log_every=0"]
 
 
@@ -39,7 +44,7 @@ def make(high: str, low: str, tmp_path):
     return assemble(cfg, run_config(cfg), tmp_path)
 
 
-@pytest.mark.parametrize(("high", "low"), list(itertools.product(choices("high"), choices("low"))))
+@pytest.mark.parametrize(("high", "low"), list(itertools.product(choices("high"), TRAINED)))
 def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
     monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0
@@ -56,7 +61,7 @@ ELSEWHERE = {
 
 
 @pytest.mark.parametrize("env", list(ELSEWHERE))
-@pytest.mark.parametrize("low", [low for low in choices("low") if low != "planner"])
+@pytest.mark.parametrize("low", [low for low in TRAINED if low != "planner"])
 def test_every_learner_works_on_other_problems(low, env, tmp_path, monkeypatch):
     given = [f"env={env}", "high=none", f"low={low}", *ELSEWHERE[env], *SHORT.get(low, []), *SMALL]
     if low == "qpamdp":
@@ -74,7 +79,7 @@ def test_learners_work_for_each_option_and_shared(sharing, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize(
-    ("high", "low"), [*((high, "random") for high in choices("high")), *(("uniform", low) for low in choices("low"))]
+    ("high", "low"), [*((high, "random") for high in choices("high")), *(("uniform", low) for low in TRAINED)]
 )
 def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(high, low, tmp_path):
     parts = make(high, low, tmp_path)

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from hpamdp import keys
 from hpamdp.data.episodes import select
 from hpamdp.data.errors import HumanDataError
-from hpamdp.data.released_file import SHA256, HumanData, read
+from hpamdp.data.released_file import HumanData, read
 from hpamdp.data.settled import settle
 from hpamdp.data.transitions import TRAJECTORY, transitions
 from hpamdp.env import harbour
@@ -26,9 +26,9 @@ class HumanPresses:
     Args:
         env: the boats, whose boat, key map, reward and observation are taken.
         path: the released file; None: where `released_file.default_path` expects it.
+        checksum: the SHA-256 that the file must have; None: any.
         complete, successes, best_people: as in `hpamdp.data.episodes.select`.
         settled: whether `hpamdp.data.settled.settle` makes presses of them that start from rest and glide out.
-        checksum: the SHA-256 that the file must have; None: any.
 
     Raises:
         ValueError: another environment than the boats, no such file, not the right one, or nothing is left.
@@ -39,11 +39,11 @@ class HumanPresses:
         env: object,
         *,
         path: str | None,
+        checksum: str | None,
         complete: bool,
         successes: bool,
         best_people: PositiveInt | None,
         settled: bool,
-        checksum: str | None = SHA256,
     ) -> None:
         if not isinstance(env, BoatDockEnv):
             raise ValueError("people docked boats; use env=boatdock or data=none")
@@ -77,8 +77,7 @@ def with_keymap(data: HumanData, keymap: int) -> HumanData:
 
 
 def with_decision_sums(rows: TensorDict) -> TensorDict:
-    """Add what `DecisionTracker` writes for options that last an episode: the return so far, the steps, the decision's
-    observation."""
+    """Add what `DecisionTracker` writes where options last an episode: return so far, steps, decision's observation."""
     trajectory, reward = rows[TRAJECTORY], rows["next", keys.REWARD].squeeze(-1).double()
     first = torch.searchsorted(trajectory, trajectory)
     total = reward.cumsum(0)

@@ -127,6 +127,8 @@ class HyAR(ReplayLearner):
 
     has_value: ClassVar[bool] = True
 
+    modes: ClassVar[tuple[str, ...]] = ("train",)  # it remembers its own latent actions beside the presses
+
     def __init__(
         self,
         specs: PAMDPSpecs,
