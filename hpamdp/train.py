@@ -58,14 +58,9 @@ class Trainer:
         self.recorder = Recorder(cfg, parts, output_dir)
         self.frames, self.wall_s, self.cpu_s = 0, 0.0, 0.0
         # A frame is what the run is counted in.
+        self.is_offline = settings.mode == "offline"
         self.unit = " updates" if self.is_offline else " decisions" if settings.low.freeze else " presses"
-        self.total = settings.num_frames
         self.eval_every = settings.offline.eval_every if self.is_offline else settings.eval.every
-
-    @property
-    def is_offline(self) -> bool:
-        """Whether all there is to learn from is a data set."""
-        return self.settings.mode == "offline"
 
     def restore(self, source: Path) -> None:
         """Take the agent from a checkpoint and, to train on, where its run stood."""
@@ -83,10 +78,11 @@ class Trainer:
         self.recorder.resume_from(source.parent, self.frames)
 
     def train(self) -> bool:
-        """Run until `total` frames; return whether the user stopped it before. Either way the agent is saved."""
+        """Run until `num_frames`; return whether the user stopped it before. Either way the agent is saved."""
         context = {"cfg": self.cfg, "settings": self.settings, "parts": self.parts, "frames": self.frames}
         collection = build("collector", self.cfg.collector, **context)
-        bar = tqdm(total=self.total, initial=self.frames, unit=self.unit, unit_scale=True, mininterval=1.0)
+        total = self.settings.num_frames
+        bar = tqdm(total=total, initial=self.frames, unit=self.unit, unit_scale=True, mininterval=1.0)
         previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # a cluster's stop is a Ctrl-C
         try:
             self._loop(collection, bar)
@@ -109,13 +105,13 @@ class Trainer:
             self._log(bar, is_evaluated=True)
             if self.parts.data is not None:
                 self.parts.agent.remember(self.parts.data)
-        while self.frames < self.total:
+        while self.frames < self.settings.num_frames:
             num = self._learn(collection)
             last, self.frames = self.frames, self.frames + num
             self.wall_s = wall_before + time.perf_counter()
             self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
             bar.update(num)
-            is_over = self.frames >= self.total
+            is_over = self.frames >= self.settings.num_frames
             if is_over or _is_due(last, self.frames, self.eval_every):
                 self._log(bar, is_evaluated=True)
             elif _is_due(last, self.frames, settings.log_every):
@@ -126,7 +122,7 @@ class Trainer:
     def _learn(self, collection: Collection) -> int:
         """Let the agent learn, from presses or from the data set; return how many frames that took."""
         if self.is_offline:
-            num = min(_UPDATES_A_TURN, self.total - self.frames)
+            num = min(_UPDATES_A_TURN, self.settings.num_frames - self.frames)
             self.recorder.take(None, self.parts.agent.practise(num))
             return num
         batch = collection.next()
@@ -141,12 +137,8 @@ class Trainer:
 
     def save(self, collection: Collection) -> None:
         """Write the checkpoint."""
-        progress = {
-            "config": OmegaConf.to_container(self.cfg, resolve=True),
-            "frames": self.frames,
-            "wall_s": self.wall_s,
-            "cpu_s": self.cpu_s,
-        }
+        progress = {"config": OmegaConf.to_container(self.cfg, resolve=True), "frames": self.frames}
+        progress |= {"wall_s": self.wall_s, "cpu_s": self.cpu_s}
         path = self.output_dir / checkpoint.FILE_NAME
         checkpoint.save(path, self.parts.agent, collection.state_columns(), progress)
 
