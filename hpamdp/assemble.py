@@ -175,6 +175,8 @@ def _check_collector(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, collec
     name, num_workers = name_of(cfg.collector), cfg.collector.get("num_workers", 1)
     if settings.mode == "eval":  # which collects nothing
         return
+    if settings.mode == "offline" and name != "single":
+        raise ConfigError(f"collector={name}: mode=offline presses nothing; use collector=single")
     if collection.package is not None and importlib.util.find_spec(collection.package) is None:
         raise ConfigError(
             f"collector={name}: {collection.package} is not installed; pip install hpamdp[{collection.package}]"

@@ -138,6 +138,7 @@ REFUSED = [
     (["low=iql", "mode=offline"], "mode=offline: data=none leaves nothing to learn from; use data=human"),
     (["low=iql", "mode=offline", "data=human", "data.path=/nowhere.mat"], "/nowhere.mat: there is no such file"),
     (["low=iql", "high=none", "env=platform", "mode=offline", "data=human"], "people docked boats; use env=boatdock"),
+    (["low=iql", "data=human", "mode=offline", "collector=multi"], "mode=offline presses nothing"),
     (["low=iql", "data=human", "mode=offline", "low.freeze=true"], "mode=offline trains the learners"),
 ]
 
