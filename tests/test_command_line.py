@@ -139,7 +139,7 @@ def test_help_shows_groups_values_with_comments_and_examples(command):
         assert f"  {group:<12}{', '.join(choices(group))}\n" in out
     cfg = OmegaConf.load(CONF / "config.yaml")
     lines = out.splitlines()
-    for name in set(cfg) - {"defaults", "hydra", "eval", "agent", "low"}:
+    for name in set(cfg) - {"defaults", "hydra", "eval", "agent", "low", "offline"}:
         place = next(i for i, line in enumerate(lines) if line.startswith(f"  {name}:"))
         assert lines[place - 1].startswith("  # ")
     assert out.count("  python run.py ") >= 3
