@@ -205,7 +205,8 @@ def make_agent(cfg: DictConfig, settings: RunConfig, specs: PAMDPSpecs, device: 
     if is_shared:
         learner_specs, num_learners = specs.with_option_observed(), 1
     learners = [_make_learner(cfg.low, learner_specs, device) for _ in range(num_learners)]
-    return HierarchicalAgent(selector, learners, specs, is_shared, settings.low.freeze).to(device)
+    agent = HierarchicalAgent(selector, learners, specs, is_shared, settings.low.freeze, settings.agent.practice_frames)
+    return agent.to(device)
 
 
 def _make_learner(node: Any, specs: PAMDPSpecs, device: torch.device) -> Learner:

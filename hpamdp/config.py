@@ -71,6 +71,7 @@ class AgentConfig(BaseModel):
 
     sharing: Literal["per_option", "shared"]
     option_length: Literal["episode"] | PositiveInt
+    practice_frames: NonNegativeInt
 
 
 class OfflineConfig(BaseModel):

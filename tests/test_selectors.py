@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from conftest import choices, compose_config
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -9,6 +10,8 @@ from toy_bandits import CPU, SPECS, due
 from toy_options import Stepper, Toll
 
 from hpamdp import keys
+from hpamdp.assemble import assemble
+from hpamdp.config import run_config
 from hpamdp.env.boatdock import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
@@ -142,3 +145,23 @@ def test_human_chooses_the_congruent_boat_as_often_as_people_do_at_each_bearing(
         inside = (offset >= low) & (offset < high)
         assert inside.sum() > 2500
         assert chosen[inside].mean().item() == pytest.approx(share, abs=0.035)
+
+
+@pytest.mark.parametrize(
+    "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
+)
+def test_options_are_uniform_until_practice_is_over_and_greedy_choices_never(high, tmp_path):
+    words = [f"high={high}", "low=random", "num_envs=400", "eval.layouts=4", "agent.practice_frames=800"]
+    cfg = compose_config([*words, *(["high.warmup_decisions=0"] if high == "meta_critic" else [])])
+    parts = assemble(cfg, run_config(cfg), tmp_path)
+    torch.manual_seed(0)
+    agent = parts.agent
+    for _ in range(2):
+        assert agent.selector.is_practice
+        batch = parts.env.rollout(1, agent.policy)
+        assert 0.4 < batch["option"].float().mean() < 0.6
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            td = parts.env.reset()
+            assert (agent.selector(td.clone())["option"] == agent.selector.choose(td)["option"]).all()
+        agent.learn(batch)
+    assert not agent.selector.is_practice

@@ -85,6 +85,8 @@ class HierarchicalAgent(nn.Module):
         specs: of the problem as the environment states it.
         is_shared: whether the single learner takes the option as input (its own specs then count the one-hot option).
         is_frozen: whether the learners stay as they are.
+        practice_frames: presses (decisions, where the learners are frozen) at the start for which the selector's
+            exploring choices are uniform; it learns from them.
     """
 
     def __init__(
@@ -94,11 +96,15 @@ class HierarchicalAgent(nn.Module):
         specs: PAMDPSpecs,
         is_shared: bool = False,
         is_frozen: bool = False,
+        practice_frames: int = 0,
     ) -> None:
         super().__init__()
         self.selector = selector
         self.learners = nn.ModuleList(learners)
         self.specs, self.is_shared, self.is_frozen = specs, is_shared, is_frozen
+        self.practice_frames = practice_frames
+        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
+        self._end_practice_if_due()
         self.router = OptionRouter(learners, specs, is_shared)
         self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
 
@@ -118,7 +124,9 @@ class HierarchicalAgent(nn.Module):
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
+        self.frames += batch.numel()
         if self.selector is not None:
+            self._end_practice_if_due()
             scalars |= {f"high/{name}": value for name, value in self._teach_selector(batch).items()}
         if self.is_frozen:
             return scalars
@@ -132,6 +140,10 @@ class HierarchicalAgent(nn.Module):
 
     def _name_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
+
+    def _end_practice_if_due(self) -> None:
+        if self.selector is not None:
+            self.selector.is_practice.fill_(self.frames < self.practice_frames)
 
     def _teach_selector(self, batch: TensorDictBase) -> dict[str, float]:
         is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)

@@ -41,6 +41,8 @@ class Selector(TensorDictModuleBase):
         self.in_keys = [keys.OBSERVATION, keys.IS_DECISION]
         self.out_keys = [keys.OPTION]
         self.specs = specs
+        # While it is true, exploring choices are uniform, so that every option's learner gets its practice.
+        self.register_buffer("is_practice", torch.zeros((), dtype=torch.bool))
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return a fresh choice for every environment, int64 `[*B]`."""
@@ -49,6 +51,10 @@ class Selector(TensorDictModuleBase):
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return all `out_keys` of a fresh choice, each `[*B]`; beside the option what `learn` wants to know of it."""
         return {keys.OPTION: self.select(td)}
+
+    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return all `out_keys` of uniformly random choices, each `[*B]`."""
+        return {keys.OPTION: torch.randint(self.specs.num_options, td.batch_size, device=self.is_practice.device)}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first; return scalars to log.
@@ -69,7 +75,8 @@ class Selector(TensorDictModuleBase):
         held = {key: td.get(key, None) for key in self.out_keys}
         is_new = any(value is None for value in held.values())
         if is_new or is_decision.any():
-            fresh = self.choose(td)
+            is_uniform = bool(self.is_practice) and not is_greedy()
+            fresh = self.choose_uniformly(td) if is_uniform else self.choose(td)
             held = fresh if is_new else {key: torch.where(is_decision, fresh[key], held[key]) for key in held}
         for key, value in held.items():
             td.set(key, value)

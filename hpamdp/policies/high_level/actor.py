@@ -9,6 +9,7 @@ option's return, bootstrapped where its episode goes on, less a learned value of
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import torch
@@ -66,6 +67,12 @@ class Actor(OnPolicy, Selector):
         log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
         option = log_probs.argmax(-1) if is_greedy() else draw_index(log_probs)
         return {keys.OPTION: option, LOG_PROB: log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)}
+
+    def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
+        """Return uniformly random options and their log-probabilities, `[*B]` each."""
+        chosen = super().choose_uniformly(td)
+        uniform = -math.log(self.specs.num_options)
+        return chosen | {LOG_PROB: torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; from a minibatch of them on, make `epochs` passes over them."""
