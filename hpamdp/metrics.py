@@ -285,6 +285,7 @@ def _number(value: float) -> str:
 _PERCENT, _PRESSES = "{:.1%}".format, "{:.2f}".format
 _TABLE = (
     ("score", "score", _number),
+    ("human_normalised", "random 0, people 1", _number),
     ("success", "success", _PERCENT),
     ("too_fast", "too fast", _PERCENT),
     ("out_of_bounds", "out of bounds", _PERCENT),

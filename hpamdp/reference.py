@@ -35,6 +35,8 @@ HUMAN: dict[str, Figures] = {
     "congruent": {"score": 2.012, "success": 0.864},
     "incongruent": {"score": 1.912, "success": 0.854},
 }
+# Uniformly random keys and durations with either boat, over 200,000 random layouts (standard error .0013).
+RANDOM: Figures = {"score": -0.925, "success": 0.017}
 HUMAN_LAST_60: Figures = {"score": 2.241, "success": 0.900}  # of each person's 360 episodes
 BEST_PERSON: Figures = {"score": 3.021, "success": 0.989}
 HUMAN_SUCCESS_BY_BLOCK = (0.764, 0.843, 0.873, 0.886, 0.894, 0.900)  # six blocks of 60 episodes
@@ -62,6 +64,16 @@ def _is_on_boats(summary: Mapping[str, Any]) -> bool:
     return summary.get("env", "boatdock") == "boatdock"
 
 
+def human_normalised(score: float, controller: str = "chosen") -> float:
+    """Return a score on boats on the scale of random presses, 0, and people's mean with the same boat, 1.
+
+    Args:
+        controller: as in a run's summary; boats that are drawn are held against people's choice, as they are elsewhere.
+    """
+    people = HUMAN.get(controller, HUMAN["chosen"])["score"]
+    return (score - RANDOM["score"]) / (people - RANDOM["score"])
+
+
 def references(summary: Mapping[str, Any]) -> dict[str, Figures]:
     """Return the figures to stand beside a run's own, by name: those known of random, human, best_person and ceiling.
 
@@ -69,7 +81,7 @@ def references(summary: Mapping[str, Any]) -> dict[str, Figures]:
         summary: a run's summary. `controller` ("chosen" if missing, "congruent", "incongruent" or "random") picks the
             figures; `references` overrides them by name: a mapping of figures is taken as it is, a number is the
             score beside the other figures, and None leaves the name out. Leaving people out leaves out the best one.
-            Of other environments than the boats these are all there is.
+            Of other environments than the boats these are all there is; on boats each score is also `human_normalised`.
 
     Raises:
         ValueError: the controller is not one of these.
@@ -92,4 +104,10 @@ def references(summary: Mapping[str, Any]) -> dict[str, Figures]:
         else:
             found[name] = {**found.get(name, {}), "score": float(figures)}
     order = [name for name in ("random", "human", "best_person", "ceiling") if name in found]
-    return {name: found[name] for name in order}
+    return {name: _normalised(found[name], controller) if _is_on_boats(summary) else found[name] for name in order}
+
+
+def _normalised(figures: Figures, controller: str) -> Figures:
+    if "score" not in figures:
+        return figures
+    return {**figures, "human_normalised": human_normalised(figures["score"], controller)}

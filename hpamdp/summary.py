@@ -10,6 +10,7 @@ from omegaconf import DictConfig
 
 from hpamdp import __version__
 from hpamdp.config import name_of
+from hpamdp.reference import human_normalised
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
 
@@ -32,6 +33,8 @@ def summarise(
         references["ceiling"]["oracle_agreement"] = 1.0
     controller = cfg.env.get("controller")
     boat = {} if controller is None else {"controller": "chosen" if controller == "choose" else controller}
+    if name_of(cfg.env) == "boatdock":
+        measured = measured | {"human_normalised": human_normalised(measured["score"], boat["controller"])}
     return {
         "high": name_of(cfg.high),
         "low": name_of(cfg.low),

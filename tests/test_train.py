@@ -14,6 +14,7 @@ from conftest import compose_config
 from hpamdp import checkpoint
 from hpamdp.config import ConfigError
 from hpamdp.env import harbour
+from hpamdp.reference import human_normalised
 from hpamdp.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
@@ -39,6 +40,7 @@ def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys):
     }
     assert {"frames", "wall_s", "seed", "versions", "ceiling"} <= {*summary}
     assert summary["frames"] == 1024 and summary["episodes"] == 20
+    assert summary["human_normalised"] == human_normalised(summary["score"])
     printed = capsys.readouterr().out
     assert "score" in printed and "ceiling" in printed and str(tmp_path) in printed
 
