@@ -6,11 +6,8 @@ python experiments/learners/study.py                       draws and tabulates w
 
 from __future__ import annotations
 
-import csv
-import json
 import sys
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -19,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.metrics import read_rows
 from hpamdp.reference import HUMAN
+from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_csv
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
@@ -35,17 +32,17 @@ COLOURS = {
     "pdqn as MP-DQN": "#6b6b00",
     "pdqn as P-DQN": "#332288",
 }
-Rows = list[dict[str, str]]
 
 
-def gather(folder: Path) -> tuple[Rows, Rows]:
-    """Return a row a run and a row an evaluation of the finished runs under a multirun's folder."""
+def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
+    """Return a row a run and a row an evaluation."""
     results, curves = [], []
-    for file in sorted(folder.glob("**/summary.json")):
-        summary, config = json.loads(file.read_text()), (file.parent / "config.yaml").read_text()
-        name = {"low": _name(summary["low"], config), "problem": summary.get("controller", summary.get("env"))}
-        name |= {"reward": "sparse" if "reward: sparse" in config else "given", "seed": summary["seed"]}
-        rows = [row for row in read_rows(file.parent / "metrics.csv") if "eval/score" in row]
+    for run in runs:
+        summary = run.summary
+        name = {"low": _name(run), "problem": summary.get("controller", summary.get("env"))}
+        is_sparse = run.config.env.get("reward") == "sparse"
+        name |= {"reward": "sparse" if is_sparse else "given", "seed": summary["seed"]}
+        rows = run.evaluations()
         reached = next((row for row in rows if row["eval/score"] >= HUMAN["chosen"]["score"]), {})
         results.append(
             name
@@ -59,33 +56,12 @@ def gather(folder: Path) -> tuple[Rows, Rows]:
     return results, curves
 
 
-def _name(low: str, config: str) -> str:
+def _name(run: Run) -> str:
     """Return the learner's name; P-DQN's published forms have names of their own."""
-    if low != "pdqn" or "twin_q: true" in config:
-        return low
-    return "pdqn as MP-DQN" if "multipass: true" in config else "pdqn as P-DQN"
-
-
-def write(path: Path, rows: Rows) -> None:
-    """Write rows as csv."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def read(path: Path) -> Rows:
-    """Read rows from csv."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def groups(rows: Rows, *names: str) -> dict[tuple[str, ...], Rows]:
-    """Return the rows by their values of the named columns."""
-    found = defaultdict(list)
-    for row in rows:
-        found[tuple(row[name] for name in names)].append(row)
-    return dict(found)
+    low = run.config.low
+    if run.summary["low"] != "pdqn" or low.twin_q:
+        return run.summary["low"]
+    return "pdqn as MP-DQN" if low.multipass else "pdqn as P-DQN"
 
 
 def table(results: Rows) -> str:
@@ -95,23 +71,18 @@ def table(results: Rows) -> str:
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for (low, problem, reward), rows in groups(results, "low", "problem", "reward").items():
-        score, success = ([float(row[name]) for row in rows] for name in ("score", "success"))
-        wall, cpu, presses = (np.mean([float(row[name]) for row in rows]) for name in ("wall_s", "cpu_s", "presses"))
+        score, success = ([row[name] for row in rows] for name in ("score", "success"))
+        wall, cpu, presses = (np.mean([row[name] for row in rows]) for name in ("wall_s", "cpu_s", "presses"))
         reached = [row for row in rows if row["presses_to_people"]]
         first = ["-", "-"]
         if len(reached) == len(rows):
-            to = [np.mean([float(row[name]) for row in rows]) for name in ("presses_to_people", "wall_s_to_people")]
+            to = [np.mean([row[name] for row in rows]) for name in ("presses_to_people", "wall_s_to_people")]
             first = [f"{to[0]:,.0f}", f"{to[1]:.0f} s"]
         lines.append(
-            f"| {low} | {problem} | {reward} | {len(rows)} | {_spread(score)} | "
+            f"| {low} | {problem} | {reward} | {len(rows)} | {spread(score)} | "
             f"{np.mean(success):.1%} | {presses:,.0f} | {wall:.0f} s | {cpu:.0f} s | {first[0]} | {first[1]} |"
         )
     return "\n".join(lines)
-
-
-def _spread(values: list[float]) -> str:
-    mean = f"{np.mean(values):.3f}"
-    return f"{mean} ± {np.std(values, ddof=1):.3f}" if len(values) > 1 else mean
 
 
 def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
@@ -137,10 +108,7 @@ def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
 
 
 def _draw_learner(axes: Axes, runs: Rows, low: str, x: str) -> float:
-    seeds = [np.array([(float(r[x]), float(r["eval/score"])) for r in rows]) for rows in groups(runs, "seed").values()]
-    num = min(len(seed) for seed in seeds)
-    at, score = np.mean([s[:num, 0] for s in seeds], 0), np.array([s[:num, 1] for s in seeds])
-    mean, deviation = score.mean(0), score.std(0)
+    at, mean, deviation = curve(runs, x, "eval/score")
     late = at > 0
     axes.plot(at[late], mean[late], color=COLOURS[low], linewidth=1.8, label=low)
     axes.fill_between(
@@ -151,25 +119,22 @@ def _draw_learner(axes: Axes, runs: Rows, low: str, x: str) -> float:
 
 def _draw_lines(axes: Axes, results: Rows, boat: str) -> None:
     lines = {
-        "ceiling": (float(results[0]["ceiling"]), "#2b2b2b", "-"),
+        "ceiling": (results[0]["ceiling"], "#2b2b2b", "-"),
         "people": (HUMAN[boat]["score"], "#D98200", "--"),
-        "random": (float(results[0]["random"]), "#8c8c8c", ":"),
+        "random": (results[0]["random"], "#8c8c8c", ":"),
     }
     for name, (height, colour, style) in lines.items():
         axes.axhline(height, color=colour, linestyle=style, linewidth=1.0, zorder=1)
         axes.annotate(f"{name} {height:.2f}", (0.005, height + 0.04), xycoords=("axes fraction", "data"), fontsize=8)
 
 
-def main(folders: Iterable[str]) -> None:
+def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
-    results, curves = [], []
-    for folder in folders:
-        for target, rows in zip((results, curves), gather(Path(folder)), strict=True):
-            target += rows
-    if results:
-        write(HERE / "results.csv", results)
-        write(HERE / "curves.csv", curves)
-    results, curves = read(HERE / "results.csv"), read(HERE / "curves.csv")
+    names = ("results", "curves")
+    if folders:
+        for name, rows in zip(names, gather(finished(folders)), strict=True):
+            write_csv(HERE / f"{name}.csv", rows)
+    results, curves = (read_csv(HERE / f"{name}.csv") for name in names)
     draw(curves, results, "given", "frames", HERE / "curves.png")
     draw(curves, results, "sparse", "frames", HERE / "curves_sparse.png")
     draw(curves, results, "given", "wall_s", HERE / "curves_seconds.png")

@@ -1,0 +1,113 @@
+"""What studies make of finished runs: files gathered, seeds as the unit of the statistics."""
+
+import importlib.util
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hpamdp.study import curve, finished, groups, interquartile_mean, read_csv, spread, write_csv
+
+EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
+CONFIG = "low: {{twin_q: {twin_q}, multipass: {multipass}}}\nenv: {{controller: congruent, reward: {reward}}}\n"
+
+
+def study(name):
+    file = EXPERIMENTS / name / "study.py"
+    if not file.exists():
+        pytest.skip("the studies are in the repository, not in the source distribution")
+    spec = importlib.util.spec_from_file_location(f"study_{name}", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), **config):
+    """Write what a finished run leaves behind, as far as studies read it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    summary = {"low": low, "env": "boatdock", "controller": "congruent", "seed": seed, "score": scores[-1]}
+    summary |= {"success": 0.9, "ceiling": 3.4, "references": {"random": {"score": -0.9}}}
+    summary |= {"frames": 200, "wall_s": 2.04, "cpu_s": 1.0}
+    (folder / "summary.json").write_text(json.dumps(summary))
+    (folder / "config.yaml").write_text(
+        CONFIG.format(**{"twin_q": "true", "multipass": "true", "reward": "paper"} | config)
+    )
+    lines = ["frames,wall_s,loss,eval/score,eval/success", "50,0.5,1.0,,"]
+    lines += [f"{100 * i},{i},,{score},{0.1 * i}" for i, score in enumerate(scores)]
+    (folder / "metrics.csv").write_text("\n".join(lines) + "\n")
+    np.savez(folder / "evaluation.npz", score=np.array([1.0, 2.0]))
+
+
+def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_path):
+    leave_run(tmp_path / "b/deep/er", seed=1)
+    leave_run(tmp_path / "a", seed=2)
+    (tmp_path / "c").mkdir()
+    (tmp_path / "c/metrics.csv").write_text("frames\n1\n")
+    runs = finished([tmp_path])
+    assert [run.summary["seed"] for run in runs] == [2, 1] and runs[1].config.env.reward == "paper"
+    assert finished([tmp_path / "b", str(tmp_path / "a")])[0].summary["seed"] == 1
+
+
+def test_a_run_gives_its_evaluations_and_its_played_episodes(tmp_path):
+    leave_run(tmp_path)
+    (run,) = finished([tmp_path])
+    assert [row["eval/score"] for row in run.evaluations()] == [-0.9, 1.5, 2.5]
+    assert run.played()["score"].tolist() == [1.0, 2.0]
+
+
+def test_rows_come_back_from_csv_with_numbers_as_numbers_and_gaps_as_gaps(tmp_path):
+    rows = [{"low": "hppo", "seed": 0, "reached": 1e6}, {"low": "a, b", "seed": 1, "reached": ""}]
+    write_csv(tmp_path / "a.csv", rows)
+    assert read_csv(tmp_path / "a.csv") == rows
+
+
+def test_groups_keep_the_order_of_appearance():
+    rows = [{"a": 2, "b": 0, "x": 1}, {"a": 1, "b": 0, "x": 2}, {"a": 2, "b": 0, "x": 3}]
+    assert [(key, [row["x"] for row in of]) for key, of in groups(rows, "a", "b").items()] == [
+        ((2, 0), [1, 3]),
+        ((1, 0), [2]),
+    ]
+
+
+def test_the_spread_is_the_deviation_of_a_sample_and_of_one_seed_there_is_none():
+    assert spread([1.0, 2.0, 3.0]) == "2.000 ± 1.000"
+    assert spread([1.25], digits=1) == "1.2"
+
+
+def test_the_interquartile_mean_ignores_the_outer_quarters():
+    middle, low, high = interquartile_mean([-100.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 100.0])
+    assert middle == 3.5 and low < 3.5 < high
+    assert interquartile_mean([1.0, 5.0, 9.0])[0] == 5.0  # a quarter of three seeds is none
+
+
+def test_the_interval_covers_the_truth_about_as_often_as_it_says():
+    draws = np.random.default_rng(0).normal(size=(60, 20))
+    covers = [low <= 0.0 <= high for _, low, high in map(interquartile_mean, draws)]
+    assert 0.83 < np.mean(covers) <= 1.0
+
+
+@pytest.mark.parametrize("values", [[2.0], [2.0, 2.0, 2.0]])
+def test_seeds_that_do_not_vary_have_an_interval_of_no_width(values):
+    assert interquartile_mean(values) == (2.0, 2.0, 2.0)
+
+
+def test_a_curve_goes_as_far_as_all_seeds_do():
+    rows = [{"seed": 0, "frames": 10 * i, "score": float(i)} for i in range(4)]
+    rows += [{"seed": 1, "frames": 10 * i, "score": i + 2.0} for i in range(3)]
+    x, mean, deviation = curve(rows, "frames", "score")
+    assert x.tolist() == [0, 10, 20] and mean.tolist() == [1, 2, 3] and deviation.tolist() == [1, 1, 1]
+
+
+def test_the_learners_study_names_published_forms_and_rewards_and_when_people_were_reached(tmp_path):
+    leave_run(tmp_path / "a", low="pdqn", twin_q="false", scores=(0.0, 2.0, 1.0))
+    leave_run(tmp_path / "b", low="pdqn", twin_q="false", multipass="false", reward="sparse", scores=(0.0, 1.9))
+    leave_run(tmp_path / "c", low="pdqn")
+    results, curves = study("learners").gather(finished([tmp_path]))
+    assert [(row["low"], row["reward"], row["presses_to_people"]) for row in results] == [
+        ("pdqn as MP-DQN", "given", 100.0),
+        ("pdqn as P-DQN", "sparse", ""),
+        ("pdqn", "given", 200.0),
+    ]
+    assert len(curves) == 8 and math.isclose(curves[1]["eval/success"], 0.1)
