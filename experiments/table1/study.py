@@ -151,7 +151,7 @@ def draw_curves(curves: Rows, results: Rows, path: Path) -> None:
             _draw_line(axes, "people", HUMAN[boat][key], PEOPLE, "--")
             _draw_line(axes, "random", RANDOM[key], FAINT, ":")
             axes.set_title(f"{boat} boat", loc="left", fontweight="bold", fontsize=10)
-        row[0].legend(loc="lower right", fontsize=8, frameon=False, ncols=2)
+        row[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.18), fontsize=8, frameon=False, ncols=2)
     figure.savefig(path, dpi=130)
 
 
@@ -164,7 +164,8 @@ def _draw_learners(axes: Axes, curves: Rows, boat: str, key: str) -> None:
         late = x > 0  # the axis is logarithmic
         x, mean, deviation = x[late], mean[late], deviation[late]
         axes.plot(x, mean, color=colour, linewidth=1.8, label=low, marker="o" if len(x) < 5 else None, markersize=4)
-        axes.fill_between(x, mean - deviation, mean + deviation, color=colour, alpha=0.18, linewidth=0)
+        high = mean + deviation if key == "score" else np.minimum(mean + deviation, 1.0)
+        axes.fill_between(x, mean - deviation, high, color=colour, alpha=0.18, linewidth=0)
     label, bottom, top = PANELS[key]
     axes.set(xscale="log", xlabel="presses", ylabel=label, ylim=(bottom, top))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -176,8 +177,8 @@ def _draw_learners(axes: Axes, curves: Rows, boat: str, key: str) -> None:
 def _draw_line(axes: Axes, name: str, height: float, colour: str, style: str) -> None:
     axes.axhline(height, color=colour, linestyle=style, linewidth=1.0, zorder=1)
     text = f"{name} {height:.2f}" if axes.get_ylim()[1] > 2 else f"{name} {height:.0%}"
-    axes.annotate(text, (0.01, height), xytext=(0, 2), xycoords=("axes fraction", "data"),
-                  textcoords="offset points", fontsize=8)  # fmt: skip
+    axes.annotate(text, (0.995, height), xytext=(0, 2), xycoords=("axes fraction", "data"),
+                  textcoords="offset points", fontsize=8, ha="right")  # fmt: skip
 
 
 def draw_efficiency(curves: Rows, results: Rows, path: Path) -> None:
