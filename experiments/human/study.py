@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -251,20 +251,27 @@ def draw_agreement(axes: Axes) -> None:
     axes.legend(frameon=True, loc="lower right", fontsize=8)
 
 
+def cells(rows: dict[str, np.ndarray], of_blocks: np.ndarray) -> str:
+    """Return a line's cells: means over the episodes of these blocks."""
+
+    def mean(name: str, controller: int = -1) -> float:
+        own = of_blocks & (rows["controller"] == controller)
+        return np.average(rows[name][own], weights=rows["episodes"][own])
+
+    shares = [f"{mean(name):.1%}" for name in ("success", "too_fast", "out_of_bounds", "out_of_fuel")]
+    scores = [f"{mean('score', controller):.3f}" for controller in (-1, 1, 0)]
+    gaps = [f"{mean(name):.2f}" for name in ("presses", "press_gap", "choice_gap")]
+    return " | ".join([*scores, *shares, *gaps])
+
+
 def tabulate() -> None:
     """Print the tables of the page."""
     rows = load("blocks")
-    print(
-        "| episodes | score | congruent | incongruent | success | too fast | out | no fuel | presses | keys | choice |"
-    )
+    print("| episodes | score | congruent | incongruent | success | too fast | out | no fuel | presses | keys | boat |")
     print("|---|" + "---|" * 10)
     for block in np.unique(rows["block"]):
-        every, incongruent, congruent = (np.flatnonzero((rows["block"] == block) & (rows["controller"] == c))[0]
-                                         for c in (-1, 0, 1))  # fmt: skip
-        shares = [f"{rows[name][every]:.1%}" for name in ("success", "too_fast", "out_of_bounds", "out_of_fuel")]
-        scores = [f"{rows['score'][i]:.3f}" for i in (every, congruent, incongruent)]
-        gaps = [f"{rows[name][every]:.2f}" for name in ("presses", "press_gap", "choice_gap")]
-        print(f"| {60 * block + 1:.0f} to {60 * block + 60:.0f} | {' | '.join([*scores, *shares, *gaps])} |")
+        print(f"| {60 * block + 1:.0f} to {60 * block + 60:.0f} | {cells(rows, rows['block'] == block)} |")
+    print(f"| all | {cells(rows, np.ones_like(rows['block'], dtype=bool))} |")
     persons = load("people")
     for name in ("score", "success", "better_boat", "gap", "press_gap", "choice_gap", "ceiling", "score_last_60"):
         low, middle, high = np.quantile(persons[name], [0, 0.5, 1])
@@ -277,10 +284,15 @@ def tabulate() -> None:
     print(f"best agreement {agreement['agreement'].max():.3f}; near ours {agreement['agreement'][ours]}")
 
 
-if __name__ == "__main__":
-    if sys.argv[1:] == ["measure"]:
+def main(words: Sequence[str]) -> None:
+    """Measure, if asked; draw, tabulate."""
+    if list(words) == ["measure"]:
         measure()
-    elif sys.argv[1:]:
+    elif words:
         sys.exit(__doc__)
     draw()
     tabulate()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -65,12 +65,13 @@ def _name(run: Run) -> str:
 
 
 def table(results: Rows) -> str:
-    """Return mean and standard deviation over seeds, a line a learner, problem and reward."""
+    """Return mean and standard deviation over seeds, a line a learner, problem and reward; Platform last."""
     lines = [
         "| learner | problem | reward | seeds | score | success | presses | wall | CPU | presses to 1.97 | after |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for (low, problem, reward), rows in groups(results, "low", "problem", "reward").items():
+    cases = groups(results, "low", "problem", "reward").items()
+    for (low, problem, reward), rows in sorted(cases, key=lambda case: (case[0][1] not in BOATS, case[0][2])):
         score, success = ([row[name] for row in rows] for name in ("score", "success"))
         wall, cpu, presses = (np.mean([row[name] for row in rows]) for name in ("wall_s", "cpu_s", "presses"))
         reached = [row for row in rows if row["presses_to_people"]]
