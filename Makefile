@@ -3,7 +3,7 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 IS_ALLOWED := import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
 
-.PHONY: run test
+.PHONY: run test report
 
 # A first run: which boat, by UCB; how to sail it, by HyAR. More settings: make run ARGS="seed=1"
 run: $(VENV)/.installed
@@ -13,6 +13,10 @@ test: $(VENV)/.installed
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m pytest -n auto $(ARGS)
+
+# Figures, tables and pages of all studies, from their csv files: report/report.html
+report: $(VENV)/.installed
+	$(PYTHON) experiments/report.py
 
 # A python on the PATH may be a stub that does not run (pyenv) or lack venv's pip (Debian), so each is tried.
 $(VENV)/.installed: pyproject.toml constraints.txt
