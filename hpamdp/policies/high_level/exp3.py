@@ -72,9 +72,8 @@ class Exp3(Bandit):
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return uniformly random options and their probabilities, `[*B]` each."""
         chosen = super().choose_uniformly(td)
-        return chosen | {
-            PROBABILITY: torch.full_like(chosen[keys.OPTION], 1.0 / self.specs.num_options, dtype=torch.double)
-        }
+        uniform = 1.0 / self.specs.num_options
+        return chosen | {PROBABILITY: torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add to the gains what the finished decisions earned over the probability of their choice."""
