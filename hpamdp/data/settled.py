@@ -1,13 +1,13 @@
 """People's presses as they would be if every boat came to rest before the next press, as the environment's boats do.
 
-People can press a key while their boat still glides: the glide ends there. They use that as a brake, a tap that hardly
-moves the boat but keeps the press before from going too far. In the environment a boat always glides out, so a tap does
-nothing, and a policy that copies the recorded presses goes too far, then taps until its tank is empty. Here
+Two things in the recording mislead whoever copies it. A press that begins while the boat still glides ends the glide, so
+a press often brought its boat less far than it would here. And presses that overlapped another are missing, among them
+most of those that ended their episodes: four of five final presses in the log are too short, or aimed past the dock, to
+have done it. A policy that copies all this taps where it should press, and runs dry. Here
 - a press lasts as long as takes a gliding boat to where it was when the next press began (P inverted);
-- taps, presses that moved the boat less than `TAP`, are gone;
-- so are final presses that, by our physics, would not have ended as theirs did: they had the glide of the press before.
-
-Where the final press is gone, the last one left leads to where it began.
+- presses that moved the boat less than `TAP` are gone;
+- so are final presses that, by our physics, would not have ended as their episodes did.
+Where the final press is gone, the last one left leads to where it began, and the episode is cut, not over.
 """
 
 from __future__ import annotations
