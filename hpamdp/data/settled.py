@@ -1,6 +1,6 @@
 """People's presses as they would be if every boat came to rest before the next press, as the environment's boats do.
 
-Two things in the recording mislead whoever copies it. A press that begins while the boat still glides ends the glide, so
+Two things in the recording mislead whoever copies it. A press that begins while the boat glides ends the glide, so
 a press often brought its boat less far than it would here. And presses that overlapped another are missing, among them
 most of those that ended their episodes: four of five final presses in the log are too short, or aimed past the dock, to
 have done it. A policy that copies all this taps where it should press, and runs dry. Here
