@@ -7,6 +7,7 @@ python experiments/hierarchy/study.py                        draws and tabulates
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,7 +27,7 @@ SELECTORS = {
     "lin_thompson": "#56B4E9",
     "actor": "#CC79A7",
     "ucb": "#D55E00",
-    "thompson": "#E69F00",
+    "thompson": "#AA4499",
     "epsilon_greedy": "#882255",
     "exp3": "#999933",
     "uniform": "#8c8c8c",
@@ -43,7 +44,6 @@ FIGURES = {
     "entropy": "choice_entropy",
     "score_congruent": "score_congruent",
     "score_incongruent": "score_incongruent",
-    "frames": "frames",
     "wall_s": "wall_s",
     "cpu_s": "cpu_s",
 }
@@ -54,7 +54,9 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
     results, curves, choices = [], [], []
     for run in runs:
         summary = run.summary
-        name = {"high": summary["high"], "low": summary["low"], "seed": summary["seed"]}
+        practice = run.config.agent.get("practice_frames", 0)
+        name = {"high": summary["high"], "low": summary["low"], "total": run.config.total_frames, "practice": practice}
+        name["seed"] = summary["seed"]
         results.append(name | {column: round(summary[key], 4) for column, key in FIGURES.items()})
         for row in run.evaluations():
             told = {key: row[f"eval/{key}"] for key in ("score", "regret", "oracle_agreement")}
@@ -72,20 +74,30 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
 def table(results: Rows) -> str:
     """Return a line a selector and learner: mean and standard deviation over seeds."""
     lines = [
-        "| selector | learner | seeds | score | oracle's choice | weighted | regret | gain | success | presses | CPU |",
+        "| selector | learner | presses, uniform | n | score | oracle's | weighted | regret | gain | success | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     by_score = sorted(
-        groups(results, "low", "high").items(), key=lambda item: (item[0][0], -np.mean([r["score"] for r in item[1]]))
+        groups(results, "low", "total", "practice", "high").items(),
+        key=lambda item: (*item[0][:3], -np.mean([row["score"] for row in item[1]])),
     )
-    for (low, high), rows in by_score:
+    for (low, total, practice, high), rows in by_score:
         mean = {key: np.mean([row[key] for row in rows]) for key in FIGURES}
+        name = f"| {high} | {low} | {total:,.0f}, {practice:,.0f} | {len(rows)}"
+        score, agreement = spread([row["score"] for row in rows]), f"{mean['agreement']:.1%}"
         lines.append(
-            f"| {high} | {low} | {len(rows)} | {spread([row['score'] for row in rows])} | {mean['agreement']:.1%} | "
-            f"{mean['weighted_agreement']:.1%} | {mean['regret']:.3f} | {mean['choice_gain']:.3f} | "
-            f"{mean['success']:.1%} | {mean['frames']:,.0f} | {mean['cpu_s']:.0f} s |"
+            f"{name} | {score} | {agreement} | {mean['weighted_agreement']:.1%} | {mean['regret']:.3f} | "
+            f"{mean['choice_gain']:.3f} | {mean['success']:.1%} | {mean['cpu_s']:.0f} s |"
         )
     return "\n".join(lines)
+
+
+def of_the_map(rows: Rows) -> Rows:
+    """Return the rows of those runs of each learner that all selectors have: its commonest length, no practice."""
+    lengths = {
+        low: Counter(row["total"] for row in of).most_common(1)[0][0] for (low,), of in groups(rows, "low").items()
+    }
+    return [row for row in rows if row["total"] == lengths[row["low"]] and not row["practice"]]
 
 
 def draw_map(results: Rows, path: Path) -> None:
@@ -158,11 +170,12 @@ def main(folders: Sequence[str]) -> None:
         for name, rows in zip(names, gather(finished(folders)), strict=True):
             write_csv(HERE / f"{name}.csv", rows)
     results, curves, choices = (read_csv(HERE / f"{name}.csv") for name in names)
+    print(table(results))
+    results, curves, choices = map(of_the_map, (results, curves, choices))
     draw_map(results, HERE / "map.png")
     draw_curves(curves, "regret", "regret of the greedy choice", HERE / "regret.png")
     draw_curves(curves, "score", "score, greedy, 1,000 layouts", HERE / "curves.png")
     draw_choices(choices, HERE / "choices.png")
-    print(table(results))
 
 
 if __name__ == "__main__":
