@@ -31,7 +31,7 @@ from hpamdp.config import GROUPS, RUN_FILE, ConfigError, no_such, no_such_option
 _MISTAKE, _INTERRUPTED = 2, 130
 # Launchers and sweepers of packages of their own, and the extra of pyproject.toml that brings each.
 _EXTRAS = {
-    "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray"},
+    "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
     "hydra/sweeper": {"optuna": "optuna"},
 }
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"

@@ -32,6 +32,10 @@ def choices(group: str) -> list[str]:
     return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
 
 
+# The learners that learn from presses of their own; the others learn from data sets alone.
+TRAINED = sorted({*choices("low")} - {"bc"})
+
+
 @contextmanager
 def global_generators_unmoved() -> Iterator[None]:
     """Assert that what happens inside moves none of the global random generators."""

@@ -10,7 +10,7 @@ import time
 
 import pytest
 import torch
-from conftest import CONF, choices, compose_config
+from conftest import CONF, TRAINED, compose_config
 
 from hpamdp.assemble import assemble
 from hpamdp.collection.worker import PolicyCopy, Share, packed
@@ -105,9 +105,9 @@ def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
     assert collection.cpu_s > 0.0
 
 
-@pytest.mark.parametrize("low", choices("low"))
+@pytest.mark.parametrize("low", TRAINED)
 def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
-    warmup = ["low.warmup_frames=8"] if low in ("hyar", "hsac", "pdqn", "qpamdp") else []
+    warmup = ["low.warmup_frames=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
     warmup += ["low.codec_pretrain_updates=2"] if low == "hyar" else []
     cfg = compose_config(["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "high=ucb", f"low={low}", *warmup])
     parts = assemble(cfg, run_config(cfg), tmp_path)

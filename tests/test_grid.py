@@ -5,7 +5,7 @@ import json
 
 import pytest
 import torch
-from conftest import choices, compose_config
+from conftest import TRAINED, choices, compose_config
 from tensordict import TensorDict
 
 from hpamdp import checkpoint
@@ -27,9 +27,6 @@ SHORT = {
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
-# These learn from data sets alone.
-OFFLINE = {"bc"}
-TRAINED = [low for low in choices("low") if low not in OFFLINE]
 SMALL = ["num_envs=16", "steps_per_batch=4", "total_frames=256", "eval.layouts=10", "eval.every=0", "log_every=0"]
 
 
