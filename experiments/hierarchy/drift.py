@@ -25,7 +25,7 @@ from hpamdp.study import Rows, groups, read_csv, write_csv
 HERE = Path(__file__).resolve().parent
 SELECTORS = ("ucb", "thompson", "epsilon_greedy", "exp3")
 MEMORIES = {"all": "#2b2b2b", "discounted": "#0072B2", "sliding_window": "#D55E00"}
-SEEDS = range(1)
+SEEDS = range(3)
 NUM_ENVS, DECISIONS, EVERY = 20, 10_000, 200
 # Of the incongruent and of the congruent boat: the congruent one is the better one first, then the other.
 NOISE = ((0.15, 0.0), (0.0, 0.15))
