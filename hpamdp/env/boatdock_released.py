@@ -16,11 +16,12 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, released
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.columns import taken_back, where
 
 
 class ReleasedBoatDockEnv(PAMDPEnv):
@@ -136,14 +137,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         if not columns:
             self._reset()
             return
-        if set(columns) != set(released.ReleasedState._fields):
-            fields = ", ".join(released.ReleasedState._fields)
-            raise ValueError(f"ReleasedBoatDockEnv: the state has {fields}, not {', '.join(columns)}")
-        for name, column in columns.items():
-            if column.shape != (self.num_envs,):
-                given = f"the state's {name} is {list(column.shape)}"
-                raise ValueError(f"ReleasedBoatDockEnv: {given}, but must be [{self.num_envs}]")
-        self._state = released.ReleasedState(*(columns[name].to(now) for name, now in self._state._asdict().items()))
+        self._state = taken_back(columns, self._state, "ReleasedBoatDockEnv")
 
     def _make_specs(self) -> None:
         n, device, dtype = self.num_envs, self.device, self.float_type
@@ -153,13 +147,8 @@ class ReleasedBoatDockEnv(PAMDPEnv):
             outcome=Categorical(len(released.OUTCOMES), shape=(n,), device=device),
             shape=(n,),
         )
-        num_keys = len(self.parameter_dims)
-        press = Composite(
-            key=Categorical(num_keys, shape=(n,), device=device),
-            duration=Bounded(-1.0, 1.0, shape=(n, num_keys), device=device),
-            shape=(n,),
-        )
-        self.action_spec = Composite(action=press, shape=(n,))
+        bound = torch.ones(len(self.parameter_dims))
+        self.action_spec = self.make_action_spec(-bound, bound)
         self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=dtype)
         self.done_spec = self.make_done_spec()
 
@@ -194,7 +183,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
             outcome=torch.full_like(before.outcome, released.SAILING),
             episode=episode,
         )
-        self._state = released.where(mask, fresh, before)
+        self._state = where(mask, fresh, before)
         return self._read()
 
     def _drawn_layout(self, rng: Tensor, mask: Tensor) -> dict[str, Tensor]:
@@ -233,7 +222,8 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         return {**columns, "keymap": keymap.to(self.device, torch.int32)}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        key, duration = self._checked_action(tensordict.get(keys.KEY), tensordict.get(keys.DURATION))
+        self.check_action(tensordict)
+        key, duration = self._checked_press(tensordict.get(keys.KEY), tensordict.get(keys.DURATION))
         before = self._state
         is_over = before.outcome != released.SAILING
         mask = tensordict.get("_step", None)
@@ -241,20 +231,12 @@ class ReleasedBoatDockEnv(PAMDPEnv):
             is_over = is_over | ~mask.reshape(self.num_envs)
         direction = self._directions[before.keymap.clamp(min=0).long(), key]
         after, reward = released.press(before, direction, duration, self.max_steps)
-        self._state = released.where(is_over, before, after)
+        self._state = where(is_over, before, after)
         return self._read().set(keys.REWARD, torch.where(is_over, 0.0, reward).unsqueeze(-1))
 
-    def _checked_action(self, key: Tensor | None, durations: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _checked_press(self, key: Tensor, durations: Tensor) -> tuple[Tensor, Tensor]:
         """Return the keys `[N]` and their durations `[N]`, clipped to [-1, 1]."""
-        num_keys = len(self.parameter_dims)
-        expected = ((keys.KEY, key, (self.num_envs,)), (keys.DURATION, durations, (self.num_envs, num_keys)))
-        for name, value, shape in expected:
-            if value is None or value.shape != shape:
-                given = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
-        if key.is_floating_point():
-            raise ValueError(f"step: {keys.KEY} has type {key.dtype}, but must be integer")
-        allowed = key.clamp(0, num_keys - 1).long()
+        allowed = key.clamp(0, len(self.parameter_dims) - 1).long()
         duration = durations.gather(-1, allowed.unsqueeze(-1)).squeeze(-1)
         is_action = (key == allowed) & duration.isfinite()
         if not is_action.all():

@@ -20,7 +20,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.columns import where
+from hpamdp.env.columns import taken_back, where
 
 RUN, HOP, LEAP = range(3)
 PARAMETER_HIGH = (30.0, 720.0, 430.0)
@@ -134,14 +134,7 @@ class PlatformEnv(PAMDPEnv):
         if not columns:
             self._reset()
             return
-        if set(columns) != set(PlatformState._fields):
-            raise ValueError(f"PlatformEnv: the state has {', '.join(PlatformState._fields)}, not {', '.join(columns)}")
-        for name, column in columns.items():
-            if column.shape != (self.num_envs,):
-                raise ValueError(
-                    f"PlatformEnv: the state's {name} is {list(column.shape)}, but must be [{self.num_envs}]"
-                )
-        self._state = PlatformState(*(columns[name].to(now) for name, now in self._state._asdict().items()))
+        self._state = taken_back(columns, self._state, "PlatformEnv")
 
     def _make_specs(self) -> None:
         n, device = self.num_envs, self.device

@@ -166,8 +166,3 @@ def observe(state: ReleasedState, is_congruent: bool, is_scaled: bool) -> Tensor
     if is_scaled:
         columns += [(state.goal_x - state.x) / length, (state.goal_y - state.y) / length]
     return torch.stack(columns, -1)
-
-
-def where(mask: Tensor, new: ReleasedState, old: ReleasedState) -> ReleasedState:
-    """Take `new` in the rows of `mask` `[N]` and `old` elsewhere."""
-    return ReleasedState(*(torch.where(mask, n, o) for n, o in zip(new, old, strict=True)))
