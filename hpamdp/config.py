@@ -62,6 +62,7 @@ class EvalConfig(BaseModel):
     every: NonNegativeInt
     layouts: PositiveInt
     seed: Seed
+    stop_score: float | None = None  # early runs' configs lack it
 
 
 class AgentConfig(BaseModel):
@@ -118,6 +119,11 @@ class RunConfig(BaseModel):
         """How long the run is to train: in updates with mode=offline, else in presses or decisions."""
         return self.offline.updates if self.mode == "offline" else self.total_frames
 
+    @property
+    def eval_every(self) -> int:
+        """How far evaluations are apart, in the same; 0: only at the start and at the end."""
+        return self.offline.eval_every if self.mode == "offline" else self.eval.every
+
     def resolve_device(self) -> torch.device:
         """Return the device to run on.
 
@@ -155,6 +161,9 @@ def run_config(cfg: DictConfig) -> RunConfig:
         raise ConfigError("checkpoint: goes with mode=eval only; to go on with a run, set resume")
     if run.mode == "eval" and run.resume is not None:
         raise ConfigError("resume: goes with mode=train and mode=offline; to score an agent, set checkpoint")
+    if run.eval.stop_score is not None and run.eval_every == 0:
+        every = "offline.eval_every" if run.mode == "offline" else "eval.every"
+        raise ConfigError(f"eval.stop_score={run.eval.stop_score}: wants evaluations on the way; set {every} above 0")
     return run
 
 

@@ -153,7 +153,8 @@ def _final_score(wanted: DictConfig, folder: Path) -> float | None:
     except (OSError, ValueError):  # not there, or cut off in the middle
         return None
     num_frames = wanted.offline.updates if wanted.mode == "offline" else wanted.total_frames
-    if wanted.mode != "eval" and summary["frames"] < num_frames:
+    is_good_enough = wanted.eval.stop_score is not None and summary["score"] >= wanted.eval.stop_score
+    if wanted.mode != "eval" and summary["frames"] < num_frames and not is_good_enough:
         return None
     return summary["score"]
 
@@ -163,7 +164,8 @@ def _check_same(wanted: DictConfig, file: Path) -> None:
     saved = _flat(OmegaConf.to_container(OmegaConf.load(file))) if file.is_file() else {}
     # Written and read as the saved one was.
     own = _flat(OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(wanted, resolve=True))))
-    keys = [key for key in {**own, **saved} if key not in own or key not in saved or own[key] != saved[key]]
+    # An older config may lack what is null now.
+    keys = [key for key in {**own, **saved} if own.get(key) != saved.get(key)]
     if keys:
         there, here = (json.dumps(values.get(keys[0]), default=str) for values in (saved, own))
         more = f" and {len(keys) - 1} more" if keys[1:] else ""

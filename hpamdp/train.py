@@ -60,7 +60,6 @@ class Trainer:
         # A frame is what the run is counted in.
         self.is_offline = settings.mode == "offline"
         self.unit = " updates" if self.is_offline else " decisions" if settings.low.freeze else " presses"
-        self.eval_every = settings.offline.eval_every if self.is_offline else settings.eval.every
 
     def restore(self, source: Path) -> None:
         """Take the agent from a checkpoint and, to train on, where its run stood."""
@@ -78,7 +77,7 @@ class Trainer:
         self.recorder.resume_from(source.parent, self.frames)
 
     def train(self) -> bool:
-        """Run until `num_frames`; return whether the user stopped it before. Either way the agent is saved."""
+        """Run until `num_frames` or `eval.stop_score`, save the agent; return whether the user stopped it before."""
         context = {"cfg": self.cfg, "settings": self.settings, "parts": self.parts, "frames": self.frames}
         collection = build("collector", self.cfg.collector, **context)
         total = self.settings.num_frames
@@ -101,22 +100,23 @@ class Trainer:
     def _loop(self, collection: Collection, bar: tqdm) -> None:
         settings = self.settings
         wall_before, cpu_before = self.wall_s - time.perf_counter(), self.cpu_s - time.process_time()
+        is_good_enough = False
         if self.frames == 0:
-            self._log(bar, is_evaluated=True)
+            is_good_enough = self._evaluate(bar)
             if self.parts.data is not None:
                 self.parts.agent.remember(self.parts.data)
-        while self.frames < self.settings.num_frames:
+        while self.frames < settings.num_frames and not is_good_enough:
             num = self._learn(collection)
             last, self.frames = self.frames, self.frames + num
             self.wall_s = wall_before + time.perf_counter()
             self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
             bar.update(num)
-            is_over = self.frames >= self.settings.num_frames
-            if is_over or _is_due(last, self.frames, self.eval_every):
-                self._log(bar, is_evaluated=True)
+            is_over = self.frames >= settings.num_frames
+            if is_over or _is_due(last, self.frames, settings.eval_every):
+                is_good_enough = self._evaluate(bar)
             elif _is_due(last, self.frames, settings.log_every):
-                self._log(bar, is_evaluated=False)
-            if not is_over and _is_due(last, self.frames, settings.checkpoint_every):
+                self.recorder.log(self.frames, self.wall_s, is_evaluated=False)
+            if not is_over and not is_good_enough and _is_due(last, self.frames, settings.checkpoint_every):
                 self.save(collection)
 
     def _learn(self, collection: Collection) -> int:
@@ -129,11 +129,13 @@ class Trainer:
         self.recorder.take(batch, self.parts.agent.learn(batch))
         return batch.numel()
 
-    def _log(self, bar: tqdm, is_evaluated: bool) -> None:
-        row = self.recorder.log(self.frames, self.wall_s, is_evaluated)
-        if is_evaluated:
-            success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
-            bar.set_postfix_str(f"score {row['eval/score']:.2f}{success}")
+    def _evaluate(self, bar: tqdm) -> bool:
+        """Write a row with an evaluation; return whether its score is the one to stop at."""
+        row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True)
+        success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
+        bar.set_postfix_str(f"score {row['eval/score']:.2f}{success}")
+        stop_score = self.settings.eval.stop_score
+        return stop_score is not None and row["eval/score"] >= stop_score
 
     def save(self, collection: Collection) -> None:
         """Write the checkpoint."""

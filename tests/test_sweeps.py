@@ -84,6 +84,13 @@ def test_a_sweep_started_again_does_what_is_left(command, jobs):
     assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
 
 
+def test_a_run_that_reached_its_stop_score_is_finished(command, jobs):
+    words = ["-m", "seed=3", "eval.stop_score=3", "hydra.sweep.dir=sweep"]
+    command(*words)
+    code, out, _ = command(*words)
+    assert code == 0 and len(jobs) == 1 and "Job 0: skipped, finished before\n" in out
+
+
 def test_the_results_of_another_config_stay_as_they_are(command, jobs, tmp_path):
     command("-m", "seed=4", "hydra.sweep.dir=sweep")
     before = {file: file.read_bytes() for file in (tmp_path / "sweep/0").iterdir()}

@@ -1,6 +1,7 @@
 """A run from start to end: what it leaves behind, that it can be stopped, resumed and scored again."""
 
 import csv
+import itertools
 import json
 import os
 import signal
@@ -14,6 +15,7 @@ from conftest import compose_config
 from hpamdp import checkpoint
 from hpamdp.config import ConfigError
 from hpamdp.env import harbour
+from hpamdp.evaluate import Evaluation
 from hpamdp.reference import human_normalised
 from hpamdp.train import run
 
@@ -79,6 +81,18 @@ def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
     assert all(torch.equal(states[0][column], states[1][column]) for column in states[0])
 
 
+def test_training_ends_at_the_first_evaluation_that_reaches_the_stop_score(tmp_path, monkeypatch):
+    measure, rising = Evaluation.measure, itertools.count()
+    monkeypatch.setattr(Evaluation, "measure", lambda *given: measure(*given) | {"score": float(next(rising))})
+    # Scored 0 are random presses, 1 is the start.
+    assert start(tmp_path, "low=random", "total_frames=4096", "eval.stop_score=3") == 0
+    assert [(row["frames"], row["eval/score"]) for row in rows_of(tmp_path)][-2:] == [
+        ("512.0", "2.0"),
+        ("1024.0", "3.0"),
+    ]
+    assert checkpoint.progress_of(tmp_path / "checkpoint.zip")["frames"] == 1024
+
+
 def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys):
     timer = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
@@ -139,6 +153,7 @@ def test_a_run_goes_on_in_its_own_folder_with_its_own_rows_before(tmp_path):
         (["high=fixed", "high.option=sideways"], "incongruent, congruent"),
         (["resume=/nowhere"], "no checkpoint"),
         (["mode=eval", "checkpoint=/nowhere"], "no checkpoint"),
+        (["eval.stop_score=1.97", "eval.every=0"], "set eval.every above 0"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line_before_anything_is_written(tmp_path, words, complaint):
