@@ -108,6 +108,25 @@ def test_decisions_of_one_environment_survive_the_resets_of_others():
         account(environment, 1.0)
 
 
+@pytest.mark.parametrize("mask", [None, [True, False, True]])
+def test_layouts_given_to_a_reset_reach_the_boats_whole_or_in_part(mask):
+    env = with_decisions(BoatDockEnv(3, seed=1))
+    before = env.reset()
+    layout = TensorDict({"start": points(560.0), "goal": points(700.0)}, [3])
+    if mask is not None:
+        layout["_reset"] = torch.tensor(mask).unsqueeze(-1)
+    after = env.reset(before.clone().update(layout))
+    is_new = torch.ones(3, dtype=torch.bool) if mask is None else torch.tensor(mask)
+    given = BoatDockEnv(3, seed=1).reset(layout.exclude("_reset"))
+    expected = torch.where(is_new.unsqueeze(-1), given[keys.OBSERVATION], before[keys.OBSERVATION])
+    assert torch.equal(after[keys.OBSERVATION], expected)
+    assert not torch.equal(env.reset()[keys.OBSERVATION], after[keys.OBSERVATION])  # of that reset alone
+
+
+def points(x):
+    return torch.tensor([[x, 480.0 + 10.0 * i] for i in range(3)])
+
+
 def test_the_selector_learns_from_every_decision_once_oldest_first():
     class Listener(Uniform):
         heard = ()

@@ -55,7 +55,7 @@ class PAMDPEnv(EnvBase):
         return None
 
     def begin_with(self, episodes: TensorDict | None) -> None:
-        """Make these the episodes of the next reset of all environments, as if that were given them.
+        """Make these the episodes of the next reset, as if given to it; with `_reset` in them, of the next partial one.
 
         TorchRL's transforms drop what a reset is given; this reaches the environment under them.
         """
@@ -63,7 +63,7 @@ class PAMDPEnv(EnvBase):
 
     def _asked_of_reset(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
         """Return what `_reset` was given, or in its place what `begin_with` was."""
-        if self._next_episodes is None or (tensordict is not None and "_reset" in tensordict.keys()):
+        if self._next_episodes is None or _is_partial(tensordict) != _is_partial(self._next_episodes):
             return tensordict
         episodes, self._next_episodes = self._next_episodes, None
         return episodes
@@ -137,3 +137,7 @@ class PAMDPEnv(EnvBase):
         flag = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
         flags = {name: flag.clone() for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
         return Composite(flags, shape=self.batch_size, device=self.device)
+
+
+def _is_partial(tensordict: TensorDictBase | None) -> bool:
+    return tensordict is not None and "_reset" in tensordict.keys()

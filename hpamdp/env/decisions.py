@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, Unbounded
-from torchrl.envs import EnvBase, Transform, TransformedEnv
+from torchrl.envs import Transform, TransformedEnv
 
 from hpamdp import keys
+from hpamdp.env.base import PAMDPEnv
 
 
 class DecisionTracker(Transform):
@@ -87,6 +90,15 @@ def _unless(is_first: Tensor, account: Tensor) -> Tensor:
     return torch.where(is_first, torch.zeros_like(account), account)
 
 
-def with_decisions(env: EnvBase, gamma: float = 1.0, option_length: int | None = None) -> TransformedEnv:
+class DecisionEnv(TransformedEnv):
+    """An environment with its decisions tracked, whose `reset` takes what the environment's own takes."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        if tensordict is not None:
+            self.base_env.begin_with(tensordict)  # TorchRL passes no more than the mask on
+        return super()._reset(tensordict, **kwargs)
+
+
+def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: int | None = None) -> DecisionEnv:
     """Return the environment with its decisions tracked."""
-    return TransformedEnv(env, DecisionTracker(gamma, option_length))
+    return DecisionEnv(env, DecisionTracker(gamma, option_length))
