@@ -11,7 +11,11 @@ import pytest
 from hpamdp.study import curve, finished, groups, interquartile_mean, read_csv, spread, write_csv
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
-CONFIG = "low: {{twin_q: {twin_q}, multipass: {multipass}}}\nenv: {{controller: congruent, reward: {reward}}}\n"
+CONFIG = (
+    "low: {{twin_q: {twin_q}, multipass: {multipass}}}\n"
+    "env: {{controller: congruent, reward: {reward}}}\n"
+    "eval: {{stop_score: {stop_score}}}\n"
+)
 
 
 def study(name):
@@ -32,7 +36,7 @@ def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), **config):
     summary |= {"frames": 200, "wall_s": 2.04, "cpu_s": 1.0}
     (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "config.yaml").write_text(
-        CONFIG.format(**{"twin_q": "true", "multipass": "true", "reward": "paper"} | config)
+        CONFIG.format(**{"twin_q": "true", "multipass": "true", "reward": "paper", "stop_score": "null"} | config)
     )
     lines = ["frames,wall_s,loss,eval/score,eval/success", "50,0.5,1.0,,"]
     lines += [f"{100 * i},{i},,{score},{0.1 * i}" for i, score in enumerate(scores)]
@@ -111,3 +115,13 @@ def test_the_learners_study_names_published_forms_and_rewards_and_when_people_we
         ("pdqn", "given", 200.0),
     ]
     assert len(curves) == 8 and math.isclose(curves[1]["eval/success"], 0.1)
+
+
+def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length_ones(tmp_path):
+    leave_run(tmp_path / "a", scores=(0.0, 2.0, 3.3))
+    leave_run(tmp_path / "b", scores=(0.0, 3.1), reward="sparse")
+    leave_run(tmp_path / "c", scores=(0.0, 2.0), stop_score=1.97)
+    found = study("table1").gather(finished([tmp_path]))
+    assert [(row["reward"], row["score"]) for row in found["results"]] == [("given", 3.3), ("sparse", 3.1)]
+    assert len(found["curves"]) == 5
+    assert [(row["frames"], row["eval/score"]) for row in found["efficiency"]] == [(0.0, 0.0), (100.0, 2.0)]

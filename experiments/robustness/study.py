@@ -1,7 +1,8 @@
 """Score trained agents under noise that they were not, or were, trained with.
 
-python experiments/robustness/study.py RUN...   scores the agents in these folders, writes results.csv, then draws
-python experiments/robustness/study.py          draws and tabulates what results.csv holds
+python experiments/robustness/study.py FOLDER...   scores the agents of the finished runs in these folders, writes
+                                                   results.csv, then draws and tabulates
+python experiments/robustness/study.py             draws and tabulates what results.csv holds
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ from pathlib import Path
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from hpamdp import checkpoint
 from hpamdp.assemble import make_agent, make_env, resolve
+from hpamdp.config import name_of
 from hpamdp.env.decisions import with_decisions
 from hpamdp.evaluate import Evaluation
+from hpamdp.reference import HUMAN
 from hpamdp.specs import PAMDPSpecs
-from hpamdp.study import Rows, groups, read_csv, spread, write_csv
+from hpamdp.study import Rows, finished, groups, read_csv, spread, write_csv
 
 HERE = Path(__file__).resolve().parent
 LEVELS = {
@@ -34,18 +38,19 @@ AXES = {
     "sensor_noise": "deviation of positions, px",
     "slip": "probability of a random key",
 }
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#2b2b2b")
+NO_NOISE = "no noise"
 
 
-def score(folder: str) -> Iterator[dict[str, float | str]]:
+def score(folder: Path) -> Iterator[dict[str, float | str]]:
     """Yield a row for each noise and level: the score of the agent in a run's output folder."""
     device = torch.device("cpu")
     with initialize_config_dir(str(HERE.parents[1] / "conf"), version_base="1.3"):
         words = ["mode=eval", f"checkpoint={folder}"]
         cfg, settings, source = resolve(compose("config", words), words)
-    trained = {name: cfg.env[name] for name in LEVELS}
-    noisy = [f"{name} {value}" for name, value in trained.items() if value]
-    low = {"agent": f"{cfg.high._target_ and cfg.high._target_.split('.')[-2]} x {cfg.low._target_.split('.')[-2]}"}
+    noisy = [f"{noise} {cfg.env[noise]}" for noise in LEVELS if cfg.env[noise]]
+    who = {"agent": name_of(cfg.low) if name_of(cfg.high) == "none" else f"{name_of(cfg.high)} x {name_of(cfg.low)}"}
+    who |= {"trained_with": ", ".join(noisy) or NO_NOISE, "seed": cfg.seed}
     agent = make_agent(cfg, settings, PAMDPSpecs.from_env(make_env(cfg, 1, device, 0)), device)
     checkpoint.load(source, agent, device, with_training=False)
     for name, levels in LEVELS.items():
@@ -55,13 +60,11 @@ def score(folder: str) -> Iterator[dict[str, float | str]]:
                 cfg.env[other] = value
             evaluation = Evaluation(with_decisions(make_env(cfg, settings.eval.layouts, device, 0)), settings.eval.seed)
             told = evaluation.measure(evaluation.run(agent.policy))
-            row = low | {
-                "trained_with": ", ".join(noisy) or "no noise",
-                "seed": cfg.seed,
-                "noise": name,
-                "level": level,
-            }
-            yield row | {key: round(told[key], 4) for key in ("score", "success", "too_fast", "out_of_bounds")}
+            yield (
+                who
+                | {"noise": name, "level": level}
+                | {key: round(told[key], 4) for key in ("score", "success", "too_fast", "out_of_bounds")}
+            )
 
 
 def table(rows: Rows) -> str:
@@ -75,30 +78,45 @@ def table(rows: Rows) -> str:
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """Draw the scores against the level, a panel a noise."""
-    figure = Figure(figsize=(12.0, 3.6), layout="constrained")
-    panels = figure.subplots(1, len(LEVELS), sharey=True)
-    for axes, noise in zip(panels, LEVELS, strict=True):
-        agents = groups([row for row in rows if row["noise"] == noise], "agent", "trained_with")
-        for colour, ((agent, trained), of) in zip(COLOURS, agents.items(), strict=False):
-            levels = groups(of, "level")
-            means = [np.mean([row["score"] for row in each]) for each in levels.values()]
-            axes.plot([level for (level,) in levels], means, "o-", color=colour, label=f"{agent}, {trained}")
-        axes.axhline(1.97, color="#D98200", linestyle="--", linewidth=1.0)
-        axes.set_title(noise, loc="left", fontsize=10, fontweight="bold")
-        axes.set_xlabel(AXES[noise])
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("score, greedy, 1,000 layouts")
-    panels[0].annotate("people 1.97", (0.5, 2.03), xycoords=("axes fraction", "data"), fontsize=8)
-    panels[-1].legend(fontsize=8, frameon=False)
+    """Draw the scores against the level: above all agents trained without noise, below what training with it does."""
+    figure = Figure(figsize=(12.0, 7.2), layout="constrained")
+    above, below = figure.subplots(2, len(LEVELS), sharey=True)
+    everything = max((row["trained_with"] for row in rows), key=lambda trained: trained.count(","))
+    for upper, lower, noise in zip(above, below, LEVELS, strict=True):
+        of = [row for row in rows if row["noise"] == noise]
+        calm = groups([row for row in of if row["trained_with"] == NO_NOISE], "agent")
+        for colour, ((agent,), each) in zip(COLOURS, calm.items(), strict=False):
+            _draw_line(upper, each, colour, agent)
+        trained = groups([row for row in of if row["agent"] == "hppo"], "trained_with")
+        own = [name for (name,) in trained if name.startswith(noise) and "," not in name]
+        for colour, name in zip(COLOURS, (NO_NOISE, *own, everything), strict=False):
+            _draw_line(lower, trained[name,], colour, name.replace("_noise", ""))
+        upper.set_title(noise, loc="left", fontsize=10, fontweight="bold")
+        lower.set_title("H-PPO, trained with", loc="left", fontsize=9)
+        lower.set_xlabel(AXES[noise])
+        lower.legend(fontsize=8, frameon=False, loc="lower left")
+        for axes in (upper, lower):
+            axes.axhline(HUMAN["chosen"]["score"], color="#D98200", linestyle="--", linewidth=1.0)
+            axes.spines[["top", "right"]].set_visible(False)
+    above[0].set_ylabel("score, greedy, 1,000 layouts")
+    below[0].set_ylabel("score, greedy, 1,000 layouts")
+    above[0].annotate("people 1.97, without noise", (0.4, 2.03), xycoords=("axes fraction", "data"), fontsize=8)
+    above[-1].legend(fontsize=8, frameon=False, title="trained with no noise", title_fontsize=8)
     figure.savefig(path, dpi=130)
+
+
+def _draw_line(axes: Axes, rows: Rows, colour: str, label: str) -> None:
+    levels = groups(rows, "level")
+    means = [np.mean([row["score"] for row in each]) for each in levels.values()]
+    axes.plot([level for (level,) in levels], means, "o-", color=colour, markersize=4, linewidth=1.5, label=label)
 
 
 def main(folders: Sequence[str]) -> None:
     """Score, draw, tabulate."""
     if folders:
         torch.set_num_threads(1)
-        write_csv(HERE / "results.csv", [row for folder in tqdm(folders) for row in score(folder)])
+        runs = tqdm(finished(folders))
+        write_csv(HERE / "results.csv", [row for run in runs for row in score(run.folder)])
     rows = read_csv(HERE / "results.csv")
     draw(rows, HERE / "robustness.png")
     print(table(rows))

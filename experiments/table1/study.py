@@ -1,8 +1,9 @@
 """Draw and tabulate the paper's five learners beside its Table 1, people, and the ceiling.
 
-python experiments/table1/study.py                    from the csv files of experiments/learners, whose runs these are
-python experiments/table1/study.py multirun/table1    from other runs: writes results.csv and curves.csv here first, and
-                                                      reads these from then on
+python experiments/table1/study.py FOLDER...    gathers the runs of experiment=table1, sparse and sample_efficiency
+                                                in these folders into results.csv, curves.csv and efficiency.csv, then
+                                                draws and tabulates
+python experiments/table1/study.py              draws and tabulates what these hold
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.reference import HUMAN, HUMAN_SUCCESS_BY_BLOCK, RANDOM, human_normalised
+from hpamdp.reference import HUMAN, RANDOM, human_normalised
 from hpamdp.study import Rows, Run, curve, finished, groups, interquartile_mean, read_csv, spread, write_csv
 
 HERE = Path(__file__).resolve().parent
-LEARNERS = HERE.parent / "learners"
+PEOPLE_BY_BLOCK = HERE.parent / "human" / "blocks.csv"
 BOATS = ("congruent", "incongruent")
 COLOURS = {"hppo": "#0072B2", "pdqn": "#009E73", "hyar": "#CC79A7", "qpamdp": "#E69F00", "dlpa": "#56B4E9"}
 PEOPLE, INK, FAINT = "#D98200", "#2b2b2b", "#8c8c8c"
@@ -40,37 +41,31 @@ PANELS = {
 }
 
 
-def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
-    """Return a row a run on the boats and a row an evaluation, in the columns of experiments/learners used here."""
-    results, curves = [], []
+def gather(runs: Sequence[Run]) -> dict[str, Rows]:
+    """Return a row a full-length run, and a row an evaluation of these and of those that ended at people's score."""
+    found: dict[str, Rows] = {"results": [], "curves": [], "efficiency": []}
     for run in (run for run in runs if run.summary["env"] == "boatdock"):  # no score elsewhere is this one
-        summary, rows = run.summary, run.evaluations()
-        name = {"low": summary["low"], "problem": summary["controller"]}
-        name |= {"reward": "sparse" if run.config.env.get("reward") == "sparse" else "given", "seed": summary["seed"]}
-        reached = next((row["frames"] for row in rows if row["eval/score"] >= HUMAN["chosen"]["score"]), "")
-        results.append(
+        summary = run.summary
+        name = {"low": summary["low"], "boat": summary["controller"]}
+        name |= {"reward": "sparse" if run.config.env.reward == "sparse" else "given", "seed": summary["seed"]}
+        keys = ("frames", "wall_s", "eval/score", "eval/success")
+        evaluations = [name | {key: round(row[key], 4) for key in keys} for row in run.evaluations()]
+        if run.config.eval.get("stop_score") is not None:
+            found["efficiency"] += evaluations
+            continue
+        found["curves"] += evaluations
+        found["results"].append(
             name
             | {key: round(summary[key], 4) for key in ("score", "success", "ceiling")}
-            | {"random": round(summary["references"]["random"]["score"], 4)}
-            | {"presses": summary["frames"], "presses_to_people": reached}
+            | {"presses": summary["frames"], "cpu_s": round(summary["cpu_s"], 1)}
         )
-        curves += [name | {key: round(row[key], 4) for key in ("frames", "eval/score", "eval/success")} for row in rows]
-    return results, curves
-
-
-def load(folder: Path) -> tuple[Rows, Rows]:
-    """Return the rows of the paper's learners and boats under the given reward."""
-    results, curves = (read_csv(folder / f"{name}.csv") for name in ("results", "curves"))
-    return tuple(
-        [row for row in rows if row["low"] in COLOURS and row["problem"] in BOATS and row["reward"] == "given"]
-        for rows in (results, curves)
-    )
+    return found
 
 
 def summarise(results: Rows) -> Rows:
     """Return a row a learner and boat: what its seeds come to, and the paper's number."""
     rows = []
-    for (low, boat), of in sorted(groups(results, "low", "problem").items(), key=lambda item: _order(*item[0])):
+    for (low, boat), of in sorted(groups(results, "low", "boat").items(), key=lambda item: _order(*item[0])):
         scores = [row["score"] for row in of]
         middle, low_end, high_end = interquartile_mean(scores)
         figures = {
@@ -80,6 +75,8 @@ def summarise(results: Rows) -> Rows:
             "interval_high": high_end,
             "human_normalised": human_normalised(float(np.mean(scores)), boat),
             "success": np.mean([row["success"] for row in of]),
+            "presses": np.mean([row["presses"] for row in of]),
+            "cpu_s": np.mean([row["cpu_s"] for row in of]),
         }
         rows.append(
             {"learner": low, "boat": boat, "seeds": len(of), "spread": spread(scores)}
@@ -96,55 +93,68 @@ def _order(low: str, boat: str) -> tuple[int, int]:
 def table(rows: Rows, results: Rows) -> str:
     """Return the learners' lines, then people's, the ceiling's and those of random presses."""
     lines = [
-        "| | boat | score | interquartile mean (95 %) | random 0, people 1 | success | the paper's number |",
-        "|---|---|---|---|---|---|---|",
+        "| | boat | score | interquartile mean (95 %) | random 0, people 1 | success | presses | CPU | the paper's |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     lines += [
         f"| {row['learner']} | {row['boat']} | {row['spread']} | {row['interquartile_mean']:.3f} "
         f"({row['interval_low']:.3f} to {row['interval_high']:.3f}) | {row['human_normalised']:.3f} | "
-        f"{row['success']:.1%} | {row['paper']} |"
+        f"{row['success']:.1%} | {row['presses']:,.0f} | {row['cpu_s']:.0f} s | {row['paper']} |"
         for row in rows
     ]
     for boat, paper in zip(BOATS, PAPER["people"], strict=True):
         people = HUMAN[boat]
-        lines.append(f"| people | {boat} | {people['score']:.3f} | | 1 | {people['success']:.1%} | {paper} (*) |")
+        lines.append(
+            f"| people | {boat} | {people['score']:.3f} | | 1 | {people['success']:.1%} | 1,170 | | {paper} (*) |"
+        )
     for boat in BOATS:
-        (ceiling,) = {row["ceiling"] for row in results if row["problem"] == boat}
-        lines.append(f"| ceiling | {boat} | {ceiling:.3f} | | {human_normalised(ceiling, boat):.3f} | 100.0% | |")
-    lines.append(f"| random | both | {RANDOM['score']:.3f} | | 0 | {RANDOM['success']:.1%} | |")
+        (ceiling,) = {row["ceiling"] for row in results if row["boat"] == boat}
+        lines.append(f"| ceiling | {boat} | {ceiling:.3f} | | {human_normalised(ceiling, boat):.3f} | 100.0% | | | |")
+    lines.append(f"| random | both | {RANDOM['score']:.3f} | | 0 | {RANDOM['success']:.1%} | | | |")
     return "\n".join(lines)
 
 
-def efficiency_table(results: Rows) -> str:
+def sparse_table(given: Rows, sparse: Rows) -> str:
+    """Return a line a learner: its scores after learning from either reward."""
+    boats = [f"{boat}, {reward}" for boat in BOATS for reward in ("given", "sparse")]
+    lines = [f"| learner | {' | '.join(boats)} |", "|---|---|---|---|---|"]
+    for low in (low for low in COLOURS if any(row["low"] == low for row in sparse)):
+        cells = []
+        for boat in BOATS:
+            for rows in (given, sparse):
+                scores = [row["score"] for row in rows if (row["low"], row["boat"]) == (low, boat)]
+                cells.append(spread(scores) if scores else "")
+        lines.append(f"| {low} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def efficiency_table(efficiency: Rows, results: Rows) -> str:
     """Return a line a learner: presses to people's score, and how far it came on both boats together."""
     lines = [
-        "| learner | presses to 1.97, congruent | incongruent | presses trained "
-        "| random 0, people 1: interquartile mean of the runs on both boats (95 %) |",
+        "| learner | presses to 1.97, congruent | incongruent | wall seconds, both "
+        "| random 0, people 1: interquartile mean of the full-length runs on both boats (95 %) |",
         "|---|---|---|---|---|",
     ]
-    for low in (low for low in COLOURS if any(row["low"] == low for row in results)):
-        own = [row for row in results if row["low"] == low]
-        first = " | ".join(_reached([row for row in own if row["problem"] == boat]) for boat in BOATS)
-        middle, low_end, high_end = interquartile_mean([human_normalised(row["score"], row["problem"]) for row in own])
-        presses = np.mean([row["presses"] for row in own])
-        lines.append(f"| {low} | {first} | {presses:,.0f} | {middle:.3f} ({low_end:.3f} to {high_end:.3f}) |")
+    for low in COLOURS:
+        runs = [of[-1] for (of_low, _, _), of in groups(efficiency, "low", "boat", "seed").items() if of_low == low]
+        first = " | ".join(_range([row["frames"] for row in runs if row["boat"] == boat]) for boat in BOATS)
+        seconds = _range([row["wall_s"] for row in runs])
+        own = [human_normalised(row["score"], row["boat"]) for row in results if row["low"] == low]
+        middle, low_end, high_end = interquartile_mean(own)
+        lines.append(f"| {low} | {first} | {seconds} | {middle:.3f} ({low_end:.3f} to {high_end:.3f}) |")
     return "\n".join(lines)
 
 
-def _reached(rows: Rows) -> str:
-    """Return the presses to people's score of the earliest and the latest seed."""
-    presses = [row["presses_to_people"] for row in rows]
-    if not presses or "" in presses:
-        return f"{len(presses) - presses.count('')} of {len(presses)} seeds"
-    first, last = min(presses), max(presses)
-    return f"{first:,.0f}" if first == last else f"{first:,.0f} to {last:,.0f}"
+def _range(values: Sequence[float]) -> str:
+    first, last = f"{min(values):,.0f}", f"{max(values):,.0f}"
+    return first if first == last else f"{first} to {last}"
 
 
 def draw_curves(curves: Rows, results: Rows, path: Path) -> None:
     """Draw score and success against presses, a row a boat: mean over seeds and one standard deviation."""
     figure = Figure(figsize=(11.5, 7.6), layout="constrained")
     for boat, row in zip(BOATS, figure.subplots(2, 2, sharex=True), strict=True):
-        (ceiling,) = {of["ceiling"] for of in results if of["problem"] == boat}
+        (ceiling,) = {of["ceiling"] for of in results if of["boat"] == boat}
         for key, axes in zip(PANELS, row, strict=True):
             _draw_learners(axes, curves, boat, key)
             _draw_line(axes, "ceiling", ceiling if key == "score" else 1.0, INK, "-")
@@ -157,7 +167,7 @@ def draw_curves(curves: Rows, results: Rows, path: Path) -> None:
 
 def _draw_learners(axes: Axes, curves: Rows, boat: str, key: str) -> None:
     for low, colour in COLOURS.items():
-        rows = [row for row in curves if row["low"] == low and row["problem"] == boat]
+        rows = [row for row in curves if row["low"] == low and row["boat"] == boat]
         if not rows:
             continue
         x, mean, deviation = curve(rows, "frames", f"eval/{key}")
@@ -181,45 +191,53 @@ def _draw_line(axes: Axes, name: str, height: float, colour: str, style: str) ->
                   textcoords="offset points", fontsize=8, ha="right")  # fmt: skip
 
 
-def draw_efficiency(curves: Rows, results: Rows, path: Path) -> None:
-    """Draw success against presses with people's own learning beside it, and the presses to people's score."""
-    figure = Figure(figsize=(15.0, 4.2), layout="constrained")
-    *panels, last = figure.subplots(1, 3)
-    presses = (np.arange(len(HUMAN_SUCCESS_BY_BLOCK)) + 0.5) * BLOCK * HUMAN["chosen"]["presses"]
-    for boat, axes in zip(BOATS, panels, strict=True):
-        _draw_learners(axes, curves, boat, "success")
-        axes.plot(presses, HUMAN_SUCCESS_BY_BLOCK, "s--", color=PEOPLE, markersize=4, label="a person, either boat")
-        _draw_line(axes, "random", RANDOM["success"], FAINT, ":")
+def draw_efficiency(efficiency: Rows, path: Path) -> None:
+    """Draw score against presses up to people's mean, a line a seed, with people's own learning beside them."""
+    figure = Figure(figsize=(12.5, 4.4), layout="constrained")
+    for boat, axes in zip(BOATS, figure.subplots(1, 2, sharey=True), strict=True):
+        for low, colour in COLOURS.items():
+            own = [row for row in efficiency if (row["low"], row["boat"]) == (low, boat)]
+            for i, rows in enumerate(groups(own, "seed").values()):
+                late = [row for row in rows if row["frames"]]  # the axis is logarithmic
+                x, y = ([row[key] for row in late] for key in ("frames", "eval/score"))
+                axes.plot(x, y, color=colour, linewidth=1.0, alpha=0.6)
+                axes.plot(x[-1], y[-1], "o", color=colour, markersize=5, label=None if i else low)
+        x, y = people_by_block(boat)
+        axes.plot(x, y, "s--", color=PEOPLE, markersize=4, label="a person, 60 episodes a square")
+        axes.set(xscale="log", xlabel="presses", ylim=(-1.1, 3.2))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.spines[["top", "right"]].set_visible(False)
         axes.set_title(f"{boat} boat", loc="left", fontweight="bold", fontsize=10)
-        axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.38), fontsize=8, frameon=False)
-    lows = [low for low in COLOURS if any(row["low"] == low for row in results)]
-    for offset, marker, boat in ((0.12, "o", "congruent"), (-0.12, "^", "incongruent")):
-        rows = [row for row in results if row["problem"] == boat and row["presses_to_people"] != ""]
-        y = [lows.index(row["low"]) + offset for row in rows]
-        colours = [COLOURS[row["low"]] for row in rows]
-        last.scatter([row["presses_to_people"] for row in rows], y, c=colours, marker=marker, s=28, label=boat)
-    last.set(xscale="log", xlabel="presses to people's mean score, 1.97")
-    last.set_yticks(range(len(lows)), lows)
-    last.xaxis.set_major_formatter(EngFormatter(sep=""))
-    last.set_title("first evaluation at 1.97, each seed", loc="left", fontweight="bold", fontsize=10)
-    last.spines[["top", "right"]].set_visible(False)
-    last.legend(fontsize=8, frameon=False)
+        _draw_line(axes, "people's mean", HUMAN["chosen"]["score"], PEOPLE, "--")
+        _draw_line(axes, "random", RANDOM["score"], FAINT, ":")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 0.06), fontsize=8, frameon=False)
+        if boat == BOATS[0]:
+            axes.set_ylabel("score, greedy")
     figure.savefig(path, dpi=130)
+
+
+def people_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a person's presses up to the middle of each block of episodes, and people's score in it with this boat."""
+    blocks = read_csv(PEOPLE_BY_BLOCK)
+    num_presses = np.array([row["presses"] for row in blocks if row["controller"] == -1]) * BLOCK
+    chosen = float(boat == "congruent")
+    return num_presses.cumsum() - num_presses / 2, np.array(
+        [row["score"] for row in blocks if row["controller"] == chosen]
+    )
 
 
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        for name, rows in zip(("results", "curves"), gather(finished(folders)), strict=True):
+        for name, rows in gather(finished(folders)).items():
             write_csv(HERE / f"{name}.csv", rows)
-    source = HERE if (HERE / "results.csv").exists() else LEARNERS
-    print(f"From the runs of {source.name}/results.csv and curves.csv\n")
-    results, curves = load(source)
-    rows = summarise(results)
+    results, curves, efficiency = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves", "efficiency"))
+    given, sparse = ([row for row in results if row["reward"] == reward] for reward in ("given", "sparse"))
+    rows = summarise(given)
     write_csv(HERE / "table1.csv", rows)
-    draw_curves(curves, results, HERE / "figure2.png")
-    draw_efficiency(curves, results, HERE / "efficiency.png")
-    print(table(rows, results), efficiency_table(results), sep="\n\n")
+    draw_curves([row for row in curves if row["reward"] == "given"], given, HERE / "figure2.png")
+    draw_efficiency(efficiency, HERE / "efficiency.png")
+    print(table(rows, given), efficiency_table(efficiency, given), sparse_table(given, sparse), sep="\n\n")
 
 
 if __name__ == "__main__":
