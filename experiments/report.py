@@ -1,7 +1,9 @@
 """Draw and tabulate every study again from its csv files, and put all pages into one report.
 
 python experiments/report.py    runs main([]) of every study.py, renews the tables between `<!-- table -->` and
-                                `<!-- /table -->` in the pages, writes report/report.html and every figure as SVG
+                                `<!-- /table -->` in the pages, and that between `<!-- table of STUDY -->` and
+                                `<!-- /table -->` in the project's README, writes report/report.html and every figure
+                                as SVG
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import io
 import mimetypes
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from unittest import mock
@@ -22,7 +24,7 @@ import markdown
 from matplotlib.figure import Figure
 
 HERE = Path(__file__).resolve().parent
-TABLE = re.compile(r"(<!-- table -->\n).*?(<!-- /table -->)", re.DOTALL)
+TABLE = re.compile(r"(<!-- table(?: of (\w+))? -->\n).*?(<!-- /table -->)", re.DOTALL)
 # The pages that a reader wants first; the others follow by name.
 FIRST = ("table1", "learners", "hierarchy", "quickstart", "human")
 STYLE = """
@@ -36,29 +38,32 @@ section { border-top: 3px solid #222 }
 
 def report(experiments: Path, target: Path) -> list[str]:
     """Renew figures, tables and the report; return a line for everything that failed."""
-    failures, pages = [], []
+    failures, pages, tables = [], [], {}
     target.mkdir(parents=True, exist_ok=True)
     folders = [folder for folder in experiments.iterdir() if folder.is_dir()]
     for folder in sorted(folders, key=lambda folder: (folder.name not in FIRST, _place(folder.name), folder.name)):
-        table = ""
         if (folder / "study.py").exists():
             try:
-                table = tables_in(run(folder / "study.py", target / folder.name))
+                tables[folder.name] = tables_in(run(folder / "study.py", target / folder.name))
             except (Exception, SystemExit) as error:  # whatever a study does must not lose the others
                 failures.append(f"{folder.name}: {type(error).__name__}: {error}")
         page = folder / "README.md"
         if page.exists():
-            if table:
-                renew(page, table)
+            if folder.name in tables:
+                renew(page, {None: tables[folder.name]})
             text = page.read_text(encoding="utf-8")
         elif (folder / "study.py").exists():
-            figures = "\n\n".join(f"![{file.stem}]({file.name})" for file in sorted(folder.glob("*.png")))
-            text = f"# {folder.name}\n\nThere is no page of this study yet.\n\n{table}\n\n{figures}\n"
+            figures = [f"![{file.stem}]({file.name})" for file in sorted(folder.glob("*.png"))]
+            parts = [f"# {folder.name}", "There is no page of this study yet.", tables.get(folder.name, ""), *figures]
+            text = "\n\n".join(parts)
         else:
             continue
         body, missing = to_html(text, folder)
         failures += [f"{folder.name}: no image {name}" for name in missing]
         pages.append((folder.name, body))
+    front = experiments.parent / "README.md"
+    if front.exists():
+        renew(front, {name: table.split("\n\n")[0] for name, table in tables.items()})
     (target / "report.html").write_text(bind(pages), encoding="utf-8")
     return failures
 
@@ -104,10 +109,14 @@ def tables_in(printed: str) -> str:
     return "\n".join(lines[rows[0] : rows[-1] + 1])
 
 
-def renew(page: Path, table: str) -> None:
-    """Put the table between the markers of a page; a page without markers stays as it is."""
+def renew(page: Path, tables: Mapping[str | None, str]) -> None:
+    """Put tables between the markers of a page, by the study that each names; where there is none, it stays as it is."""
+
+    def replace(found: re.Match[str]) -> str:
+        return f"{found[1]}{tables[found[2]]}\n{found[3]}" if found[2] in tables else found[0]
+
     text = page.read_text(encoding="utf-8")
-    renewed = TABLE.sub(lambda found: f"{found[1]}{table}\n{found[2]}", text, count=1)
+    renewed = TABLE.sub(replace, text)
     if renewed != text:
         page.write_text(renewed, encoding="utf-8")
 

@@ -81,6 +81,15 @@ def test_a_table_is_renewed_between_its_markers_and_nothing_else_of_the_page(mod
     assert (experiments / "fine/README.md").stat().st_mtime_ns == before
 
 
+def test_the_front_page_gets_the_first_table_of_the_study_that_it_names(module, experiments, tmp_path):
+    front = tmp_path / "README.md"
+    kept = "<!-- table of sad -->\n| kept |\n<!-- /table -->\n"
+    old = f"Good:\n\n<!-- table of fine -->\n| old |\n<!-- /table -->\n\n{kept}"
+    front.write_text(old)
+    module.report(experiments, tmp_path / "report")
+    assert front.read_text() == old.replace("| old |", "| a | b |\n|---|---|\n| 1 \\ 2 | 0.5 |")
+
+
 def test_every_figure_is_there_as_png_beside_its_page_and_as_svg_in_the_report(module, experiments, tmp_path):
     module.report(experiments, tmp_path / "report")
     assert (experiments / "fine/line.png").read_bytes().startswith(b"\x89PNG")
