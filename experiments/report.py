@@ -110,7 +110,7 @@ def tables_in(printed: str) -> str:
 
 
 def renew(page: Path, tables: Mapping[str | None, str]) -> None:
-    """Put tables between the markers of a page, by the study that each names; where there is none, it stays as it is."""
+    """Put tables between the markers of a page, by the study that each names; without one, what is there stays."""
 
     def replace(found: re.Match[str]) -> str:
         return f"{found[1]}{tables[found[2]]}\n{found[3]}" if found[2] in tables else found[0]
