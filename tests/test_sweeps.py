@@ -157,8 +157,9 @@ STUDY = ["high=uniform,fixed", "seed=0,-1,1", "total_frames=16384", "checkpoint_
         [],
         pytest.param(["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"], marks=needs("hydra-joblib-launcher")),
         pytest.param(["hydra/launcher=submitit_local"], marks=needs("hydra-submitit-launcher")),
+        pytest.param(["hydra/launcher=ray"], marks=needs("hydra-ray-launcher")),
     ],
-    ids=["basic", "joblib", "submitit"],
+    ids=["basic", "joblib", "submitit", "ray"],
 )
 def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path, launcher):
     jobs = tmp_path / "sweep"
