@@ -204,7 +204,7 @@ def draw_efficiency(efficiency: Rows, path: Path) -> None:
                 axes.plot(x[-1], y[-1], "o", color=colour, markersize=5, label=None if i else low)
         x, y = people_by_block(boat)
         axes.plot(x, y, "s--", color=PEOPLE, markersize=4, label="a person, 60 episodes a square")
-        axes.set(xscale="log", xlabel="presses", ylim=(-1.1, 3.2))
+        axes.set(xscale="log", xlabel="presses", xlim=(80, 1e7), ylim=(-1.1, 2.6))
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_title(f"{boat} boat", loc="left", fontweight="bold", fontsize=10)
