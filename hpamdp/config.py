@@ -161,7 +161,7 @@ def run_config(cfg: DictConfig) -> RunConfig:
         raise ConfigError("checkpoint: goes with mode=eval only; to go on with a run, set resume")
     if run.mode == "eval" and run.resume is not None:
         raise ConfigError("resume: goes with mode=train and mode=offline; to score an agent, set checkpoint")
-    if run.eval.stop_score is not None and run.eval_every == 0:
+    if run.mode != "eval" and run.eval.stop_score is not None and run.eval_every == 0:
         every = "offline.eval_every" if run.mode == "offline" else "eval.every"
         raise ConfigError(f"eval.stop_score={run.eval.stop_score}: wants evaluations on the way; set {every} above 0")
     return run

@@ -35,8 +35,7 @@ class Evaluation:
 
     def _reset(self) -> TensorDictBase:
         self.env.set_seed(self.seed ^ _APART)  # the noise, too, is the same at every evaluation
-        self.env.begin_with(self.episodes)
-        return self.env.reset()
+        return self.env.reset(None if self.episodes is None else self.episodes.copy())
 
     def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
         """Play every episode greedily; return one array an attribute, first dimension the episode.

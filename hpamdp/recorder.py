@@ -62,11 +62,12 @@ class Recorder:
         self._ended, self._scalars = [], {}
         return row
 
-    def finish(self, frames: int, wall_s: float, cpu_s: float) -> str:
+    def finish(self, frames: int, wall_s: float, cpu_s: float, is_finished: bool) -> str:
         """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
         played = self._play()
         np.savez_compressed(self.output_dir / "evaluation.npz", **played)
-        summary = summarise(self.cfg, self.parts.evaluation.measure(played), self._random, frames, wall_s, cpu_s)
+        measured = self.parts.evaluation.measure(played)
+        summary = summarise(self.cfg, measured, self._random, frames, wall_s, cpu_s, is_finished)
         (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         logger = self.parts.logger
         logger.images(plots.draw_all(self.output_dir))

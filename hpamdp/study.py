@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,19 +39,32 @@ class Run:
 
 
 def finished(folders: Iterable[Path | str]) -> list[Run]:
-    """Return the finished runs under the folders, in the order of their names."""
-    files = [file for folder in folders for file in sorted(Path(folder).glob("**/summary.json"))]
-    return [
-        Run(file.parent, json.loads(file.read_text()), OmegaConf.load(file.parent / "config.yaml")) for file in files
-    ]
+    """Return the finished runs under the folders, in the order of their names; stopped ones are named on stderr."""
+    runs = []
+    for file in (file for folder in folders for file in sorted(Path(folder).glob("**/summary.json"))):
+        summary = json.loads(file.read_text())
+        if summary.get("finished", True):  # early runs' summaries lack it
+            runs.append(Run(file.parent, summary, OmegaConf.load(file.parent / "config.yaml")))
+        else:
+            print(f"{file.parent}: was stopped, left out", file=sys.stderr)
+    return runs
 
 
-def write_csv(path: Path, rows: Rows) -> None:
-    """Write rows as csv, the first one's columns at the top."""
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
+def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
+    """Write each table as a csv of its name, the first row's columns at the top; none of them, if one has no rows.
+
+    Raises:
+        SystemExit: with a line that names those without rows.
+    """
+    empty = [name for name, rows in tables.items() if not rows]
+    if empty:
+        files = ", ".join(f"{name}.csv" for name in empty)
+        raise SystemExit(f"in the folders given are no finished runs for {files}; nothing was written")
+    for name, rows in tables.items():
+        with (folder / f"{name}.csv").open("w", newline="") as file:
+            writer = csv.DictWriter(file, rows[0])
+            writer.writeheader()
+            writer.writerows(rows)
 
 
 def read_csv(path: Path) -> Rows:

@@ -16,7 +16,13 @@ _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy
 
 
 def summarise(
-    cfg: DictConfig, measured: dict[str, float], random: dict[str, float], frames: int, wall_s: float, cpu_s: float
+    cfg: DictConfig,
+    measured: dict[str, float],
+    random: dict[str, float],
+    frames: int,
+    wall_s: float,
+    cpu_s: float,
+    is_finished: bool,
 ) -> dict[str, Any]:
     """Return the run's summary: its final evaluation's means, what to hold them against, what it cost, what made it.
 
@@ -25,6 +31,7 @@ def summarise(
         measured: means of the agent's final evaluation, from `evaluate.measure`.
         random: the same for random choices and presses.
         frames, wall_s, cpu_s: presses, seconds and the process's own seconds of training, evaluations included.
+        is_finished: whether the run came to its end.
     """
     references = {"random": random}
     if "ceiling" in measured:
@@ -43,6 +50,7 @@ def summarise(
         **measured,
         "references": references,
         "episodes": cfg.eval.layouts,
+        "finished": is_finished,
         "frames": frames,
         "wall_s": wall_s,
         "cpu_s": cpu_s,

@@ -152,11 +152,12 @@ def _final_score(wanted: DictConfig, folder: Path) -> float | None:
         summary = json.loads((folder / "summary.json").read_text())
     except (OSError, ValueError):  # not there, or cut off in the middle
         return None
-    num_frames = wanted.offline.updates if wanted.mode == "offline" else wanted.total_frames
-    is_good_enough = wanted.eval.stop_score is not None and summary["score"] >= wanted.eval.stop_score
-    if wanted.mode != "eval" and summary["frames"] < num_frames and not is_good_enough:
-        return None
-    return summary["score"]
+    if "finished" in summary:
+        is_finished = summary["finished"]
+    else:  # an early run
+        num_frames = wanted.offline.updates if wanted.mode == "offline" else wanted.total_frames
+        is_finished = wanted.mode == "eval" or summary["frames"] >= num_frames
+    return summary["score"] if is_finished else None
 
 
 def _check_same(wanted: DictConfig, file: Path) -> None:

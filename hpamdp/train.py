@@ -42,7 +42,7 @@ def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stoppe
     output_dir.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
     is_interrupted = settings.mode != "eval" and trainer.train()
-    print(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s))
+    print(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, not is_interrupted))
     print(f"Everything is in {output_dir}")
     if is_interrupted:
         mode = "" if settings.mode == "train" else f"mode={settings.mode} "
@@ -57,9 +57,9 @@ class Trainer:
         self.cfg, self.settings, self.parts, self.output_dir = cfg, settings, parts, output_dir
         self.recorder = Recorder(cfg, parts, output_dir)
         self.frames, self.wall_s, self.cpu_s = 0, 0.0, 0.0
+        self.last_score: float | None = None  # at the last evaluation
         # A frame is what the run is counted in.
-        self.is_offline = settings.mode == "offline"
-        self.unit = " updates" if self.is_offline else " decisions" if settings.low.freeze else " presses"
+        self.unit = " updates" if settings.mode == "offline" else " decisions" if settings.low.freeze else " presses"
 
     def restore(self, source: Path) -> None:
         """Take the agent from a checkpoint and, to train on, where its run stood."""
@@ -67,6 +67,7 @@ class Trainer:
         env_state = checkpoint.load(source, self.parts.agent, self.parts.device, is_training)
         progress = checkpoint.progress_of(source)
         self.frames, self.wall_s, self.cpu_s = (progress[name] for name in ("frames", "wall_s", "cpu_s"))
+        self.last_score = progress.get("last_score")  # early runs' checkpoints lack it
         if not is_training:
             self.parts.env.set_statistics(env_state)
             return
@@ -98,30 +99,27 @@ class Trainer:
             signal.signal(signal.SIGTERM, previous)
 
     def _loop(self, collection: Collection, bar: tqdm) -> None:
-        settings = self.settings
         wall_before, cpu_before = self.wall_s - time.perf_counter(), self.cpu_s - time.process_time()
-        is_good_enough = False
-        if self.frames == 0:
-            is_good_enough = self._evaluate(bar)
+        if self.last_score is None and self.frames == 0:
+            self._evaluate(bar)
             if self.parts.data is not None:
                 self.parts.agent.remember(self.parts.data)
-        while self.frames < settings.num_frames and not is_good_enough:
+        while not self._is_over():
             num = self._learn(collection)
             last, self.frames = self.frames, self.frames + num
             self.wall_s = wall_before + time.perf_counter()
             self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
             bar.update(num)
-            is_over = self.frames >= settings.num_frames
-            if is_over or _is_due(last, self.frames, settings.eval_every):
-                is_good_enough = self._evaluate(bar)
-            elif _is_due(last, self.frames, settings.log_every):
+            if self.frames >= self.settings.num_frames or _is_due(last, self.frames, self.settings.eval_every):
+                self._evaluate(bar)
+            elif _is_due(last, self.frames, self.settings.log_every):
                 self.recorder.log(self.frames, self.wall_s, is_evaluated=False)
-            if not is_over and not is_good_enough and _is_due(last, self.frames, settings.checkpoint_every):
+            if not self._is_over() and _is_due(last, self.frames, self.settings.checkpoint_every):
                 self.save(collection)
 
     def _learn(self, collection: Collection) -> int:
         """Let the agent learn, from presses or from the data set; return how many frames that took."""
-        if self.is_offline:
+        if self.settings.mode == "offline":
             num = min(_UPDATES_A_TURN, self.settings.num_frames - self.frames)
             self.recorder.take(None, self.parts.agent.practise(num))
             return num
@@ -129,20 +127,22 @@ class Trainer:
         self.recorder.take(batch, self.parts.agent.learn(batch))
         return batch.numel()
 
-    def _evaluate(self, bar: tqdm) -> bool:
-        """Write a row with an evaluation; return whether its score is the one to stop at."""
+    def _is_over(self) -> bool:
+        stop_score, last_score = self.settings.eval.stop_score, self.last_score
+        is_reached = stop_score is not None and last_score is not None and last_score >= stop_score
+        return is_reached or self.frames >= self.settings.num_frames
+
+    def _evaluate(self, bar: tqdm) -> None:
         row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True)
         success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
-        bar.set_postfix_str(f"score {row['eval/score']:.2f}{success}")
-        stop_score = self.settings.eval.stop_score
-        return stop_score is not None and row["eval/score"] >= stop_score
+        self.last_score = row["eval/score"]
+        bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
 
     def save(self, collection: Collection) -> None:
         """Write the checkpoint."""
         progress = {"config": OmegaConf.to_container(self.cfg, resolve=True), "frames": self.frames}
-        progress |= {"wall_s": self.wall_s, "cpu_s": self.cpu_s}
-        path = self.output_dir / checkpoint.FILE_NAME
-        checkpoint.save(path, self.parts.agent, collection.state_columns(), progress)
+        progress |= {"wall_s": self.wall_s, "cpu_s": self.cpu_s, "last_score": self.last_score}
+        checkpoint.save(self.output_dir / checkpoint.FILE_NAME, self.parts.agent, collection.state_columns(), progress)
 
 
 def _is_due(before: int, now: int, every: int) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hpamdp.study import curve, finished, groups, interquartile_mean, read_csv, spread, write_csv
+from hpamdp.study import curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 CONFIG = (
@@ -28,11 +28,17 @@ def study(name):
     return module
 
 
-def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), **config):
+def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), high="none", finished=True, **config):
     """Write what a finished run leaves behind, as far as studies read it."""
     folder.mkdir(parents=True, exist_ok=True)
     summary = {"low": low, "env": "boatdock", "controller": "congruent", "seed": seed, "score": scores[-1]}
-    summary |= {"success": 0.9, "ceiling": 3.4, "references": {"random": {"score": -0.9}}}
+    summary |= {
+        "high": high,
+        "finished": finished,
+        "success": 0.9,
+        "ceiling": 3.4,
+        "references": {"random": {"score": -0.9}},
+    }
     summary |= {"frames": 200, "wall_s": 2.04, "cpu_s": 1.0}
     (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "config.yaml").write_text(
@@ -63,8 +69,22 @@ def test_a_run_gives_its_evaluations_and_its_played_episodes(tmp_path):
 
 def test_rows_come_back_from_csv_with_numbers_as_numbers_and_gaps_as_gaps(tmp_path):
     rows = [{"low": "hppo", "seed": 0, "reached": 1e6}, {"low": "a, b", "seed": 1, "reached": ""}]
-    write_csv(tmp_path / "a.csv", rows)
+    write_tables(tmp_path, {"a": rows})
     assert read_csv(tmp_path / "a.csv") == rows
+
+
+def test_of_tables_one_of_which_is_empty_none_is_written(tmp_path):
+    (tmp_path / "a.csv").write_text("kept")
+    with pytest.raises(SystemExit, match=r"b\.csv; nothing was written"):
+        write_tables(tmp_path, {"a": [{"x": 1}], "b": []})
+    assert [file.name for file in tmp_path.iterdir()] == ["a.csv"] and (tmp_path / "a.csv").read_text() == "kept"
+
+
+def test_stopped_runs_are_left_out_and_named(tmp_path, capsys):
+    leave_run(tmp_path / "a", finished=True)
+    leave_run(tmp_path / "b", finished=False)
+    assert [run.folder.name for run in finished([tmp_path])] == ["a"]
+    assert capsys.readouterr().err == f"{tmp_path / 'b'}: was stopped, left out\n"
 
 
 def test_groups_keep_the_order_of_appearance():
@@ -121,6 +141,8 @@ def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length
     leave_run(tmp_path / "a", scores=(0.0, 2.0, 3.3))
     leave_run(tmp_path / "b", scores=(0.0, 3.1), reward="sparse")
     leave_run(tmp_path / "c", scores=(0.0, 2.0), stop_score=1.97)
+    leave_run(tmp_path / "d", high="ucb")
+    leave_run(tmp_path / "e", low="random")
     found = study("table1").gather(finished([tmp_path]))
     assert [(row["reward"], row["score"]) for row in found["results"]] == [("given", 3.3), ("sparse", 3.1)]
     assert len(found["curves"]) == 5

@@ -45,10 +45,11 @@ def jobs(monkeypatch):
             raise ConfigError("these two\ndo not go together")
         if cfg.seed == 2:
             raise ZeroDivisionError("a bug")
-        frames = 5 if cfg.seed == 3 and stopped_at is None else cfg.total_frames
+        frames = 5 if cfg.seed == 5 or (cfg.seed == 3 and stopped_at is None) else cfg.total_frames
         (folder / "checkpoint.zip").touch()
-        (folder / "summary.json").write_text(json.dumps({"score": float(cfg.seed), "frames": frames}))
-        return 130 if frames == 5 else 0
+        summary = {"score": float(cfg.seed), "frames": frames, "finished": cfg.seed == 5 or frames > 5}
+        (folder / "summary.json").write_text(json.dumps(summary))
+        return 0 if summary["finished"] else 130
 
     monkeypatch.setattr(train, "run", run)
     return started
@@ -84,11 +85,24 @@ def test_a_sweep_started_again_does_what_is_left(command, jobs):
     assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
 
 
-def test_a_run_that_reached_its_stop_score_is_finished(command, jobs):
-    words = ["-m", "seed=3", "eval.stop_score=3", "hydra.sweep.dir=sweep"]
+def test_a_run_that_ended_early_is_finished_and_one_that_was_stopped_is_not(command, jobs):
+    words = ["-m", "seed=5,3", "eval.stop_score=3", "hydra.sweep.dir=sweep"]
     command(*words)
     code, out, _ = command(*words)
-    assert code == 0 and len(jobs) == 1 and "Job 0: skipped, finished before\n" in out
+    assert code == 0 and [seed for seed, _ in jobs] == [5, 3, 3]
+    assert "Job 0: skipped, finished before\n" in out and "Job 1: resumed and finished\n" in out
+
+
+def test_runs_of_an_older_version_are_skipped_or_gone_on_with(command, jobs, tmp_path):
+    words = ["-m", "seed=0,4", "hydra.sweep.dir=sweep"]
+    command(*words)
+    for job, frames in ((0, 10**9), (1, 5)):
+        folder = tmp_path / f"sweep/{job}"
+        (folder / "summary.json").write_text(json.dumps({"score": 1.0, "frames": frames}))
+        cfg = OmegaConf.load(folder / "config.yaml")
+        del cfg.eval.stop_score
+        OmegaConf.save(cfg, folder / "config.yaml")
+    assert command(*words)[0] == 0 and [seed for seed, _ in jobs] == [0, 4, 4]
 
 
 def test_the_results_of_another_config_stay_as_they_are(command, jobs, tmp_path):

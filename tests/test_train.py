@@ -91,6 +91,12 @@ def test_training_ends_at_the_first_evaluation_that_reaches_the_stop_score(tmp_p
         ("1024.0", "3.0"),
     ]
     assert checkpoint.progress_of(tmp_path / "checkpoint.zip")["frames"] == 1024
+    assert json.loads((tmp_path / "summary.json").read_text())["finished"]
+    # Nothing is left to do, unless a higher score is asked for.
+    for name, score, frames in (("same", 3.0, 1024), ("higher", next(rising) + 3.0, 1536)):
+        words = [f"resume={tmp_path}", f"eval.stop_score={score}"]
+        assert run(compose_config(words), tmp_path / name, words) == 0
+        assert json.loads((tmp_path / name / "summary.json").read_text())["frames"] == frames
 
 
 def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys):
@@ -99,7 +105,7 @@ def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, cap
     assert start(tmp_path / "stopped", "low=random", "total_frames=100_000_000", "eval.every=0") == 130
     assert f"resume={tmp_path / 'stopped'}" in capsys.readouterr().out
     stopped = json.loads((tmp_path / "stopped" / "summary.json").read_text())
-    assert 0 < stopped["frames"] < 100_000_000
+    assert 0 < stopped["frames"] < 100_000_000 and not stopped["finished"]
     total = stopped["frames"] + 2048
     more = [f"resume={tmp_path / 'stopped'}", f"total_frames={total}"]
     assert run(compose_config(more), tmp_path / "resumed", more) == 0

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hpamdp.study import Rows, groups, read_csv, spread, write_csv
+from hpamdp.study import Rows, groups, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 RUN = HERE.parents[1] / "run.py"
@@ -85,8 +85,10 @@ def table(rows: Rows) -> str:
 
 def main(words: Sequence[str]) -> None:
     """Run if asked, tabulate."""
-    if words:
-        write_csv(HERE / "results.csv", run_all())
+    if words == ["run"]:
+        write_tables(HERE, {"results": run_all()})
+    elif words:
+        raise SystemExit(f"{' '.join(words)}: the only word is run; without it what results.csv holds is tabulated")
     print(table(read_csv(HERE / "results.csv")))
 
 

@@ -20,7 +20,7 @@ from tqdm import tqdm
 from hpamdp import keys
 from hpamdp.assemble import acting, assemble, make_env
 from hpamdp.config import run_config
-from hpamdp.study import Rows, groups, read_csv, write_csv
+from hpamdp.study import Rows, groups, read_csv, write_tables
 
 HERE = Path(__file__).resolve().parent
 SELECTORS = ("ucb", "thompson", "epsilon_greedy", "exp3")
@@ -113,7 +113,7 @@ def main(arguments: Sequence[str]) -> None:
     if arguments:
         torch.set_num_threads(1)
         forms = [(high, memory, seed) for high in SELECTORS for memory in MEMORIES for seed in SEEDS]
-        write_csv(HERE / "drift.csv", [row for form in tqdm(forms) for row in play(arguments[0], *form)])
+        write_tables(HERE, {"drift": [row for form in tqdm(forms) for row in play(arguments[0], *form)]})
     rows = read_csv(HERE / "drift.csv")
     draw(rows, HERE / "drift.png")
     print(table(rows))

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from hpamdp.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
-from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_csv
+from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 # Those that see the layout, those that do not, and the lines to hold them against.
@@ -167,8 +167,7 @@ def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     names = ("results", "curves", "choices")
     if folders:
-        for name, rows in zip(names, gather(finished(folders)), strict=True):
-            write_csv(HERE / f"{name}.csv", rows)
+        write_tables(HERE, dict(zip(names, gather(finished(folders)), strict=True)))
     results, curves, choices = (read_csv(HERE / f"{name}.csv") for name in names)
     print(table(results))
     results, curves, choices = map(of_the_map, (results, curves, choices))

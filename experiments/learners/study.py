@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from hpamdp.reference import HUMAN
-from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_csv
+from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
@@ -133,8 +133,7 @@ def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     names = ("results", "curves")
     if folders:
-        for name, rows in zip(names, gather(finished(folders)), strict=True):
-            write_csv(HERE / f"{name}.csv", rows)
+        write_tables(HERE, dict(zip(names, gather(finished(folders)), strict=True)))
     results, curves = (read_csv(HERE / f"{name}.csv") for name in names)
     draw(curves, results, "given", "frames", HERE / "curves.png")
     draw(curves, results, "sparse", "frames", HERE / "curves_sparse.png")

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from hpamdp.reference import HUMAN
-from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_csv
+from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 PEOPLE = HUMAN["chosen"]["score"]
@@ -103,8 +103,7 @@ def _draw_curve(axes: Axes, rows: Rows, label: str, colour: str, style: str) -> 
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        for name, rows in zip(("results", "curves"), gather(finished(folders)), strict=True):
-            write_csv(HERE / f"{name}.csv", rows)
+        write_tables(HERE, dict(zip(("results", "curves"), gather(finished(folders)), strict=True)))
     results, curves = read_csv(HERE / "results.csv"), read_csv(HERE / "curves.csv")
     draw(curves, HERE / "curves.png")
     print(table(results))

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, write_csv
+from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, write_tables
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
@@ -87,8 +87,7 @@ def _draw_learners(axes: Axes, rows: Rows, key: str) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        for name, rows in gather(finished(folders)).items():
-            write_csv(HERE / f"{name}.csv", rows)
+        write_tables(HERE, gather(finished(folders)))
     draw(read_csv(HERE / "curves.csv"), HERE / "figure2.png")
     print(table(read_csv(HERE / "learned.csv")))
 

@@ -20,12 +20,11 @@ from tqdm import tqdm
 
 from hpamdp import checkpoint
 from hpamdp.assemble import make_agent, make_env, resolve
-from hpamdp.config import name_of
 from hpamdp.env.decisions import with_decisions
 from hpamdp.evaluate import Evaluation
 from hpamdp.reference import HUMAN
 from hpamdp.specs import PAMDPSpecs
-from hpamdp.study import Rows, finished, groups, read_csv, spread, write_csv
+from hpamdp.study import Rows, Run, finished, groups, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 LEVELS = {
@@ -39,18 +38,19 @@ AXES = {
     "slip": "probability of a random key",
 }
 COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#2b2b2b")
-NO_NOISE = "no noise"
+NO_NOISE, PLUS = "no noise", " + "
 
 
-def score(folder: Path) -> Iterator[dict[str, float | str]]:
-    """Yield a row for each noise and level: the score of the agent in a run's output folder."""
+def score(run: Run) -> Iterator[dict[str, float | str]]:
+    """Yield a row for each noise and level: the score of a run's agent."""
     device = torch.device("cpu")
     with initialize_config_dir(str(HERE.parents[1] / "conf"), version_base="1.3"):
-        words = ["mode=eval", f"checkpoint={folder}"]
+        words = ["mode=eval", f"checkpoint={run.folder}"]
         cfg, settings, source = resolve(compose("config", words), words)
     noisy = [f"{noise} {cfg.env[noise]}" for noise in LEVELS if cfg.env[noise]]
-    who = {"agent": name_of(cfg.low) if name_of(cfg.high) == "none" else f"{name_of(cfg.high)} x {name_of(cfg.low)}"}
-    who |= {"trained_with": ", ".join(noisy) or NO_NOISE, "seed": cfg.seed}
+    high, low = run.summary["high"], run.summary["low"]
+    who = {"agent": low if high == "none" else f"{high} x {low}", "boat": run.summary["controller"]}
+    who |= {"trained_with": PLUS.join(noisy) or NO_NOISE, "seed": cfg.seed}
     agent = make_agent(cfg, settings, PAMDPSpecs.from_env(make_env(cfg, 1, device, 0)), device)
     checkpoint.load(source, agent, device, with_training=False)
     for name, levels in LEVELS.items():
@@ -69,27 +69,29 @@ def score(folder: Path) -> Iterator[dict[str, float | str]]:
 
 def table(rows: Rows) -> str:
     """Return a line an agent and noise: the scores at each level, mean and deviation over seeds."""
-    lines = ["| agent | trained with | noise | level: score |", "|---|---|---|---|"]
-    for (agent, trained, noise), of in groups(rows, "agent", "trained_with", "noise").items():
+    lines = ["| agent | boat | trained with | noise | level: score |", "|---|---|---|---|---|"]
+    for (*names, noise), of in groups(rows, "agent", "boat", "trained_with", "noise").items():
         levels = groups(of, "level").items()
         said = ", ".join(f"{level:g}: {spread([row['score'] for row in each], 2)}" for (level,), each in levels)
-        lines.append(f"| {agent} | {trained} | {noise} | {said} |")
+        lines.append(f"| {' | '.join(names)} | {noise} | {said} |")
     return "\n".join(lines)
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """Draw the scores against the level: above all agents trained without noise, below what training with it does."""
+    """Draw scores on the congruent boat against the level: above without noise in training, below H-PPO with it."""
     figure = Figure(figsize=(12.0, 7.2), layout="constrained")
     above, below = figure.subplots(2, len(LEVELS), sharey=True)
-    everything = max((row["trained_with"] for row in rows), key=lambda trained: trained.count(","))
+    rows = [row for row in rows if row["boat"] == "congruent"]
+    everything = max((row["trained_with"] for row in rows), key=lambda name: name.count(PLUS), default="")
     for upper, lower, noise in zip(above, below, LEVELS, strict=True):
         of = [row for row in rows if row["noise"] == noise]
         calm = groups([row for row in of if row["trained_with"] == NO_NOISE], "agent")
         for colour, ((agent,), each) in zip(COLOURS, calm.items(), strict=False):
             _draw_line(upper, each, colour, agent)
         trained = groups([row for row in of if row["agent"] == "hppo"], "trained_with")
-        own = [name for (name,) in trained if name.startswith(noise) and "," not in name]
-        for colour, name in zip(COLOURS, (NO_NOISE, *own, everything), strict=False):
+        own = [name for (name,) in trained if name.startswith(noise) and PLUS not in name]
+        shown = [name for name in dict.fromkeys((NO_NOISE, *own, everything)) if (name,) in trained]
+        for colour, name in zip(COLOURS, shown, strict=False):
             _draw_line(lower, trained[name,], colour, name.replace("_noise", ""))
         upper.set_title(noise, loc="left", fontsize=10, fontweight="bold")
         lower.set_title("H-PPO, trained with", loc="left", fontsize=9)
@@ -116,7 +118,7 @@ def main(folders: Sequence[str]) -> None:
     if folders:
         torch.set_num_threads(1)
         runs = tqdm(finished(folders))
-        write_csv(HERE / "results.csv", [row for run in runs for row in score(run.folder)])
+        write_tables(HERE, {"results": [row for run in runs for row in score(run)]})
     rows = read_csv(HERE / "results.csv")
     draw(rows, HERE / "robustness.png")
     print(table(rows))

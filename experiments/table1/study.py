@@ -8,9 +8,11 @@ python experiments/table1/study.py              draws and tabulates what these h
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from hpamdp.reference import HUMAN, RANDOM, human_normalised
-from hpamdp.study import Rows, Run, curve, finished, groups, interquartile_mean, read_csv, spread, write_csv
+from hpamdp.study import Rows, Run, curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 PEOPLE_BY_BLOCK = HERE.parent / "human" / "blocks.csv"
@@ -34,6 +36,7 @@ PAPER = {
     "dlpa": (".2441 ± .64", ".1484 ± .29"),
     "people": ("3.0163 ± .87", "2.9318 ± .94"),
 }
+SEEDS = (0, 1, 2)
 BLOCK = 60  # episodes
 PANELS = {
     "score": ("score, greedy", -1.3, 3.8),
@@ -44,8 +47,10 @@ PANELS = {
 def gather(runs: Sequence[Run]) -> dict[str, Rows]:
     """Return a row a full-length run, and a row an evaluation of these and of those that ended at people's score."""
     found: dict[str, Rows] = {"results": [], "curves": [], "efficiency": []}
-    for run in (run for run in runs if run.summary["env"] == "boatdock"):  # no score elsewhere is this one
+    for run in runs:
         summary = run.summary
+        if (summary["env"], summary["high"]) != ("boatdock", "none") or summary["low"] not in COLOURS:
+            continue
         name = {"low": summary["low"], "boat": summary["controller"]}
         name |= {"reward": "sparse" if run.config.env.reward == "sparse" else "given", "seed": summary["seed"]}
         keys = ("frames", "wall_s", "eval/score", "eval/success")
@@ -60,6 +65,25 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
             | {"presses": summary["frames"], "cpu_s": round(summary["cpu_s"], 1)}
         )
     return found
+
+
+def missing(tables: dict[str, Rows]) -> list[str]:
+    """Return the runs, of those that the three experiments make, that are in none of the tables."""
+    kinds = {
+        "table1": ("results", "given"),
+        "sparse": ("results", "sparse"),
+        "sample_efficiency": ("efficiency", "given"),
+    }
+    lines = []
+    for experiment, (name, reward) in kinds.items():
+        there = {tuple(row[key] for key in ("low", "boat", "seed")) for row in tables[name] if row["reward"] == reward}
+        wanted = itertools.product(COLOURS, BOATS, SEEDS)
+        lines += [
+            f"{experiment}: no run of {low}, {boat}, seed {seed}"
+            for low, boat, seed in wanted
+            if (low, boat, seed) not in there
+        ]
+    return lines
 
 
 def summarise(results: Rows) -> Rows:
@@ -135,19 +159,30 @@ def efficiency_table(efficiency: Rows, results: Rows) -> str:
         "| random 0, people 1: interquartile mean of the full-length runs on both boats (95 %) |",
         "|---|---|---|---|---|",
     ]
-    for low in COLOURS:
-        runs = [of[-1] for (of_low, _, _), of in groups(efficiency, "low", "boat", "seed").items() if of_low == low]
-        first = " | ".join(_range([row["frames"] for row in runs if row["boat"] == boat]) for boat in BOATS)
-        seconds = _range([row["wall_s"] for row in runs])
+    for low in (low for low in COLOURS if any(row["low"] == low for row in efficiency)):
+        runs = groups([row for row in efficiency if row["low"] == low], "boat", "seed")
+        first = {run: _first_at_people(rows) for run, rows in runs.items()}
+        presses = (_range([first[run] for run in runs if run[0] == boat], "frames") for boat in BOATS)
+        cells = " | ".join([*presses, _range(list(first.values()), "wall_s")])
         own = [human_normalised(row["score"], row["boat"]) for row in results if row["low"] == low]
         middle, low_end, high_end = interquartile_mean(own)
-        lines.append(f"| {low} | {first} | {seconds} | {middle:.3f} ({low_end:.3f} to {high_end:.3f}) |")
+        lines.append(f"| {low} | {cells} | {middle:.3f} ({low_end:.3f} to {high_end:.3f}) |")
     return "\n".join(lines)
 
 
-def _range(values: Sequence[float]) -> str:
+def _first_at_people(rows: Rows) -> dict[str, Any] | None:
+    """Return a run's first evaluation at people's score."""
+    return next((row for row in rows if row["eval/score"] >= HUMAN["chosen"]["score"]), None)
+
+
+def _range(rows: Sequence[dict[str, Any] | None], key: str) -> str:
+    """Return the least and the most of the runs that came there, and how many did unless all."""
+    values = [row[key] for row in rows if row is not None]
+    some = "" if len(values) == len(rows) else f" ({len(values)} of {len(rows)} seeds)"
+    if not values:
+        return some.strip(" ()")
     first, last = f"{min(values):,.0f}", f"{max(values):,.0f}"
-    return first if first == last else f"{first} to {last}"
+    return (first if first == last else f"{first} to {last}") + some
 
 
 def draw_curves(curves: Rows, results: Rows, path: Path) -> None:
@@ -201,7 +236,9 @@ def draw_efficiency(efficiency: Rows, path: Path) -> None:
                 late = [row for row in rows if row["frames"]]  # the axis is logarithmic
                 x, y = ([row[key] for row in late] for key in ("frames", "eval/score"))
                 axes.plot(x, y, color=colour, linewidth=1.0, alpha=0.6)
-                axes.plot(x[-1], y[-1], "o", color=colour, markersize=5, label=None if i else low)
+                reached = _first_at_people(rows) or {}
+                x, y = reached.get("frames"), reached.get("eval/score")
+                axes.plot([x], [y], "o", color=colour, markersize=5, label=None if i else low)
         x, y = people_by_block(boat)
         axes.plot(x, y, "s--", color=PEOPLE, markersize=4, label="a person, 60 episodes a square")
         axes.set(xscale="log", xlabel="presses", xlim=(80, 1e7), ylim=(-1.1, 2.6))
@@ -229,12 +266,14 @@ def people_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        for name, rows in gather(finished(folders)).items():
-            write_csv(HERE / f"{name}.csv", rows)
-    results, curves, efficiency = (read_csv(HERE / f"{name}.csv") for name in ("results", "curves", "efficiency"))
+        write_tables(HERE, gather(finished(folders)))
+    tables = {name: read_csv(HERE / f"{name}.csv") for name in ("results", "curves", "efficiency")}
+    for line in missing(tables):
+        print(line, file=sys.stderr)
+    results, curves, efficiency = tables.values()
     given, sparse = ([row for row in results if row["reward"] == reward] for reward in ("given", "sparse"))
     rows = summarise(given)
-    write_csv(HERE / "table1.csv", rows)
+    write_tables(HERE, {"table1": rows})
     draw_curves([row for row in curves if row["reward"] == "given"], given, HERE / "figure2.png")
     draw_efficiency(efficiency, HERE / "efficiency.png")
     print(table(rows, given), efficiency_table(efficiency, given), sparse_table(given, sparse), sep="\n\n")

@@ -30,7 +30,6 @@ class PAMDPEnv(EnvBase):
     parameter_dims: tuple[int, ...]  # how many parameters each key takes
     max_steps: int  # presses in the longest episode
     result_keys: ClassVar[tuple[str, ...]] = ()  # leaves of an episode's last step that `results` reads
-    _next_episodes: TensorDict | None = None
 
     @property
     def has_choice(self) -> bool:
@@ -53,20 +52,6 @@ class PAMDPEnv(EnvBase):
         None: `set_seed(seed)` and a reset without arguments are all that it takes.
         """
         return None
-
-    def begin_with(self, episodes: TensorDict | None) -> None:
-        """Make these the episodes of the next reset, as if given to it; with `_reset` in them, of the next partial one.
-
-        TorchRL's transforms drop what a reset is given; this reaches the environment under them.
-        """
-        self._next_episodes = episodes
-
-    def _asked_of_reset(self, tensordict: TensorDictBase | None) -> TensorDictBase | None:
-        """Return what `_reset` was given, or in its place what `begin_with` was."""
-        if self._next_episodes is None or _is_partial(tensordict) != _is_partial(self._next_episodes):
-            return tensordict
-        episodes, self._next_episodes = self._next_episodes, None
-        return episodes
 
     def describe(self) -> dict[str, Tensor]:
         """Return what is known of the episodes that were just reset, first dimension `N`; computed once a run."""
@@ -137,7 +122,3 @@ class PAMDPEnv(EnvBase):
         flag = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
         flags = {name: flag.clone() for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
         return Composite(flags, shape=self.batch_size, device=self.device)
-
-
-def _is_partial(tensordict: TensorDictBase | None) -> bool:
-    return tensordict is not None and "_reset" in tensordict.keys()

@@ -194,7 +194,6 @@ class BoatDockEnv(PAMDPEnv):
         self._state = BoatState(*[floats] * 9, *[integers] * 4, episode=integers - 1)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        tensordict = self._asked_of_reset(tensordict)
         mask, given = None, None
         if tensordict is not None:
             mask = tensordict.get("_reset", None)

@@ -162,7 +162,6 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        tensordict = self._asked_of_reset(tensordict)
         mask, given = None, {}
         if tensordict is not None:
             mask = tensordict.get("_reset", None)

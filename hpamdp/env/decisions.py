@@ -94,9 +94,12 @@ class DecisionEnv(TransformedEnv):
     """An environment with its decisions tracked, whose `reset` takes what the environment's own takes."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if tensordict is not None:
-            self.base_env.begin_with(tensordict)  # TorchRL passes no more than the mask on
-        return super()._reset(tensordict, **kwargs)
+        # As TorchRL's, which passes no more than the mask on.
+        given = None if tensordict is None else tensordict.copy()
+        given = self.transform._reset_env_preprocess(given)
+        fresh = self.base_env._reset(given, **kwargs)
+        self.base_env._complete_done(self.base_env.full_done_spec, fresh)
+        return self.transform._reset(fresh.empty() if given is None else given, fresh)
 
 
 def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: int | None = None) -> DecisionEnv:

@@ -187,7 +187,6 @@ class GymnasiumEnv(PAMDPEnv):
         ]
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        tensordict = self._asked_of_reset(tensordict)
         mask = None if tensordict is None else tensordict.get("_reset", None)
         given = None if tensordict is None else tensordict.get(_SEED, None)
         if given is not None and (given.shape != (self.num_envs,) or given.is_floating_point() or (given < 0).any()):
