@@ -1,7 +1,7 @@
 """Score trained agents under noise that they were not, or were, trained with.
 
-python experiments/robustness/study.py FOLDER...   scores the agents of the finished runs in these folders, writes
-                                                   results.csv, then draws and tabulates
+python experiments/robustness/study.py FOLDER...   scores the agents of the finished runs in these folders and puts
+                                                   them into results.csv, then draws and tabulates
 python experiments/robustness/study.py             draws and tabulates what results.csv holds
 """
 
@@ -16,6 +16,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from hpamdp import checkpoint
@@ -41,8 +42,11 @@ COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#2b2b2b")
 NO_NOISE, PLUS = "no noise", " + "
 
 
-def score(run: Run) -> Iterator[dict[str, float | str]]:
-    """Yield a row for each noise and level: the score of a run's agent."""
+def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, float | str]]:
+    """Yield a row for each noise and level: the score of a run's agent.
+
+    `evaluations` are kept by the config of their boats: what is known of the layouts takes longer than playing them.
+    """
     device = torch.device("cpu")
     with initialize_config_dir(str(HERE.parents[1] / "conf"), version_base="1.3"):
         words = ["mode=eval", f"checkpoint={run.folder}"]
@@ -55,16 +59,27 @@ def score(run: Run) -> Iterator[dict[str, float | str]]:
     checkpoint.load(source, agent, device, with_training=False)
     for name, levels in LEVELS.items():
         for level in levels:
-            noise = {other: 0.0 for other in LEVELS} | {name: level}
-            for other, value in noise.items():
-                cfg.env[other] = value
-            evaluation = Evaluation(with_decisions(make_env(cfg, settings.eval.layouts, device, 0)), settings.eval.seed)
-            told = evaluation.measure(evaluation.run(agent.policy))
-            yield (
-                who
-                | {"noise": name, "level": level}
-                | {key: round(told[key], 4) for key in ("score", "success", "too_fast", "out_of_bounds")}
-            )
+            for noise in LEVELS:
+                cfg.env[noise] = level if noise == name else 0.0
+            boats = OmegaConf.to_yaml(cfg.env)
+            if boats not in evaluations:
+                env = with_decisions(make_env(cfg, settings.eval.layouts, device, 0))
+                evaluations[boats] = Evaluation(env, settings.eval.seed)
+            told = evaluations[boats].measure(evaluations[boats].run(agent.policy))
+            figures = {key: round(told[key], 4) for key in ("score", "success", "too_fast", "out_of_bounds")}
+            yield who | {"noise": name, "level": level} | figures
+
+
+def add(runs: Sequence[Run]) -> None:
+    """Score the runs' agents and put them into results.csv, each as soon as it is done, in the place of its like."""
+    file, evaluations = HERE / "results.csv", {}
+    for run in tqdm(runs):
+        new = list(score(run, evaluations))
+        names = ("agent", "boat", "trained_with", "seed")
+        kept = (
+            [row for row in read_csv(file) if any(row[name] != new[0][name] for name in names)] if file.exists() else []
+        )
+        write_tables(HERE, {"results": kept + new})
 
 
 def table(rows: Rows) -> str:
@@ -117,8 +132,7 @@ def main(folders: Sequence[str]) -> None:
     """Score, draw, tabulate."""
     if folders:
         torch.set_num_threads(1)
-        runs = tqdm(finished(folders))
-        write_tables(HERE, {"results": [row for run in runs for row in score(run)]})
+        add(finished(folders))
     rows = read_csv(HERE / "results.csv")
     draw(rows, HERE / "robustness.png")
     print(table(rows))
