@@ -72,7 +72,7 @@ class AgentConfig(BaseModel):
 
     sharing: Literal["per_option", "shared"]
     option_length: Literal["episode"] | PositiveInt
-    practice_frames: NonNegativeInt = 0  # early runs' configs lack it
+    practice_frames: NonNegativeInt
 
 
 class OfflineConfig(BaseModel):

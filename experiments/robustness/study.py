@@ -75,10 +75,8 @@ def add(runs: Sequence[Run]) -> None:
     file, evaluations = HERE / "results.csv", {}
     for run in tqdm(runs):
         new = list(score(run, evaluations))
-        names = ("agent", "boat", "trained_with", "seed")
-        kept = (
-            [row for row in read_csv(file) if any(row[name] != new[0][name] for name in names)] if file.exists() else []
-        )
+        names, old = ("agent", "boat", "trained_with", "seed"), read_csv(file) if file.exists() else []
+        kept = [row for row in old if any(row[name] != new[0][name] for name in names)]
         write_tables(HERE, {"results": kept + new})
 
 
