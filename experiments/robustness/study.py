@@ -132,6 +132,7 @@ def main(folders: Sequence[str]) -> None:
         torch.set_num_threads(1)
         add(finished(folders))
     rows = read_csv(HERE / "results.csv")
+    rows.sort(key=lambda row: (row["trained_with"] != NO_NOISE, row["trained_with"].count(PLUS)))
     draw(rows, HERE / "robustness.png")
     print(table(rows))
 

@@ -68,21 +68,18 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 
 def missing(tables: dict[str, Rows]) -> list[str]:
-    """Return the runs, of those that the three experiments make, that are in none of the tables."""
+    """Return a line for each experiment, learner and boat of whose three runs some are in none of the tables."""
     kinds = {
         "table1": ("results", "given"),
         "sparse": ("results", "sparse"),
         "sample_efficiency": ("efficiency", "given"),
     }
     lines = []
-    for experiment, (name, reward) in kinds.items():
-        there = {tuple(row[key] for key in ("low", "boat", "seed")) for row in tables[name] if row["reward"] == reward}
-        wanted = itertools.product(COLOURS, BOATS, SEEDS)
-        lines += [
-            f"{experiment}: no run of {low}, {boat}, seed {seed}"
-            for low, boat, seed in wanted
-            if (low, boat, seed) not in there
-        ]
+    for (experiment, (name, reward)), low, boat in itertools.product(kinds.items(), COLOURS, BOATS):
+        there = {row["seed"] for row in tables[name] if (row["low"], row["boat"], row["reward"]) == (low, boat, reward)}
+        lacking = [str(seed) for seed in SEEDS if seed not in there]
+        if lacking:
+            lines.append(f"{experiment}: no run of {low}, {boat}, seed {', '.join(lacking)}")
     return lines
 
 
