@@ -9,6 +9,7 @@ from toy_options import Crossing, Toll, best_value, earned, steppers
 
 from hpamdp import keys
 from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.choice import ControllerChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
@@ -108,9 +109,13 @@ def test_decisions_of_one_environment_survive_the_resets_of_others():
         account(environment, 1.0)
 
 
-@pytest.mark.parametrize("mask", [None, [True, False, True]])
-def test_layouts_given_to_a_reset_reach_the_boats_whole_or_in_part(mask):
-    env = with_decisions(BoatDockEnv(3, seed=1))
+@pytest.mark.parametrize("is_choice", [False, True], ids=["presses", "choice"])
+@pytest.mark.parametrize("mask", [None, [True, False, True]], ids=["whole", "part"])
+def test_layouts_given_to_a_reset_reach_the_boats(mask, is_choice):
+    env = BoatDockEnv(3, seed=1)
+    if is_choice:
+        env = ControllerChoiceEnv(Random(PAMDPSpecs.from_env(env)).policy, env)
+    env = with_decisions(env)
     before = env.reset()
     layout = TensorDict({"start": points(560.0), "goal": points(700.0)}, [3])
     if mask is not None:
