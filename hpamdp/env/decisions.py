@@ -47,23 +47,20 @@ class DecisionTracker(Transform):
         return observation_spec
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        """Start an option in the environments that were reset; the others keep theirs."""
+        """Start an option everywhere; of environments that were not reset TorchRL keeps the rows as they were."""
         observation = tensordict_reset.get(keys.OBSERVATION)
         is_new = torch.ones_like(tensordict_reset.get(keys.DONE))
-        reset = None if tensordict is None else tensordict.get("_reset", None)
         nothing = torch.zeros(is_new.shape, device=observation.device)
-        fresh = {
-            keys.IS_DECISION: is_new,
-            keys.OPTION_RETURN: nothing,
-            keys.OPTION_STEPS: nothing.long(),
-            keys.DECISION_OBSERVATION: observation,
-            keys.EPISODE_RETURN: nothing.clone(),
-            keys.EPISODE_STEPS: nothing.long(),
-        }
-        for name, value in fresh.items():
-            held = None if reset is None else tensordict.get(name, None)
-            tensordict_reset.set(name, value if held is None else torch.where(reset.view_as(is_new), value, held))
-        return tensordict_reset
+        return tensordict_reset.update(
+            {
+                keys.IS_DECISION: is_new,
+                keys.OPTION_RETURN: nothing,
+                keys.OPTION_STEPS: nothing.long(),
+                keys.DECISION_OBSERVATION: observation,
+                keys.EPISODE_RETURN: nothing.clone(),
+                keys.EPISODE_STEPS: nothing.long(),
+            }
+        )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         """Add this step to the accounts of the option and the episode."""
