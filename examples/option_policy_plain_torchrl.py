@@ -23,7 +23,7 @@ from torchrl.modules import MLP, ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.choice import ControllerChoiceEnv
 
 NUM_BOATS = 256  # that sail side by side

@@ -13,7 +13,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from hpamdp.main import main
+from hpamdp.cli import main
 
 # Two processes on two cores fight over threads otherwise.
 torch.set_num_threads(1)

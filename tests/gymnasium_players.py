@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from toy_environments import FORMS
 
 from hpamdp import keys
-from hpamdp.env.gymnasium import GymnasiumEnv
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
 
 TOY = "toy_environments:Toy"
 

@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.env.platform import HOP, RUN, PlatformEnv
+from hpamdp.env.platform.environment import HOP, RUN, PlatformEnv
 
 COURSE = 1035.0
 BOUNDS = torch.tensor([30.0, 720.0, 430.0])

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.env.boatdock_released import ReleasedBoatDockEnv
+from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
 
 REPLAY = Path(__file__).resolve().parent.parent / "experiments" / "released" / "replay.py"
 TRACES = sorted(Path(os.environ["HPAMDP_TRACES"]).glob("*.json")) if "HPAMDP_TRACES" in os.environ else []

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.io
 import torch
 
-from hpamdp.env import harbour, physics
+from hpamdp.env.boatdock import harbour, physics
 
 NUM_PEOPLE, NUM_EPISODES, MAX_PRESSES = 3, 70, 8
 CENTRES = ((640, 512), (672, 504), (672, 504))

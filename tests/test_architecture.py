@@ -34,11 +34,11 @@ def importers(package: str, inside: str = "hpamdp") -> set[str]:
 
 
 def test_the_modules_are_found():
-    assert {"hpamdp.keys", "hpamdp.config", "hpamdp.env.physics", f"{LOW}.hyar"} <= set(FILES)
+    assert {"hpamdp.keys", "hpamdp.config", "hpamdp.env.boatdock.physics", f"{LOW}.hyar"} <= set(FILES)
     assert "hpamdp.policies.base" in {name.rpartition(".")[0] for name in imports(f"{LOW}.random")}
 
 
-@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.env.physics"])
+@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.env.boatdock.physics"])
 def test_the_foundations_import_nothing_of_ours(module):
     assert not [name for name in imports(module) if is_in(name, "hpamdp")]
 
@@ -68,19 +68,19 @@ def test_learners_do_not_know_each_other(learner):
 
 
 def test_learners_and_selectors_know_neither_the_config_nor_the_agent():
-    for forbidden in ("hpamdp.config", "hpamdp.train", "hpamdp.assemble", "hpamdp.policies.agent"):
+    for forbidden in ("hpamdp.config", "hpamdp.run.train", "hpamdp.run.assemble", "hpamdp.policies.agent"):
         assert not importers(forbidden, inside=LOW) | importers(forbidden, inside=HIGH)
 
 
 def test_hydra_wandb_and_minari_stay_in_their_rooms():
-    assert importers("hydra") <= {"hpamdp.main", "hpamdp.config", "hpamdp.sweep"}
-    assert importers("wandb") <= {"hpamdp.metrics"}
-    assert importers("minari") <= {"hpamdp.data.minari"}
+    assert importers("hydra") <= {"hpamdp.cli", "hpamdp.config", "hpamdp.run.sweep"}
+    assert importers("wandb") <= {"hpamdp.run.metrics"}
+    assert importers("minari") <= {"hpamdp.data.human.minari"}
 
 
 def test_the_run_gets_concrete_classes_only_through_build():
-    for concrete in (LOW, HIGH, "hpamdp.env.boatdock"):
-        assert not importers(concrete) & {"hpamdp.train", "hpamdp.assemble"}
+    for concrete in (LOW, HIGH, "hpamdp.env.boatdock.environment"):
+        assert not importers(concrete) & {"hpamdp.run.train", "hpamdp.run.assemble"}
 
 
 @pytest.mark.parametrize("file", [ROOT / "run.py", *FILES.values()], ids=lambda file: file.relative_to(ROOT).as_posix())

@@ -10,10 +10,10 @@ from test_grid import SHORT, SMALL
 from toy_options import Crossing
 
 from hpamdp import keys
-from hpamdp.assemble import Parts, assemble
 from hpamdp.config import ConfigError, run_config
 from hpamdp.env.choice import ControllerChoiceEnv
-from hpamdp.train import Trainer
+from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.train import Trainer
 
 OWN_VALUES = ("hppo", "hsac", "hyar", "pdqn", "qpamdp")
 QUICK_CRITIC = ["high=meta_critic", "high.warmup_decisions=0", "high.updates_per_decision=0.2", "high.batch_size=16"]

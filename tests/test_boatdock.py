@@ -14,9 +14,9 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env import harbour, physics
-from hpamdp.env.boatdock import BoatDockEnv
-from hpamdp.env.episode import SCALED_NAMES
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.episode import SCALED_NAMES
 
 CENTRE = torch.tensor(harbour.CENTRE)
 NOISE = {"motor_noise": 0.2, "sensor_noise": 3.0, "slip": 0.3}

@@ -25,9 +25,9 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env.boatdock_released import ReleasedBoatDockEnv
-from hpamdp.env.released import OUT_OF_FUEL, SUCCESS, TIME_LIMIT, WALL
-from hpamdp.reference import references
+from hpamdp.env.boatdock.reference import references
+from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
+from hpamdp.env.boatdock_released.rules import OUT_OF_FUEL, SUCCESS, TIME_LIMIT, WALL
 
 
 @pytest.mark.parametrize("observation", ["pixels", "scaled"])

@@ -13,7 +13,7 @@ from toy_options import Crossing, WholeStep, steppers
 
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.choice import ControllerChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent

@@ -12,11 +12,11 @@ import pytest
 import torch
 from conftest import CONF, TRAINED, compose_config
 
-from hpamdp.assemble import assemble
-from hpamdp.collection.worker import PolicyCopy, Share, packed
 from hpamdp.config import ConfigError, build, run_config
-from hpamdp.recorder import Recorder
-from hpamdp.train import run
+from hpamdp.run.assemble import assemble
+from hpamdp.run.collection.worker import PolicyCopy, Share, packed
+from hpamdp.run.recorder import Recorder
+from hpamdp.run.train import run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=hppo", "low.minibatch_size=16"]
 BOATS = ["start_x", "start_y", "goal_x", "goal_y", "episode"]

@@ -9,8 +9,8 @@ from conftest import CONF, choices
 from omegaconf import OmegaConf
 from omegaconf.errors import ConfigAttributeError
 
-from hpamdp import train
 from hpamdp.config import GROUPS
+from hpamdp.run import train
 
 MISTAKES = [
     # A choice that isn't there, a group that isn't there.
@@ -166,6 +166,6 @@ def test_the_script_tells_a_mistake_inside_a_job_in_one_line(tmp_path):
 
 
 def test_help_does_not_wait_for_torch():
-    code = "import sys; from hpamdp.main import main; main(); assert 'torch' not in sys.modules"
+    code = "import sys; from hpamdp.cli import main; main(); assert 'torch' not in sys.modules"
     done = subprocess.run([sys.executable, "-c", code, "--help"], cwd=CONF.parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -9,8 +9,8 @@ from conftest import CONF, choices, compose_config
 from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
-from hpamdp.assemble import CONTEXT
 from hpamdp.config import GROUPS, ConfigError, build, load_class, name_of, run_config, validate
+from hpamdp.run.assemble import CONTEXT
 
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
 

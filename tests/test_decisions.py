@@ -8,7 +8,7 @@ from torchrl.envs import check_env_specs
 from toy_options import Crossing, Toll, best_value, earned, steppers
 
 from hpamdp import keys
-from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.choice import ControllerChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent

@@ -7,8 +7,8 @@ from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.env import episode, physics
-from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.boatdock import episode, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.policies.low_level.dlpa import DLPA, Plan, Planner
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel, Prediction
 from hpamdp.specs import PAMDPSpecs

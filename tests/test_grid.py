@@ -8,10 +8,10 @@ import torch
 from conftest import TRAINED, choices, compose_config
 from tensordict import TensorDict
 
-from hpamdp import checkpoint
-from hpamdp.assemble import assemble
 from hpamdp.config import run_config
-from hpamdp.train import run
+from hpamdp.run import checkpoint
+from hpamdp.run.assemble import assemble
+from hpamdp.run.train import run
 
 # What makes a learner's training short; a learner that is not named needs nothing.
 SHORT = {
@@ -43,7 +43,7 @@ def make(high: str, low: str, tmp_path):
 
 @pytest.mark.parametrize(("high", "low"), list(itertools.product(choices("high"), TRAINED)))
 def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0
     assert (tmp_path / "summary.json").is_file()
 
@@ -71,7 +71,7 @@ def test_every_learner_works_on_other_problems(low, env, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])
 def test_learners_work_for_each_option_and_shared(sharing, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
     assert run(compose_config([*words("ucb", "hyar"), f"agent.sharing={sharing}"]), tmp_path) == 0
 
 

@@ -12,8 +12,8 @@ from torchrl.envs.utils import check_env_specs
 from toy_environments import ALL, FORMS, native_action
 
 from hpamdp.config import ConfigError, build
-from hpamdp.env.boatdock import BoatDockEnv
-from hpamdp.env.gymnasium import GymnasiumEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -264,7 +264,7 @@ def test_an_old_time_limit_is_a_truncation():
 
 
 def mistake_in(**options) -> str:
-    node = OmegaConf.create({"_target_": "hpamdp.env.gymnasium.GymnasiumEnv", **options})
+    node = OmegaConf.create({"_target_": "hpamdp.env.gymnasium.environment.GymnasiumEnv", **options})
     with pytest.raises(ConfigError) as raised:
         build("env", node, num_envs=2, device="cpu", seed=0)
     assert "\n" not in str(raised.value) and "GymnasiumEnv" in str(raised.value)

@@ -19,8 +19,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import hpamdp
 from hpamdp.env import counter_rng
-from hpamdp.env.gymnasium_boats import BoatDock, BoatDockVector
-from hpamdp.env.rendering import Leg, Scene, draw
+from hpamdp.env.boatdock.gymnasium_faces import BoatDock, BoatDockVector
+from hpamdp.env.boatdock.rendering import Leg, Scene, draw
 
 ID = "hpamdp/BoatDock-v0"
 START, GOAL = np.array([640.0, 512.0]), np.array([640.0, 452.0])  # 60 px straight up, the congruent boat's key 1

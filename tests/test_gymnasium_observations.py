@@ -7,7 +7,7 @@ import torch
 from gymnasium_players import make, step
 from torchrl.envs.utils import check_env_specs
 
-from hpamdp.env.gymnasium import GymnasiumEnv
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
 
 
 def test_observations_of_any_form_are_one_vector():

@@ -8,9 +8,9 @@ from gymnasium import spaces
 from gymnasium.spaces import Box, Dict, Discrete, MultiDiscrete, Tuple
 from toy_environments import FORMS, MIXED, ONE, PAIR, TWO, Toy, old_space
 
-from hpamdp.env.action_spaces import ActionSpace
-from hpamdp.env.four_value import FourValueEnv, to_gymnasium
-from hpamdp.env.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.action_spaces import ActionSpace
+from hpamdp.env.gymnasium.four_value import FourValueEnv, to_gymnasium
+from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 
 UNIT, TWO_BOXES = Box(0, 1, (1,)), Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
 

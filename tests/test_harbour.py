@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from hpamdp.env import counter_rng, episode, harbour, physics
-from hpamdp.env.harbour import CONGRUENT, INCONGRUENT, Layout
+from hpamdp.env import counter_rng
+from hpamdp.env.boatdock import episode, harbour, physics
+from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, Layout
 
 NUM = 200_000
 

@@ -17,11 +17,11 @@ import pytest
 import synthetic_human
 from tensordict import TensorDict
 
-from hpamdp.data import human
-from hpamdp.data.download import download
-from hpamdp.data.errors import HumanDataError
-from hpamdp.data.released_file import PATH_VARIABLE, read
-from hpamdp.data.transitions import transitions
+from hpamdp.data.human import cli as human
+from hpamdp.data.human.download import download
+from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.human.released_file import PATH_VARIABLE, read
+from hpamdp.data.human.transitions import transitions
 
 REAL = os.environ.get(PATH_VARIABLE)
 

@@ -16,10 +16,10 @@ import scipy.io
 import synthetic_human
 import torch
 
-from hpamdp.data import released_file
-from hpamdp.data.errors import HumanDataError
-from hpamdp.data.released_file import HumanData, read
-from hpamdp.env import harbour, physics
+from hpamdp.data.human import released_file
+from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.human.released_file import HumanData, read
+from hpamdp.env.boatdock import harbour, physics
 
 REAL = os.environ.get(released_file.PATH_VARIABLE)
 needs_real = pytest.mark.skipif(not REAL, reason=f"{released_file.PATH_VARIABLE} is not set")

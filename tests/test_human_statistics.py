@@ -9,12 +9,11 @@ import pytest
 import synthetic_human
 import torch
 
-from hpamdp import reference
-from hpamdp.data import statistics, validation
-from hpamdp.data.episodes import keep, score, scores_of_people
-from hpamdp.data.released_file import PATH_VARIABLE, HumanData, read
-from hpamdp.data.validation import Singles
-from hpamdp.env import harbour, physics
+from hpamdp.data.human import statistics, validation
+from hpamdp.data.human.episodes import keep, score, scores_of_people
+from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
+from hpamdp.data.human.validation import Singles
+from hpamdp.env.boatdock import harbour, physics, reference
 
 REAL = os.environ.get(PATH_VARIABLE)
 needs_real = pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")

@@ -12,14 +12,14 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data import minari
-from hpamdp.data.dataset import HumanExperienceReplay, slices, whole_episodes
-from hpamdp.data.episodes import keep, scores_of_people, select
-from hpamdp.data.errors import HumanDataError
-from hpamdp.data.released_file import PATH_VARIABLE, HumanData, read
-from hpamdp.data.transitions import TRAJECTORY, transitions
-from hpamdp.env import harbour, physics
-from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.data.human import minari
+from hpamdp.data.human.dataset import HumanExperienceReplay, slices, whole_episodes
+from hpamdp.data.human.episodes import keep, scores_of_people, select
+from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
+from hpamdp.data.human.transitions import TRAJECTORY, transitions
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 
 REAL = os.environ.get(PATH_VARIABLE)

@@ -9,9 +9,9 @@ from toy_bandits import SPECS, against_sign, by_sign, constant, due, ended, play
 
 from hpamdp import keys
 from hpamdp.config import ConfigError, build
-from hpamdp.policies.context import ContextFeatures, LinearBandit
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
+from hpamdp.policies.shared.context import ContextFeatures, LinearBandit
 from hpamdp.specs import PAMDPSpecs
 
 MEMORIES = ("all", "discounted", "sliding_window")

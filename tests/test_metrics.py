@@ -5,8 +5,16 @@ import time
 import pytest
 import wandb
 
-from hpamdp.metrics import CSVLogger, MetricsFile, TensorboardLogger, WandbLogger, closing_table, duration, read_rows
-from hpamdp.reference import HUMAN, RANDOM, human_normalised, references
+from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised, references
+from hpamdp.run.metrics import (
+    CSVLogger,
+    MetricsFile,
+    TensorboardLogger,
+    WandbLogger,
+    closing_table,
+    duration,
+    read_rows,
+)
 
 
 @pytest.fixture
@@ -160,7 +168,7 @@ def test_wandb_finds_a_key_in_netrc_and_goes_offline_when_nobody_answers(tmp_pat
     (tmp_path / "netrc").write_text(f"machine 127.0.0.1:9 login user password {'0' * 40}\n")
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
-    monkeypatch.setattr("hpamdp.metrics._WANDB_START", 2.0)
+    monkeypatch.setattr("hpamdp.run.metrics._WANDB_START", 2.0)
     began = time.monotonic()
     logger = wandb_logger(tmp_path, "auto")
     assert logger.is_offline and time.monotonic() - began < 20

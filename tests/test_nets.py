@@ -2,7 +2,7 @@
 
 import torch
 
-from hpamdp.policies.nets import draw_index
+from hpamdp.policies.shared.networks import draw_index
 
 
 def test_indices_are_drawn_with_their_probabilities():

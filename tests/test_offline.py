@@ -10,19 +10,19 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.assemble import assemble
 from hpamdp.config import ConfigError, run_config
-from hpamdp.data.demonstrations import HumanPresses
-from hpamdp.data.released_file import read
-from hpamdp.data.settled import TAP, settle
-from hpamdp.env import harbour, physics
-from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.data.human.demonstrations import HumanPresses
+from hpamdp.data.human.released_file import read
+from hpamdp.data.human.rest_to_rest import TAP, settle
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.td3_bc import TD3BC
+from hpamdp.run.assemble import assemble
+from hpamdp.run.train import run
 from hpamdp.specs import PAMDPSpecs
-from hpamdp.train import run
 
 ALL = {"complete": False, "successes": False, "best_people": None, "checksum": None}
 SMALL = ["mode=offline", "data=human", "data.checksum=null", "offline.updates=6", "offline.eval_every=3"]
@@ -40,7 +40,7 @@ def presses(path: str, settled: bool = False, **env):
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    monkeypatch.setattr("hpamdp.plots.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
 
 
 def words(path: str, low: str, high: str = "human") -> list[str]:

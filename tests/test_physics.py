@@ -11,8 +11,8 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from hpamdp.env import episode, harbour, physics
-from hpamdp.env.physics import OUT_OF_BOUNDS, OUT_OF_FUEL, SAILING, SUCCESS, TOO_FAST
+from hpamdp.env.boatdock import episode, harbour, physics
+from hpamdp.env.boatdock.physics import OUT_OF_BOUNDS, OUT_OF_FUEL, SAILING, SUCCESS, TOO_FAST
 
 NUM_STEPS = 20_000
 EACH = settings(deadline=None, max_examples=50, derandomize=True)

@@ -8,10 +8,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from hpamdp.env import physics
-from hpamdp.env.harbour import CONGRUENT, INCONGRUENT, Layout, bearing_offset, direction, fixed_layouts, fuel_fraction
-from hpamdp.env.harbour import score as score_of
-from hpamdp.env.planner import Plan, best_plan, best_plans, better_option
+from hpamdp.env.boatdock import physics
+from hpamdp.env.boatdock.harbour import (
+    CONGRUENT,
+    INCONGRUENT,
+    Layout,
+    bearing_offset,
+    direction,
+    fixed_layouts,
+    fuel_fraction,
+)
+from hpamdp.env.boatdock.harbour import score as score_of
+from hpamdp.env.boatdock.planner import Plan, best_plan, best_plans, better_option
 
 NUM = 1000
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env.platform import FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, TIME_LIMIT, PlatformEnv
+from hpamdp.env.platform.environment import FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, TIME_LIMIT, PlatformEnv
 from hpamdp.specs import PAMDPSpecs
 
 

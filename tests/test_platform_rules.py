@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.platform import ARRIVED, FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, PlatformEnv
+from hpamdp.env.platform.environment import ARRIVED, FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, PlatformEnv
 
 NUMBERS = 512  # random numbers that an action may take
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hpamdp import plots
-from hpamdp.plots import draw_all
+from hpamdp.analysis import figures as plots
+from hpamdp.analysis.figures import draw_all
 
 ALL = ["learning_curves.png", "trajectories.png", "choices.png"]
 

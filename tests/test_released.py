@@ -29,9 +29,9 @@ from released_players import (
 )
 
 from hpamdp import keys
-from hpamdp.env import released
-from hpamdp.env.boatdock_released import ReleasedBoatDockEnv
-from hpamdp.env.released import OUT_OF_FUEL, SAILING, SUCCESS, TIME_LIMIT, WALL
+from hpamdp.env.boatdock_released import rules as released
+from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
+from hpamdp.env.boatdock_released.rules import OUT_OF_FUEL, SAILING, SUCCESS, TIME_LIMIT, WALL
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-5)])

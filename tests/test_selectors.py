@@ -10,9 +10,9 @@ from toy_bandits import CPU, SPECS, due
 from toy_options import Stepper, Toll
 
 from hpamdp import keys
-from hpamdp.assemble import assemble
 from hpamdp.config import run_config
-from hpamdp.env.boatdock import BoatDockEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
@@ -23,7 +23,7 @@ from hpamdp.policies.high_level.human import Human
 from hpamdp.policies.high_level.oracle import Oracle
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
-from hpamdp.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+from hpamdp.run.assemble import assemble
 from hpamdp.specs import PAMDPSpecs
 
 

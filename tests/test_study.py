@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hpamdp.study import curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
+from hpamdp.analysis.study import curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 CONFIG = (

@@ -15,9 +15,9 @@ from conftest import CONF, choices, compose_config
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from hpamdp import train
-from hpamdp.assemble import CONTEXT
 from hpamdp.config import ConfigError, validate
+from hpamdp.run import train
+from hpamdp.run.assemble import CONTEXT
 
 TINY = ["num_envs=32", "steps_per_batch=4", "eval.layouts=10", "eval.every=0", "log_every=0", "low=random"]
 

@@ -12,12 +12,12 @@ import pytest
 import torch
 from conftest import compose_config
 
-from hpamdp import checkpoint
 from hpamdp.config import ConfigError
-from hpamdp.env import harbour
-from hpamdp.evaluate import Evaluation
-from hpamdp.reference import human_normalised
-from hpamdp.train import run
+from hpamdp.env.boatdock import harbour
+from hpamdp.env.boatdock.reference import human_normalised
+from hpamdp.run import checkpoint
+from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
 FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkpoint.zip"}
@@ -73,8 +73,8 @@ def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
     for name in ("often", "seldom"):
         file = checkpoint.find(tmp_path / name, "resume")
         cfg = compose_config([*SMALL, "low=random"])
-        from hpamdp.assemble import assemble
         from hpamdp.config import run_config
+        from hpamdp.run.assemble import assemble
 
         parts = assemble(cfg, run_config(cfg), tmp_path)
         states.append(checkpoint.load(file, parts.agent, torch.device("cpu"), with_training=True))

@@ -1,4 +1,4 @@
-"""Small environments of every kind that hpamdp.env.gymnasium takes in; importing them registers Toy-v0."""
+"""Small environments of every kind that hpamdp.env.gymnasium.environment takes in; importing them registers Toy-v0."""
 
 from __future__ import annotations
 

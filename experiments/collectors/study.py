@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hpamdp.study import Rows, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, groups, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 RUN = HERE.parents[1] / "run.py"

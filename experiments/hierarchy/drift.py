@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from hpamdp import keys
-from hpamdp.assemble import acting, assemble, make_env
+from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
 from hpamdp.config import run_config
-from hpamdp.study import Rows, groups, read_csv, write_tables
+from hpamdp.run.assemble import acting, assemble, make_env
 
 HERE = Path(__file__).resolve().parent
 SELECTORS = ("ucb", "thompson", "epsilon_greedy", "exp3")

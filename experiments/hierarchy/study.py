@@ -16,8 +16,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
-from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
+from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 
 HERE = Path(__file__).resolve().parent
 # Those that see the layout, those that do not, and the lines to hold them against.

@@ -18,11 +18,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from hpamdp.data import statistics, validation
-from hpamdp.data.episodes import score
-from hpamdp.data.released_file import HumanData, read
-from hpamdp.env import harbour, physics
-from hpamdp.reference import OFFSET_EDGES
+from hpamdp.data.human import statistics, validation
+from hpamdp.data.human.episodes import score
+from hpamdp.data.human.released_file import HumanData, read
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.reference import OFFSET_EDGES
 
 HERE = Path(__file__).resolve().parent
 PEOPLE, FAINT, INK, CHOICE, PRESSES = "#D98200", "#c9c9c9", "#2b2b2b", "#CC79A7", "#0072B2"

@@ -15,9 +15,9 @@ import torch
 from hydra import compose, initialize_config_dir
 from torchrl.collectors import Collector
 
-from hpamdp.assemble import Parts, assemble
+from hpamdp.cli import conf_dir
 from hpamdp.config import run_config
-from hpamdp.main import conf_dir
+from hpamdp.run.assemble import Parts, assemble
 
 HERE = Path(__file__).resolve().parent
 PUBLISHED = ["low=pdqn", "low.twin_q=false", "low.target_smoothing=0", "low.policy_delay=1", "low.hidden_dims=[128]"]

@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.reference import HUMAN
-from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
+from hpamdp.env.boatdock.reference import HUMAN
 
 HERE = Path(__file__).resolve().parent
 PEOPLE = HUMAN["chosen"]["score"]

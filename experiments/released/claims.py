@@ -10,8 +10,8 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.env import released
-from hpamdp.env.boatdock_released import ReleasedBoatDockEnv
+from hpamdp.env.boatdock_released import rules as released
+from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
 
 BOATS = ("congruent", "incongruent")
 LAYOUTS, IDLE = 1_000, 980

@@ -19,8 +19,8 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.env.boatdock_released import ReleasedBoatDockEnv
-from hpamdp.env.released import SUCCESS
+from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
+from hpamdp.env.boatdock_released.rules import SUCCESS
 
 TOLERANCE = {"float64": 1e-9, "float32": 1e-3}  # relative beyond 1
 

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.study import Rows, Run, curve, finished, groups, read_csv, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, write_tables
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")

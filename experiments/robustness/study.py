@@ -19,13 +19,13 @@ from matplotlib.figure import Figure
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
-from hpamdp import checkpoint
-from hpamdp.assemble import make_agent, make_env, resolve
+from hpamdp.analysis.study import Rows, Run, finished, groups, read_csv, spread, write_tables
+from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.env.decisions import with_decisions
-from hpamdp.evaluate import Evaluation
-from hpamdp.reference import HUMAN
+from hpamdp.run import checkpoint
+from hpamdp.run.assemble import make_agent, make_env, resolve
+from hpamdp.run.evaluate import Evaluation
 from hpamdp.specs import PAMDPSpecs
-from hpamdp.study import Rows, Run, finished, groups, read_csv, spread, write_tables
 
 HERE = Path(__file__).resolve().parent
 LEVELS = {

@@ -19,8 +19,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.reference import HUMAN, RANDOM, human_normalised
-from hpamdp.study import Rows, Run, curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
+from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised
 
 HERE = Path(__file__).resolve().parent
 PEOPLE_BY_BLOCK = HERE.parent / "human" / "blocks.csv"

@@ -23,9 +23,10 @@ from torch import Tensor
 
 import hpamdp  # also registers the Gymnasium ids
 from hpamdp import keys
-from hpamdp.env import counter_rng, episode, physics
-from hpamdp.env.boatdock import BoatDockEnv
-from hpamdp.env.episode import BoatState, Rules
+from hpamdp.env import counter_rng
+from hpamdp.env.boatdock import episode, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.episode import BoatState, Rules
 
 SIZES = (1, 1_024, 16_384, 65_536, 131_072)
 POOL = 8

@@ -13,6 +13,6 @@ def register() -> None:
         # No max_episode_steps: the environment itself truncates after its last press.
         gymnasium.register(
             id=BOAT_DOCK_ID,
-            entry_point="hpamdp.env.gymnasium_boats:BoatDock",
-            vector_entry_point="hpamdp.env.gymnasium_boats:BoatDockVector",
+            entry_point="hpamdp.env.boatdock.gymnasium_faces:BoatDock",
+            vector_entry_point="hpamdp.env.boatdock.gymnasium_faces:BoatDockVector",
         )

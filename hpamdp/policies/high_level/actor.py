@@ -19,8 +19,8 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.nets import draw_index, mlp
-from hpamdp.policies.on_policy import OnPolicy
+from hpamdp.policies.shared.networks import draw_index, mlp
+from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
 LOG_PROB = "option_log_prob"  # of the held option when it was chosen

@@ -12,7 +12,7 @@ import torch
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from hpamdp.policies.payoffs import Bandit, Discount, Memory
+from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
 from hpamdp.specs import PAMDPSpecs
 
 

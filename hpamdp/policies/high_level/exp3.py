@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.payoffs import Bandit, Discount, Memory, Payoffs
+from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, Payoffs
 from hpamdp.specs import PAMDPSpecs
 
 PROBABILITY = "option_probability"  # of the held option when it was chosen

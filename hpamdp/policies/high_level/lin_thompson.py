@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hpamdp.policies.context import LinearBandit
+from hpamdp.policies.shared.context import LinearBandit
 
 
 class LinThompson(LinearBandit):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from hpamdp.policies.context import LinearBandit
+from hpamdp.policies.shared.context import LinearBandit
 
 
 class LinUCB(LinearBandit):

@@ -20,8 +20,8 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.nets import EnsembleMLP, move_towards
-from hpamdp.policies.replay import falling_share
+from hpamdp.policies.shared.networks import EnsembleMLP, move_towards
+from hpamdp.policies.shared.replay import falling_share
 from hpamdp.specs import PAMDPSpecs
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -13,8 +13,8 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.policies.hybrid_actor import HybridActor, HybridPolicy
-from hpamdp.policies.replay import ReplayLearner
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 

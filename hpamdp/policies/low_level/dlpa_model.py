@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from hpamdp.policies.nets import EnsembleMLP
+from hpamdp.policies.shared.networks import EnsembleMLP
 from hpamdp.specs import PAMDPSpecs
 
 

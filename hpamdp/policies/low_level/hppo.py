@@ -30,8 +30,8 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
-from hpamdp.policies.hybrid_actor import HybridActor, encoder
-from hpamdp.policies.on_policy import OnPolicy
+from hpamdp.policies.shared.hybrid_actor import HybridActor, encoder
+from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -29,8 +29,8 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.nets import EnsembleMLP, mlp, move_towards
-from hpamdp.policies.replay import ReplayLearner, falling_share
+from hpamdp.policies.shared.networks import EnsembleMLP, mlp, move_towards
+from hpamdp.policies.shared.replay import ReplayLearner, falling_share
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]

@@ -22,9 +22,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.hybrid_actor import HybridActor, HybridPolicy
-from hpamdp.policies.nets import KeyCritics, mlp, move_towards
-from hpamdp.policies.replay import ReplayLearner
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
+from hpamdp.policies.shared.networks import KeyCritics, mlp, move_towards
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]

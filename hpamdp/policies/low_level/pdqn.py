@@ -32,8 +32,8 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
-from hpamdp.policies.nets import KeyCritics, mlp, move_towards
-from hpamdp.policies.replay import ReplayLearner, falling_share
+from hpamdp.policies.shared.networks import KeyCritics, mlp, move_towards
+from hpamdp.policies.shared.replay import ReplayLearner, falling_share
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]

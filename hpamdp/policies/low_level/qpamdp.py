@@ -31,7 +31,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
-from hpamdp.policies.nets import draw_index
+from hpamdp.policies.shared.networks import draw_index
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]

@@ -23,8 +23,8 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.nets import KeyCritics, mlp, move_towards
-from hpamdp.policies.replay import ReplayLearner
+from hpamdp.policies.shared.networks import KeyCritics, mlp, move_towards
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]

@@ -1,0 +1,270 @@
+"""The command line: Hydra composes the config, `hpamdp.run.train` runs it, a user's mistake is told in one line."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import re
+import sys
+import textwrap
+import uuid
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+import yaml
+from hydra._internal.utils import get_args_parser
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, QuotedString
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hpamdp.config import GROUPS, RUN_FILE, ConfigError, no_such, no_such_option
+from hpamdp.run import sweep
+
+_MISTAKE, _INTERRUPTED = 2, 130
+# Launchers and sweepers of packages of their own, and the extra of pyproject.toml that brings each.
+_EXTRAS = {
+    "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
+    "hydra/sweeper": {"optuna": "optuna"},
+}
+_GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
+
+_HELP = """\
+hpamdp trains and scores two-level agents on parameterised-action MDPs: a selector (high) picks an option, such as which
+boat to steer; a learner (low) picks which key to press and for how long.
+
+Usage: {program} [GROUP=CHOICE ...] [GROUP.OPTION=VALUE ...] [VALUE=... ...] [--multirun]
+
+Groups, and what there is to choose
+{groups}
+  The options of a choice, explained: conf/GROUP/CHOICE.yaml in {folder}
+
+Values of the run, and what they are without a word from you
+{values}
+
+Examples
+  {program} high=ucb low=hyar
+      trains; the results go to a folder of their own in outputs/
+  {program} mode=eval checkpoint=outputs/2025-01-31/12-00-00 eval.layouts=5000
+      scores the agent of an earlier run
+  {program} --multirun high=ucb,uniform seed=0,1,2 eval.every=50000
+      six runs one after another, in multirun/; with hydra.sweep.dir=FOLDER a second start does what is left
+  {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
+      the same, two at a time; needs hpamdp[joblib]
+
+  {program} low=hyar --cfg job     shows every value and option without running
+  {program} --hydra-help           shows Hydra's own flags
+"""
+
+
+def conf_dir() -> Path:
+    """Return the folder of the yaml files: inside the package where it is installed, beside it in a clone."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "conf", package.parent / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
+
+
+def main() -> None:
+    """Run the command line; exit with 0, 1 (a bug, with its traceback), 2 (a user's mistake) or 130 (interrupted)."""
+    has_started = False
+    start = uuid.uuid4().hex
+
+    def job(cfg: DictConfig) -> float | None:
+        nonlocal has_started
+        has_started = True
+        return _run_job(cfg, start)
+
+    # Hydra then raises what it would print, in several lines, itself.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    # TorchRL tells of every replay buffer that it fills.
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    try:
+        arguments = _parse()
+        conf = conf_dir()
+        if arguments.help:
+            print(help_page(conf))
+            return
+        _check_groups(arguments.overrides, conf)
+        try:
+            hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
+        except (Exception, KeyboardInterrupt, SystemExit) as error:
+            if not sweep.has_begun(start):
+                raise
+            sys.exit(sweep.report(start, error))
+        if sweep.has_begun(start):
+            sys.exit(sweep.report(start))
+    except ConfigError as error:
+        _exit_with(str(error))
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError) as error:
+        if has_started:  # then it is not about the command line
+            raise
+        _exit_with(_explain(error, conf, arguments))
+    except RuntimeError as error:
+        if "srun" not in str(error):  # which submitit looks for
+            raise
+        _exit_with(f"hydra/launcher=submitit_slurm: {error}")
+    except KeyboardInterrupt:
+        sys.exit(_INTERRUPTED)
+
+
+def help_page(conf: Path) -> str:
+    """Return the text of `--help`: the groups as the folders have them, the run's values as config.yaml has them."""
+    groups = {folder.name: _choices(folder) for folder in sorted(conf.iterdir()) if folder.is_dir()}
+    values = re.search(r"^# [^\n]*\nmode:.*?(?=^hydra:)", (conf / "config.yaml").read_text(), re.DOTALL | re.MULTILINE)
+    return _HELP.format(
+        program="python run.py" if sys.argv[0].endswith(".py") else "hpamdp",
+        groups="\n".join(f"  {group:<12}{', '.join(choices)}" for group, choices in groups.items()),
+        folder=conf.parent,
+        values=textwrap.indent(values.group().rstrip() if values else "", "  "),
+    )
+
+
+def _choices(folder: Path) -> list[str]:
+    return sorted(file.stem for file in folder.glob("*.yaml"))
+
+
+def _parse() -> argparse.Namespace:
+    """Read the flags as Hydra will, and refuse what it refuses with a traceback or a page of text."""
+
+    def refuse(message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see --help")
+
+    parser = get_args_parser()
+    parser.error = refuse
+    arguments = parser.parse_args()
+    flags = ("run", "multirun", "cfg", "info", "shell_completion")
+    given = [f"--{flag.replace('_', '-')}" for flag in flags if getattr(arguments, flag)]
+    if len(given) > 1:
+        refuse(f"{' and '.join(given)} do not go together")
+    if arguments.resolve and not arguments.cfg:
+        refuse("--resolve goes with --cfg only")
+    if arguments.experimental_rerun:
+        refuse("--experimental-rerun is not supported, use resume=FOLDER")
+    return arguments
+
+
+def _check_groups(words: list[str], conf: Path) -> None:
+    """Refuse a choice that is no name, such as `low=3`, on which Hydra ends in a traceback."""
+    for override in OverridesParser.create().parse_overrides(words):
+        if not override.key_or_group:
+            raise ConfigError(f"{override.input_line}: {_GRAMMAR}")
+        folder = conf / override.key_or_group
+        if not folder.is_dir() or override.is_delete():
+            continue
+        values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
+        if not all(isinstance(value, str | QuotedString) for value in values):
+            raise ConfigError(
+                f"{override.input_line}: no such choice; conf/{folder.name} has {', '.join(_choices(folder))}"
+            )
+
+
+def _run_job(cfg: DictConfig, start: str) -> float | None:
+    """Run one job; return its score if it is one of a sweep."""
+    job = HydraConfig.get()
+    if job.mode == RunMode.MULTIRUN:
+        return sweep.run_job(cfg, start)
+    from hpamdp.run import train  # takes seconds, which --help need not wait for
+
+    output_dir = Path(job.runtime.output_dir)
+    try:
+        code = train.run(cfg, output_dir, OmegaConf.to_container(job.overrides.task))
+    except ConfigError as error:
+        # Not raised any further: Hydra would announce it in a line of its own.
+        with suppress(OSError):
+            output_dir.rmdir()  # Hydra made it; it stays if there is something in it
+        _exit_with(str(error))
+    if code:
+        sys.exit(code)
+    return None
+
+
+def _exit_with(mistake: str) -> NoReturn:
+    print(" ".join(mistake.splitlines()), file=sys.stderr)
+    sys.exit(_MISTAKE)
+
+
+def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str:
+    """Return in one line what is wrong with the command line or the yaml files, given what Hydra says."""
+    if isinstance(error, OverrideParseException):
+        return f"{error.override}: {_GRAMMAR}"
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        if group in _EXTRAS:
+            return _missing_plugin(group, name, error.options)
+        return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted(error.options))}"
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
+    overrides = OverridesParser.create().parse_overrides(arguments.overrides)
+    for override in overrides:
+        if override.is_sweep_override() and not arguments.multirun:
+            return f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
+    return _wrong_key(overrides, conf) or _first_lines(error)
+
+
+def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
+    if name in _EXTRAS[group]:
+        return f"{group}={name}: not installed; pip install 'hpamdp[{_EXTRAS[group][name]}]'"
+    return f"{group}={name}: no such choice; there is {', '.join(sorted({*installed, *_EXTRAS[group]}))}"
+
+
+def _first_lines(error: Exception) -> str:
+    """Return the first line of an error and that of its cause."""
+    causes = [error] if error.__cause__ is None else [error, error.__cause__]
+    lines = [str(cause).strip().split("\n")[0].rstrip(".") for cause in causes]
+    return ": ".join(dict.fromkeys(" ".join(line.split()) for line in lines if line)) or type(error).__name__
+
+
+def _wrong_key(overrides: list[Override], conf: Path) -> str | None:
+    """Return what is wrong with the first override whose key is not in the config, if there is one."""
+    groups = [o for o in overrides if "/" in o.key_or_group or (conf / o.key_or_group).is_dir()]
+    others = [o for o in overrides if o not in groups and not o.is_add() and not o.is_force_add()]
+    for choices in itertools.product(*map(_written_out, groups)):
+        try:
+            with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+                cfg = hydra.compose("config", list(choices), return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            return None
+        for override in others:
+            wrong = _missing_key(cfg, override.key_or_group, conf)
+            if wrong is not None:
+                return wrong
+    return None
+
+
+def _written_out(override: Override) -> list[str]:
+    """Return the overrides, each with a single value, that one with a sweep stands for."""
+    if not override.is_discrete_sweep():
+        return [override.input_line or ""]
+    return [f"{override.get_key_element()}={value}" for value in override.sweep_string_iterator()]
+
+
+def _missing_key(cfg: DictConfig, key: str, conf: Path) -> str | None:
+    """Return what is wrong with a dotted key that is not in the config; None if it is there."""
+    node: Any = OmegaConf.to_container(cfg)
+    names = key.split(".")
+    for depth, name in enumerate(names):
+        if not isinstance(node, dict):
+            return None
+        if name not in node:
+            return f"{key}: {_no_such_key(cfg, names[:depth], name, node, conf)}"
+        node = node[name]
+    return None
+
+
+def _no_such_key(cfg: DictConfig, path: list[str], name: str, node: dict[str, Any], conf: Path) -> str:
+    if not path:
+        known = {*node, *(folder.name for folder in conf.iterdir() if folder.is_dir())} - {"hydra"}
+        return no_such(f"group or value of the run ({RUN_FILE})", name, known)
+    if len(path) == 1 and path[0] in GROUPS:
+        file = f"conf/{path[0]}/{cfg.hydra.runtime.choices[path[0]]}.yaml"
+        return no_such_option(node, name, file)
+    return no_such(f"value of {'.'.join(path)}", name, node)

@@ -1,0 +1,230 @@
+"""The ceiling: for each boat the plan of up to three presses that docks with the most fuel left, without noise.
+
+Distance grows with the cube of the pressing time, so the seconds are concave in the lengths of the legs:
+- The last press is the shortest one that reaches the dock: its glide ends on the dock circle.
+- Consecutive presses use different keys: one long leg takes fewer seconds than the same course in two legs.
+- Detours are dear, so the best plan has as few legs as harbour and dock allow: mostly two, and a fourth never pays.
+
+What is left to search for are the lengths of the first two of three legs. A leg of length 0 is no press, so the same
+search holds the plans of one and two presses. A coarse grid over every sequence of keys finds the local minima, and
+grids that shrink around the best of them find the optimum. Concavity puts most optima of three presses on the border of
+what is allowed (a leg that ends just short of harbour or dock), so the grid runs along the borders and is denser there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from hpamdp.env.boatdock.harbour import CONGRUENT, CONTROLLERS, INCONGRUENT, NUM_KEYS, Layout, direction, fuel_fraction
+from hpamdp.env.boatdock.physics import (
+    DOCK_RADIUS,
+    HARBOUR_RADIUS,
+    TANK,
+    distance_to_dock,
+    distance_to_harbour,
+    press_for,
+)
+
+MAX_PRESSES = 3
+
+# Every leg keeps this far (px) from harbour and dock and off a course that only grazes the dock, and the last press
+# reaches a little (px) into the dock, so that rounding changes no outcome when a plan is replayed: it moves a boat by
+# about 1e-5 px, and the contact with the dock by 50 times that on the most grazing course left.
+_CLEARANCE = 0.01
+_OVERSHOOT = 0.002
+
+# Sequences of three keys without a repetition in a row. No leg of the harbour takes MAX_DURATION.
+_SEQUENCES = [
+    (first, second, last)
+    for first in range(NUM_KEYS)
+    for second in range(NUM_KEYS)
+    for last in range(NUM_KEYS)
+    if first != second and second != last
+]
+
+_GRID = 17  # points a side of the coarse grid
+_MINIMA = 2  # local minima refined for each sequence of keys
+_ZOOM_GRID = 5  # points a side of the shrinking grids
+_ZOOM_ROUNDS = 14
+_ZOOM = 0.6  # by which they shrink every round
+_CHUNK = 64  # boats searched together: bounds the memory, and fits the cache
+
+
+class Plan(NamedTuple):
+    """The best plan of each boat."""
+
+    keys: Tensor  # [*B, 3] int64, 0 past the plan's end
+    durations: Tensor  # [*B, 3] float32, seconds, 0 past the plan's end
+    num_presses: Tensor  # [*B] int64, 0 where no plan docks
+    score: Tensor  # [*B] float32, 5 x the fuel left (fraction of a tank) after docking, -1 where no plan docks
+
+
+class _Course(NamedTuple):
+    """A boat at rest, its dock and the unit directions of three legs, every field of one shape; px."""
+
+    x: Tensor
+    y: Tensor
+    goal_x: Tensor
+    goal_y: Tensor
+    first_x: Tensor
+    first_y: Tensor
+    second_x: Tensor
+    second_y: Tensor
+    last_x: Tensor
+    last_y: Tensor
+
+
+def _reach(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, dir_x: Tensor, dir_y: Tensor) -> Tensor:
+    """Return how long (px) a leg may be that ends at rest inside the harbour and short of the dock."""
+    to_dock = distance_to_dock(x, y, goal_x, goal_y, dir_x, dir_y)
+    return (torch.minimum(to_dock, distance_to_harbour(x, y, dir_x, dir_y)) - _CLEARANCE).clamp(min=0.0)
+
+
+def _leg_seconds(length: Tensor) -> Tensor:
+    return torch.where(length > 0.0, press_for(length), 0.0)
+
+
+def _durations(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the seconds of the three presses of a course; the last is `inf` where the course does not dock.
+
+    Args:
+        course: fields broadcast against `first` and `second`.
+        first: length of the first leg as a fraction of its reach.
+        second: length of the second leg as a fraction of the interval from which the last leg meets the dock.
+        max_presses: with 2 the first leg has length 0, with 1 the second too.
+    """
+    goal = course.goal_x, course.goal_y
+    first_key, second_key, last_key = course[4:6], course[6:8], course[8:10]
+    reach = _reach(course.x, course.y, *goal, *first_key) if max_presses > 2 else torch.zeros_like(course.x)
+    first_length = first * reach
+    x, y = course.x + first_length * course.first_x, course.y + first_length * course.first_y
+
+    # How far the dock lies aside of the last leg's line is linear in the second leg's length.
+    aside = (course.goal_x - x) * course.last_y - (course.goal_y - y) * course.last_x
+    slope = course.second_x * course.last_y - course.second_y * course.last_x
+    middle, half_width = aside / slope, (DOCK_RADIUS - _CLEARANCE) / slope.abs()
+    reach = _reach(x, y, *goal, *second_key) if max_presses > 1 else torch.zeros_like(x)
+    # A leg of under half the clearance would mend nothing but rounding, at the price of some hundredths of a second.
+    shortest = torch.where(middle - half_width > 0.5 * _CLEARANCE, middle - half_width, 0.0)
+    longest = torch.minimum(middle + half_width, reach)
+    second_length = shortest + second * (longest - shortest)
+    x, y = x + second_length * course.second_x, y + second_length * course.second_y
+
+    last_length = distance_to_dock(x, y, *goal, *last_key)
+    # The harbour is convex: the boat reaches the dock before it leaves if and only if they meet inside.
+    contact_x, contact_y = x + last_length * course.last_x, y + last_length * course.last_y
+    inside = contact_x.square() + contact_y.square() <= (HARBOUR_RADIUS - _CLEARANCE) ** 2
+    last_seconds = torch.where((shortest <= longest) & inside, press_for(last_length + _OVERSHOOT), torch.inf)
+    return _leg_seconds(first_length), _leg_seconds(second_length), last_seconds
+
+
+def _at(course: _Course, index: Tensor) -> _Course:
+    return _Course(*(field.gather(1, index) for field in course))
+
+
+def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the sequence and the two fractions of each boat's candidates, `[N, S * _MINIMA]`; course `[N, S]`."""
+    fractions = torch.linspace(0.0, 0.5 * math.pi, _GRID, device=course.x.device).sin().square()  # denser at the ends
+    # Without a first leg its fraction has no meaning, and one row of the grid is enough.
+    first, second = torch.meshgrid(fractions if max_presses > 2 else fractions[:1], fractions, indexing="ij")
+    grid = _Course(*(field[..., None, None] for field in course))
+    seconds = sum(_durations(grid, first, second, max_presses)).expand(*course.x.shape, *first.shape)
+    lowest_nearby = -max_pool2d(-seconds, kernel_size=3, stride=1, padding=1)
+    minima = torch.where(seconds <= lowest_nearby, seconds, torch.inf).flatten(2)
+    cell = minima.topk(_MINIMA, largest=False).indices.flatten(1)
+    sequence = torch.arange(course.x.shape[1], device=cell.device).repeat_interleave(_MINIMA).expand(cell.shape)
+    return sequence, first.flatten()[cell], second.flatten()[cell]
+
+
+def _zoom(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> tuple[Tensor, Tensor]:
+    """Return the fractions `[N, C]` to which shrinking grids around `first` and `second` lead; course `[N, C]`."""
+    offset = torch.linspace(-1.0, 1.0, _ZOOM_GRID, device=first.device)
+    first_offset, second_offset = torch.cartesian_prod(offset, offset).unbind(1)
+    course = _Course(*(field[..., None] for field in course))
+    width = 0.5 * math.pi / (_GRID - 1)  # the coarse grid's widest spacing
+    for _ in range(_ZOOM_ROUNDS):
+        near_first = (first[..., None] + width * first_offset).clamp(0.0, 1.0)
+        near_second = (second[..., None] + width * second_offset).clamp(0.0, 1.0)
+        best = sum(_durations(course, near_first, near_second, max_presses)).argmin(-1, keepdim=True)
+        first, second = near_first.gather(-1, best).squeeze(-1), near_second.gather(-1, best).squeeze(-1)
+        width *= _ZOOM
+    return first, second
+
+
+def _search(course: _Course, max_presses: int) -> tuple[Tensor, Tensor]:
+    """Return each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`; course `[N, S]`."""
+    sequence, first, second = _local_minima(course, max_presses)
+    candidates = _at(course, sequence)
+    first, second = _zoom(candidates, first, second, max_presses)
+    durations = torch.stack(_durations(candidates, first, second, max_presses), dim=-1)
+    best = durations.sum(-1).argmin(1, keepdim=True)
+    return sequence.gather(1, best).squeeze(1), durations.take_along_dim(best[..., None], 1).squeeze(1)
+
+
+def best_plan(
+    x: Tensor,
+    y: Tensor,
+    goal_x: Tensor,
+    goal_y: Tensor,
+    fuel: Tensor,
+    controller: Tensor,
+    keymap: Tensor,
+    max_presses: int = MAX_PRESSES,
+) -> Plan:
+    """Return the best plan of every boat, from wherever it rests.
+
+    Args:
+        x, y: the boat at rest, px from the harbour's centre, `[N]`.
+        goal_x, goal_y: the dock's centre, px from the harbour's centre, `[N]`.
+        fuel: seconds of pressing left in the tank, `[N]`.
+        controller: INCONGRUENT or CONGRUENT, `[N]`.
+        keymap: 1 or 2, `[N]`.
+        max_presses: the longest plan considered, 1 to 3.
+    """
+    if not 1 <= max_presses <= MAX_PRESSES:
+        raise ValueError(f"max_presses must be 1 to {MAX_PRESSES}, got {max_presses}")
+    sequences = torch.tensor(_SEQUENCES, device=x.device)
+    legs = [direction(controller[:, None], keymap[:, None], key[None, :]) for key in sequences.unbind(1)]
+    boats = [field[:, None].to(torch.float32) for field in (x, y, goal_x, goal_y)]
+    course = _Course(*torch.broadcast_tensors(*boats, *(component for leg in legs for component in leg)))
+    chunks = zip(*(field.split(_CHUNK) for field in course), strict=True)
+    found = [_search(_Course(*chunk), max_presses) for chunk in chunks]
+    keys = sequences[torch.cat([sequence for sequence, _ in found])]
+    durations = torch.cat([seconds for _, seconds in found])
+
+    left = fuel.to(torch.float32) - durations.sum(1)
+    solved = left >= 0.0
+    pressed = (durations > 0.0) & solved[:, None]
+    # Legs of length 0 are no presses: the others move to the front.
+    order = (~pressed).to(torch.int8).argsort(dim=1, stable=True)
+    return Plan(
+        keys=torch.where(pressed, keys, 0).gather(1, order),
+        durations=torch.where(pressed, durations, 0.0).gather(1, order),
+        num_presses=pressed.sum(1),
+        score=torch.where(solved, 5.0 * fuel_fraction(left), -1.0),
+    )
+
+
+def best_plans(layout: Layout, keymap: Tensor) -> Plan:
+    """Return the best plans from the start with a full tank, `[N, 2]`: INCONGRUENT, then CONGRUENT.
+
+    Args:
+        layout: fields `[N]`.
+        keymap: 1 or 2, `[N]`.
+    """
+    options = len(CONTROLLERS)
+    boats = [field.repeat_interleave(options) for field in (*layout, keymap)]
+    fuel = torch.full_like(boats[0], TANK)
+    controller = torch.tensor([INCONGRUENT, CONGRUENT], device=fuel.device).repeat(len(keymap))
+    plan = best_plan(*boats[:4], fuel, controller, boats[4])
+    return Plan(*(field.unflatten(0, (len(keymap), options)) for field in plan))
+
+
+def better_option(plans: Plan) -> Tensor:
+    """Return the controller whose plan scores higher, `[N]` int64, from `best_plans`."""
+    return plans.score.argmax(1)

@@ -1,0 +1,212 @@
+"""Pictures of an episode: the harbour, the dock, the boat with its track, the fuel and the keys."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from hpamdp.env.boatdock import harbour, physics
+
+Point = tuple[float, float]
+
+_BACKGROUND, _WATER, _RIM = "#f6f4ef", "#d6e7ec", "#a5c2cb"
+_INK, _FAINT = "#2d3e48", "#7d8b92"
+_PRESSED, _GLIDE, _HULL = "#2f6690", "#86aecb", "#1d3f58"
+_DOCK, _DOCK_EDGE = "#f4dfb0", "#c8963e"
+_GOOD, _GOOD_EDGE, _BAD, _BAD_EDGE = "#c3e3c6", "#3c8a55", "#f1cbbd", "#b9503a"
+_LOW_FUEL = 0.25
+
+# Shapes are drawn _SMOOTH times too large and averaged down; text comes after, because Pillow smooths text itself.
+_SMOOTH = 3
+_PAPER = 480.0  # units of paper from edge to edge, whatever the picture's size
+_SCALE = 1.66  # units of paper a px of the harbour's plane
+_COMPASS, _ARROW = (54.0, 403.0), 26.0  # where the keys' arrows start, and their length
+_GAUGE = (346.0, 18.0, 462.0, 28.0)
+
+
+class Leg(NamedTuple):
+    """One press: px from the harbour's centre, and the share of the way that the key was down."""
+
+    start: Point
+    end: Point
+    pressed: float
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a picture shows; positions in px from the harbour's centre, y down.
+
+    Attributes:
+        start, goal, boat: positions.
+        heading: where the bow points, of any length; (0, 0) before the first press.
+        legs: the track so far.
+        fuel: fraction of the tank.
+        presses: how many presses so far.
+        controller: 0, 1, or -1 while none is chosen.
+        keymap: 1 or 2.
+        outcome: a name out of `physics.OUTCOMES`.
+        score: shown where it is given.
+    """
+
+    start: Point
+    goal: Point
+    boat: Point
+    heading: Point = (0.0, 0.0)
+    legs: tuple[Leg, ...] = ()
+    fuel: float = 1.0
+    presses: int = 0
+    controller: int = harbour.NOT_CHOSEN
+    keymap: int = 1
+    outcome: str = physics.OUTCOMES[physics.SAILING]
+    score: float | None = None
+
+
+class _Canvas:
+    """A picture addressed in units of paper, so that one code draws every size."""
+
+    def __init__(self, image: Image.Image) -> None:
+        self.image = image
+        self._pen = ImageDraw.Draw(image)
+        self._unit = image.width / _PAPER
+
+    def disc(self, centre: Point, radius: float, fill: str, edge: str | None = None, width: float = 0.0) -> None:
+        x, y, r = (self._unit * value for value in (*centre, radius))
+        self._pen.ellipse((x - r, y - r, x + r, y + r), fill, edge, round(width * self._unit))
+
+    def line(self, start: Point, end: Point, colour: str, width: float) -> None:
+        """Draw a line with round ends."""
+        self._pen.line([self._unit * value for value in (*start, *end)], colour, round(width * self._unit))
+        for point in (start, end):
+            self.disc(point, width / 2.0, colour)
+
+    def polygon(self, points: list[Point], fill: str, edge: str | None = None, width: float = 0.0) -> None:
+        scaled = [(self._unit * x, self._unit * y) for x, y in points]
+        self._pen.polygon(scaled, fill, edge, round(width * self._unit))
+
+    def bar(self, box: tuple[float, float, float, float], colour: str) -> None:
+        """Draw a bar with round ends; `box` is left, top, right, bottom."""
+        radius = min(box[2] - box[0], box[3] - box[1]) / 2.0
+        self._pen.rounded_rectangle([self._unit * value for value in box], radius * self._unit, colour)
+
+    def write(self, place: Point, text: str, colour: str = _INK, size: float = 14.0, anchor: str = "lm") -> None:
+        x, y = place
+        self._pen.text((x * self._unit, y * self._unit), text, colour, _font(size * self._unit), anchor)
+
+
+def draw(scene: Scene, size: int = 480) -> np.ndarray:
+    """Return a picture of the scene, uint8 `[size, size, 3]`."""
+    canvas = _Canvas(_empty_harbour(size).copy())
+    _draw_places(canvas, scene)
+    _draw_track(canvas, scene)
+    _draw_boat(canvas, scene)
+    _draw_gauge(canvas, scene.fuel)
+    _draw_compass(canvas, scene)
+    finished = _Canvas(canvas.image.reduce(_SMOOTH))
+    _write_labels(finished, scene)
+    return np.array(finished.image)
+
+
+@lru_cache(maxsize=4)
+def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size)
+
+
+@lru_cache(maxsize=2)
+def _empty_harbour(size: int) -> Image.Image:
+    canvas = _Canvas(Image.new("RGB", (size * _SMOOTH, size * _SMOOTH), _BACKGROUND))
+    canvas.disc(_on_paper((0.0, 0.0)), physics.HARBOUR_RADIUS * _SCALE + 1.5, _WATER, _RIM, 3.0)
+    return canvas.image
+
+
+def _on_paper(point: Point) -> Point:
+    """Map px from the harbour's centre to units of paper."""
+    return _PAPER / 2.0 + point[0] * _SCALE, _PAPER / 2.0 + point[1] * _SCALE
+
+
+def _along(start: Point, end: Point, share: float) -> Point:
+    return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+
+
+def _colours(scene: Scene) -> tuple[str, str]:
+    """Return fill and edge of what carries the outcome."""
+    if scene.outcome == physics.OUTCOMES[physics.SUCCESS]:
+        return _GOOD, _GOOD_EDGE
+    return (_DOCK, _DOCK_EDGE) if scene.outcome == physics.OUTCOMES[physics.SAILING] else (_BAD, _BAD_EDGE)
+
+
+def _draw_places(canvas: _Canvas, scene: Scene) -> None:
+    fill, edge = _colours(scene)
+    goal = _on_paper(scene.goal)
+    canvas.disc(goal, physics.DOCK_RADIUS * _SCALE, fill, edge, 1.6)
+    canvas.disc(goal, 3.0, edge)
+
+
+def _draw_track(canvas: _Canvas, scene: Scene) -> None:
+    for start, end, pressed in scene.legs:
+        release = _on_paper(_along(start, end, pressed))
+        canvas.line(release, _on_paper(end), _GLIDE, 2.0)
+        canvas.line(_on_paper(start), release, _PRESSED, 3.2)
+    for leg in scene.legs[1:]:
+        canvas.disc(_on_paper(leg.start), 3.4, _BACKGROUND, _PRESSED, 1.6)
+    canvas.disc(_on_paper(scene.start), 5.4, _BACKGROUND, _INK, 2.0)
+
+
+def _draw_boat(canvas: _Canvas, scene: Scene) -> None:
+    x, y = _on_paper(scene.boat)
+    length = math.hypot(*scene.heading)
+    if length == 0.0:
+        canvas.disc((x, y), 7.0, _HULL, _BACKGROUND, 1.6)
+        return
+    forth_x, forth_y = scene.heading[0] / length, scene.heading[1] / length
+    # A hull seen from above, bow first: (forward, sideways) in units of paper.
+    hull = [(13.0, 0.0), (7.5, 4.6), (0.0, 6.2), (-9.0, 5.0), (-9.0, -5.0), (0.0, -6.2), (7.5, -4.6)]
+    turned = [(x + f * forth_x - s * forth_y, y + f * forth_y + s * forth_x) for f, s in hull]
+    canvas.polygon(turned, _HULL, _BACKGROUND, 1.6)
+    canvas.disc((x - 3.0 * forth_x, y - 3.0 * forth_y), 2.4, _BACKGROUND)
+
+
+def _draw_gauge(canvas: _Canvas, fuel: float) -> None:
+    left, top, right, bottom = _GAUGE
+    canvas.bar(_GAUGE, "#e3e1da")
+    if fuel > 0.0:
+        # Never narrower than high, or the round ends would not fit.
+        width = max(fuel * (right - left), bottom - top)
+        canvas.bar((left, top, left + width, bottom), _PRESSED if fuel >= _LOW_FUEL else _BAD_EDGE)
+
+
+def _directions(scene: Scene) -> tuple[Point, ...]:
+    if scene.controller == harbour.NOT_CHOSEN:
+        return ()
+    return harbour.DIRECTIONS[2 if scene.controller == harbour.CONGRUENT else scene.keymap - 1]
+
+
+def _draw_compass(canvas: _Canvas, scene: Scene) -> None:
+    x, y = _COMPASS
+    for dir_x, dir_y in _directions(scene):
+        neck = (x + (_ARROW - 6.0) * dir_x, y + (_ARROW - 6.0) * dir_y)
+        canvas.line((x + 5.0 * dir_x, y + 5.0 * dir_y), neck, _INK, 2.4)
+        tip = (x + _ARROW * dir_x, y + _ARROW * dir_y)
+        sides = [(neck[0] - s * dir_y, neck[1] + s * dir_x) for s in (-5.0, 5.0)]
+        canvas.polygon([tip, *sides], _INK)
+
+
+def _write_labels(canvas: _Canvas, scene: Scene) -> None:
+    x, y = _COMPASS
+    directions = _directions(scene)
+    for number, (dir_x, dir_y) in enumerate(directions, start=1):
+        canvas.write((x + (_ARROW + 10.0) * dir_x, y + (_ARROW + 10.0) * dir_y), str(number), size=13.0, anchor="mm")
+    name = harbour.CONTROLLERS[scene.controller] if directions else "no boat chosen"
+    canvas.write((18.0, 463.0), name, _INK if directions else _FAINT)
+    canvas.write((_GAUGE[0] - 8.0, 23.0), "fuel", _FAINT, anchor="rm")
+    canvas.write((462.0, 40.0), f"{100.0 * scene.fuel:.0f} %", _FAINT, 12.0, anchor="rm")
+    canvas.write((18.0, 23.0), f"{scene.presses} {'press' if scene.presses == 1 else 'presses'}", _FAINT)
+    if scene.outcome != physics.OUTCOMES[physics.SAILING]:
+        colour = _colours(scene)[1]
+        canvas.write((462.0, 463.0), scene.outcome.replace("_", " "), colour, 16.0, anchor="rm")
+        if scene.score is not None:
+            canvas.write((462.0, 441.0), f"score {scene.score:.2f}", _INK, anchor="rm")

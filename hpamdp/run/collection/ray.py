@@ -1,0 +1,64 @@
+"""Collection in Ray actors, on this machine or on a cluster."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import warnings
+from collections.abc import Sequence
+from typing import ClassVar
+
+from omegaconf import DictConfig
+from pydantic import PositiveInt
+from tensordict import TensorDictBase
+from torchrl.collectors.distributed import RayCollector
+
+from hpamdp.config import RunConfig
+from hpamdp.run.assemble import Parts
+from hpamdp.run.collection.worker import Share
+from hpamdp.run.collection.workers import WorkerCollection, children_without
+
+
+class RayCollection(WorkerCollection):
+    """Steps the environments in the actors of TorchRL's RayCollector."""
+
+    package: ClassVar[str | None] = "ray"
+
+    def __init__(
+        self,
+        cfg: DictConfig,
+        settings: RunConfig,
+        parts: Parts,
+        frames: int,
+        *,
+        num_workers: PositiveInt,
+        address: str | None = None,
+    ) -> None:
+        self.address = address
+        super().__init__(cfg, settings, parts, frames, num_workers)
+
+    def _start(self, shares: Sequence[Share], settings: RunConfig) -> RayCollector:
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
+        own = {"address": "local", "num_cpus": len(shares), "include_dashboard": False}
+        init = own if self.address is None else {"address": self.address}
+        # It misses weights to send; `receive` is there for them.
+        for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
+            warnings.filterwarnings("ignore", message=warning)
+        with children_without(signal.SIGINT):
+            return RayCollector(
+                [share.make_env for share in shares],
+                policy_factory=[share.make_policy for share in shares],
+                frames_per_batch=settings.num_envs * settings.steps_per_batch,
+                total_frames=sys.maxsize,  # it has no sign for endless
+                device="cpu",
+                ray_init_config={**init, "log_to_driver": False, "logging_level": "warning"},
+                remote_configs={"num_cpus": 1},
+                collector_kwargs={"auto_register_policy_transforms": False},
+                weight_sync_schemes={},
+                sync=True,
+            )
+
+    def _joined(self, batch: TensorDictBase) -> TensorDictBase:
+        return batch.flatten(0, 1)

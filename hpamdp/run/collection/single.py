@@ -1,0 +1,38 @@
+"""Collection in the learner's own process."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import Collector
+
+from hpamdp.config import RunConfig
+from hpamdp.run.assemble import Parts
+from hpamdp.run.collection.base import Collection
+
+
+class SingleCollection(Collection):
+    """Steps the run's environments here, between two calls of the learner."""
+
+    def __init__(self, settings: RunConfig, parts: Parts) -> None:
+        self.env = parts.env
+        self._collector = Collector(
+            parts.env,
+            parts.policy,
+            frames_per_batch=settings.num_envs * settings.steps_per_batch,
+            total_frames=-1,
+            auto_register_policy_transforms=False,
+        )
+        self._batches = iter(self._collector)
+
+    def next(self) -> TensorDictBase:
+        """Collect a batch."""
+        return next(self._batches)
+
+    def state_columns(self) -> dict[str, Tensor]:
+        """Return the environment's."""
+        return self.env.state_columns()
+
+    def close(self) -> None:
+        """Let go of the environment, which stays open."""
+        self._collector.shutdown(close_env=False)

@@ -1,0 +1,125 @@
+"""What collection in several processes has in common, whoever starts them."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hpamdp.config import RunConfig
+from hpamdp.run.assemble import Parts
+from hpamdp.run.collection.base import Collection
+from hpamdp.run.collection.worker import Share, packed
+
+
+class WorkerCollection(Collection):
+    """Has each of `num_workers` processes step an equal share of the environments, on the CPU with one thread.
+
+    Environment `i` has the layouts that it has in a single process: only the exploration draws from other random
+    numbers, a stream for each worker. Before each batch all workers get the policy's weights and buffers; they wait for
+    one another and for the learner. A subclass starts TorchRL's collector in `_start`.
+    """
+
+    def __init__(self, cfg: DictConfig, settings: RunConfig, parts: Parts, frames: int, num_workers: int) -> None:
+        self._policy, self._device = parts.policy, parts.device
+        self._columns = parts.env.state_columns()
+        self._collector: Any = None
+        self._is_idle = False
+        size = settings.num_envs // num_workers
+        shares = [
+            Share(
+                OmegaConf.to_container(cfg, resolve=True),
+                parts.agent.specs,
+                first,
+                size,
+                # Other numbers than before where a run goes on.
+                int(np.random.SeedSequence((settings.seed, first, frames)).generate_state(1)[0]),
+                {name: column[first : first + size].cpu() for name, column in self._columns.items()},
+                packed(parts.agent.router) if settings.low.freeze else None,
+            )
+            for first in range(0, settings.num_envs, size)
+        ]
+        try:
+            with uninterrupted():
+                self._collector = self._start(shares, settings)
+        except BaseException:
+            self.close()
+            raise
+        self._batches = iter(self._collector)
+        self._is_idle = True
+
+    def _start(self, shares: Sequence[Share], settings: RunConfig) -> Any:
+        """Start a worker for each share, and return TorchRL's collector of them."""
+        raise NotImplementedError
+
+    def next(self) -> TensorDictBase:
+        """Send the policy's state, then collect a batch; a Ctrl-C takes effect when it is there."""
+        with uninterrupted():
+            self._is_idle = False
+            self.cpu_s = sum(self._call("policy.receive", packed(self._policy)))
+            batch = self._joined(next(self._batches))
+            self._is_idle = True
+        return batch.to(self._device)
+
+    def _joined(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return what TorchRL's collector gave as `[num_envs, steps_per_batch]`."""
+        return batch
+
+    def _call(self, method: str, *arguments: Any) -> list[Any]:
+        """Return what a method of each worker's collector returns."""
+        return self._collector.map_fn(method, [arguments] * self._collector.num_workers)
+
+    def state_columns(self) -> dict[str, Tensor]:
+        """Return the environments' columns, as they were last known if a worker failed."""
+        if self._is_idle:
+            with uninterrupted():
+                columns = self._call("env.state_columns")
+                self._columns = {name: torch.cat([share[name] for share in columns]) for name in columns[0]}
+        return self._columns
+
+    def close(self) -> None:
+        """End the workers."""
+        if self._collector is not None:
+            self._collector.shutdown()
+            self._collector = None
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let a Ctrl-C wait for the block's end, as half a message would confuse the workers; a second one doesn't."""
+    is_asked = False
+
+    def note(*_: Any) -> None:
+        nonlocal is_asked
+        if is_asked:
+            raise KeyboardInterrupt
+        is_asked = True
+
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in handlers.items() if handler != signal.SIG_IGN}
+    for number in handlers:
+        signal.signal(number, note)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    if is_asked:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def children_without(*numbers: signal.Signals) -> Iterator[None]:
+    """Have processes that are started within the block never see these signals."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

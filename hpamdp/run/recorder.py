@@ -1,0 +1,105 @@
+"""What a run tells while it goes on and when it ends: rows of metrics, evaluations, the summary, the pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+from tensordict import TensorDictBase
+
+from hpamdp import keys
+from hpamdp.analysis import figures as plots
+from hpamdp.run.assemble import Parts, random_policy
+from hpamdp.run.metrics import MetricsFile, closing_table
+from hpamdp.run.summary import summarise
+
+
+class Recorder:
+    """Collects a run's figures and writes them to its output folder and its logger.
+
+    Args:
+        cfg: the resolved config.
+        parts: the run's environment, agent, evaluation and logger.
+        output_dir: where `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures go.
+    """
+
+    def __init__(self, cfg: DictConfig, parts: Parts, output_dir: Path) -> None:
+        self.cfg, self.parts, self.output_dir = cfg, parts, output_dir
+        self.metrics = MetricsFile(output_dir / "metrics.csv")
+        self._ended: list[TensorDictBase] = []
+        self._scalars: dict[str, float] = {}
+        # The last evaluation, as long as the agent has not learned since.
+        self._played: dict[str, np.ndarray] | None = None
+        self._held: dict[str, float] = {}  # scores with each option held, at the last evaluation
+        self._random = parts.evaluation.measure(parts.evaluation.run(random_policy(parts)))
+
+    def resume_from(self, folder: Path, frames: int) -> None:
+        """Start the metrics with those that the run in `folder` had written by then."""
+        self.metrics = MetricsFile(self.metrics.path, folder / "metrics.csv", frames)
+
+    def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
+        """Take note of a collected batch `[N, T]`, if there is one, and of what the agent said while learning."""
+        self._scalars |= scalars
+        self._played = None
+        if batch is None:
+            return
+        is_end = batch.get(("next", keys.DONE)).squeeze(-1)
+        ended = batch.get("next").select(*self.parts.env.result_keys, keys.EPISODE_RETURN, keys.EPISODE_STEPS)[is_end]
+        if keys.OPTION in batch.keys():
+            ended.set(keys.OPTION, batch.get(keys.OPTION)[is_end])
+        self._ended.append(ended)
+
+    def log(self, frames: int, wall_s: float, is_evaluated: bool) -> dict[str, float]:
+        """Write a row, with an evaluation if asked for, and return it."""
+        row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
+        if is_evaluated:
+            measured = self.parts.evaluation.measure(self._play())
+            row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
+        self.metrics.append(row)
+        self.parts.logger.log(row, frames)
+        self._ended, self._scalars = [], {}
+        return row
+
+    def finish(self, frames: int, wall_s: float, cpu_s: float, is_finished: bool) -> str:
+        """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
+        played = self._play()
+        np.savez_compressed(self.output_dir / "evaluation.npz", **played)
+        measured = self.parts.evaluation.measure(played)
+        summary = summarise(self.cfg, measured, self._random, frames, wall_s, cpu_s, is_finished)
+        (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        logger = self.parts.logger
+        logger.images(plots.draw_all(self.output_dir))
+        logger.summary(summary)
+        logger.close()
+        return closing_table(summary)
+
+    def _play(self) -> dict[str, np.ndarray]:
+        if self._played is None:
+            self._played = self.parts.evaluation.run_agent(self.parts.agent)
+        return self._played
+
+    def _drift(self, measured: dict[str, float]) -> dict[str, float]:
+        """Return how far the score with each option held has moved since the evaluation before."""
+        held = {name: value for name, value in measured.items() if name.startswith("score_")}
+        before, self._held = self._held, held
+        return {
+            name.replace("score_", "drift_"): value - before[name] for name, value in held.items() if name in before
+        }
+
+    def _training_scores(self) -> dict[str, float]:
+        """Return the means over the exploring episodes that ended since the last row."""
+        if not sum(len(ended) for ended in self._ended):
+            return {}
+        ended = torch.cat(self._ended)
+        results = {"score": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
+        scores = {
+            f"train/{name}": results[name].float().mean().item() for name in ("score", "success") if name in results
+        }
+        scores["train/return"] = ended[keys.EPISODE_RETURN].mean().item()
+        scores["train/presses"] = ended[keys.EPISODE_STEPS].float().mean().item()
+        for i, name in enumerate(self.parts.agent.specs.option_names):
+            scores[f"train/option_{name}"] = (ended[keys.OPTION] == i).float().mean().item()
+        return scores

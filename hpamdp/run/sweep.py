@@ -1,0 +1,268 @@
+"""A sweep: its jobs go on where they stopped, none takes the others down, the end tells what became of each."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+from filelock import FileLock, Timeout
+from hydra.core.hydra_config import HydraConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from hpamdp.config import ConfigError
+
+_MISTAKE, _INTERRUPTED = 2, 130
+_PATIENCE_S = 30.0
+# What can become of a job; the first until it has ended.
+_RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
+_STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
+
+
+class SweepDir(Callback):
+    """Tells the process that starts a sweep where the results go, which Hydra tells callbacks alone."""
+
+    path: ClassVar[Path | None] = None
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """Take note of the sweep's folder."""
+        SweepDir.path = Path(config.hydra.sweep.dir).absolute()
+
+
+@dataclass
+class Job:
+    """What is known of a job."""
+
+    number: int
+    overrides: str
+    folder: str
+    state: str = _RUNNING
+    score: float | None = None
+    reason: str = ""
+
+
+class Records:
+    """The jobs of one start of a sweep, a file each: they may run in other processes or on other machines.
+
+    Args:
+        sweep_dir: the sweep's folder.
+        start: names this start of it.
+    """
+
+    def __init__(self, sweep_dir: Path, start: str) -> None:
+        self._folder = sweep_dir / ".sweep" / start
+
+    def write(self, job: Job) -> None:
+        """Keep what is known of a job."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        draft = self._folder / f"{job.number}.draft"
+        draft.write_text(json.dumps(asdict(job)))
+        draft.replace(self._folder / f"{job.number}.json")
+
+    def read(self) -> list[Job]:
+        """Return the jobs that have been started, in order."""
+        jobs = [Job(**json.loads(file.read_text())) for file in self._folder.glob("*.json")]
+        return sorted(jobs, key=lambda job: job.number)
+
+    def remove(self) -> None:
+        """Leave no trace, unless another start is under way."""
+        for file in self._folder.glob("*"):
+            file.unlink(missing_ok=True)
+        with suppress(OSError):
+            self._folder.rmdir()
+            self._folder.parent.rmdir()
+
+
+def run_job(cfg: DictConfig, start: str) -> float | None:
+    """Run the job that Hydra is at, or what is left of it; return its score, None where it failed.
+
+    Args:
+        cfg: the job's config.
+        start: names this start of the sweep, for `report`.
+
+    Raises:
+        SystemExit: the user stopped it.
+    """
+    hydra = HydraConfig.get()
+    overrides = list(hydra.overrides.task)
+    job = Job(hydra.job.num, " ".join(overrides), hydra.runtime.output_dir)
+    records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
+    if hydra.runtime.choices["hydra/launcher"] != "basic":
+        os.environ.setdefault("TQDM_DISABLE", "1")  # the bars of jobs side by side overwrite each other
+        _stop_with_parent()
+    folder = Path(job.folder)
+    records.write(job)
+    print(f"Job {job.number}: {job.overrides}", flush=True)
+    try:
+        with _locked(folder):
+            job.state, job.score = _go_on(cfg, overrides, folder)
+    except ConfigError as error:
+        job.state, job.reason = _REFUSED, _one_line(str(error))
+        with suppress(OSError):
+            folder.rmdir()  # Hydra made it; it stays if there is something in it
+    except Exception as error:
+        job.state, job.reason = _FAILED, _one_line("".join(traceback.format_exception_only(error)))
+        with suppress(OSError):
+            (folder / "error.txt").write_text(traceback.format_exc())
+    records.write(job)
+    if job.state != _FINISHED:
+        print(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}", flush=True)
+    if job.state == _STOPPED:
+        sys.exit(_INTERRUPTED)
+    return job.score
+
+
+def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None]:
+    """Run what is not done yet in a job's folder; return what became of it, and its score."""
+    from hpamdp.run import checkpoint, train  # takes seconds, which --help need not wait for
+    from hpamdp.run.assemble import resolve
+
+    wanted, _, _ = resolve(cfg, overrides)
+    source = folder / checkpoint.FILE_NAME
+    if source.exists() or (folder / "summary.json").exists():
+        _check_same(wanted, folder / "config.yaml")
+    score = _final_score(wanted, folder)
+    if score is not None:
+        return _SKIPPED, score
+    (folder / "error.txt").unlink(missing_ok=True)
+    is_resumed = source.exists()
+    if is_resumed:
+        print(f"Going on from {source}", flush=True)
+    code = train.run(cfg, folder, overrides, source if is_resumed else None)
+    if code:
+        return _STOPPED, None
+    return (_RESUMED if is_resumed else _FINISHED), _final_score(wanted, folder)
+
+
+def _final_score(wanted: DictConfig, folder: Path) -> float | None:
+    """Return the score of a run that came to its end; None where there is none. A stopped run has a summary, too."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text())
+    except (OSError, ValueError):  # not there, or cut off in the middle
+        return None
+    if "finished" in summary:
+        is_finished = summary["finished"]
+    else:  # an early run
+        num_frames = wanted.offline.updates if wanted.mode == "offline" else wanted.total_frames
+        is_finished = wanted.mode == "eval" or summary["frames"] >= num_frames
+    return summary["score"] if is_finished else None
+
+
+def _check_same(wanted: DictConfig, file: Path) -> None:
+    """Refuse to touch the results of another config."""
+    saved = _flat(OmegaConf.to_container(OmegaConf.load(file))) if file.is_file() else {}
+    # Written and read as the saved one was.
+    own = _flat(OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(wanted, resolve=True))))
+    # An older config may lack what is null now.
+    keys = [key for key in {**own, **saved} if own.get(key) != saved.get(key)]
+    if keys:
+        there, here = (json.dumps(values.get(keys[0]), default=str) for values in (saved, own))
+        more = f" and {len(keys) - 1} more" if keys[1:] else ""
+        raise ConfigError(
+            f"its folder has the results of another config, with {keys[0]}={there} for {here}{more}; they stay as they "
+            "are: set another hydra.sweep.dir, or move the folder away"
+        )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat
+
+
+@functools.cache  # once a process, which may run several jobs
+def _stop_with_parent() -> None:
+    """See to it that this process saves and stops when the one that started it is killed, which joblib does not."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while True:
+            time.sleep(1.0)
+            if os.getppid() != parent:
+                os.kill(os.getpid(), signal.SIGTERM)  # training saves on the first, and nothing survives the second
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Keep other processes out; wait for those that are about to stop, the workers of a sweep that was killed."""
+    file = folder / ".lock"
+    lock = FileLock(file, timeout=_PATIENCE_S)
+    try:
+        lock.acquire()
+    except Timeout as error:
+        raise ConfigError("another process is at work in its folder; start the sweep again after it") from error
+    try:
+        yield
+    finally:
+        file.unlink(missing_ok=True)
+        lock.release()
+
+
+def has_begun(start: str) -> bool:
+    """Return whether any job has."""
+    return SweepDir.path is not None and bool(Records(SweepDir.path, start).read())
+
+
+def report(start: str, error: BaseException | None = None) -> int:
+    """Tell what became of the jobs, a line on stderr for each that failed; return the exit code.
+
+    Args:
+        start: names this start of the sweep.
+        error: what ended it early.
+    """
+    sweep_dir = SweepDir.path
+    assert sweep_dir is not None
+    records = Records(sweep_dir, start)
+    jobs = records.read()
+    records.remove()
+    is_stopped = isinstance(error, KeyboardInterrupt | SystemExit)
+    for job in jobs:
+        if job.state == _RUNNING:
+            job.state, job.reason = (_STOPPED, "") if is_stopped else (_FAILED, "ended without a word, or still runs")
+    failed = [job for job in jobs if job.state in (_REFUSED, _FAILED)]
+    _print_tally(jobs)
+    for job in failed:
+        told = Path(job.folder, "error.txt")
+        print(f"{job.overrides}: {job.reason} ({_shown(told if told.exists() else told.parent)})", file=sys.stderr)
+    if is_stopped or (error is not None and len(failed) < len(jobs)):
+        if not is_stopped:
+            (sweep_dir / "error.txt").write_text("".join(traceback.format_exception(error)))
+            reason = _one_line("".join(traceback.format_exception_only(error)))
+            print(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})", file=sys.stderr)
+        print(f"To go on: the same command with hydra.sweep.dir={_shown(sweep_dir)}")
+        return _INTERRUPTED if is_stopped else 1
+    if not failed:
+        return 0
+    return _MISTAKE if all(job.state == _REFUSED for job in failed) else 1
+
+
+def _print_tally(jobs: list[Job]) -> None:
+    counts = Counter(job.state for job in jobs)
+    print(f"{len(jobs)} jobs: {'; '.join(f'{count} {state}' for state, count in counts.items())}")
+    scored = [job for job in jobs if job.score is not None]
+    if len(scored) > 1:
+        best = max(scored, key=lambda job: job.score)
+        print(f"Best score {best.score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
+
+
+def _shown(path: Path) -> Path:
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,150 @@
+"""One run: build everything, then the loop: next batch, learn, log, evaluate if due, save if due."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from hpamdp.config import ConfigError, RunConfig, build
+from hpamdp.run import checkpoint
+from hpamdp.run.assemble import Parts, assemble, resolve
+from hpamdp.run.collection.base import Collection
+from hpamdp.run.recorder import Recorder
+
+_UPDATES_A_TURN = 50  # with mode=offline, between two looks at what is due
+
+
+def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stopped_at: Path | None = None) -> int:
+    """Train or score an agent as `cfg` says, write everything under `output_dir`, return the exit code.
+
+    Args:
+        cfg: the composed config.
+        output_dir: a folder, made if need be.
+        overrides: the command line's words, which change a resumed run's config.
+        stopped_at: the checkpoint of this very run, to go on from there.
+
+    Raises:
+        ConfigError: a value, a path or a pair of choices that cannot be.
+    """
+    cfg, settings, source = resolve(cfg, overrides)
+    torch.set_num_threads(settings.threads)
+    torch.manual_seed(settings.seed)
+    parts = assemble(cfg, settings, output_dir)
+    trainer = Trainer(cfg, settings, parts, output_dir)
+    if stopped_at is not None or source is not None:
+        trainer.restore(stopped_at or source)
+    output_dir.mkdir(parents=True, exist_ok=True)
+    OmegaConf.save(cfg, output_dir / "config.yaml", resolve=True)
+    is_interrupted = settings.mode != "eval" and trainer.train()
+    print(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, not is_interrupted))
+    print(f"Everything is in {output_dir}")
+    if is_interrupted:
+        mode = "" if settings.mode == "train" else f"mode={settings.mode} "
+        print(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: python run.py {mode}resume={output_dir}")
+    return 130 if is_interrupted else 0
+
+
+class Trainer:
+    """The loop, and where it stands."""
+
+    def __init__(self, cfg: DictConfig, settings: RunConfig, parts: Parts, output_dir: Path) -> None:
+        self.cfg, self.settings, self.parts, self.output_dir = cfg, settings, parts, output_dir
+        self.recorder = Recorder(cfg, parts, output_dir)
+        self.frames, self.wall_s, self.cpu_s = 0, 0.0, 0.0
+        self.last_score: float | None = None  # at the last evaluation
+        # A frame is what the run is counted in.
+        self.unit = " updates" if settings.mode == "offline" else " decisions" if settings.low.freeze else " presses"
+
+    def restore(self, source: Path) -> None:
+        """Take the agent from a checkpoint and, to train on, where its run stood."""
+        is_training = self.settings.mode != "eval"
+        env_state = checkpoint.load(source, self.parts.agent, self.parts.device, is_training)
+        progress = checkpoint.progress_of(source)
+        self.frames, self.wall_s, self.cpu_s = (progress[name] for name in ("frames", "wall_s", "cpu_s"))
+        self.last_score = progress.get("last_score")  # early runs' checkpoints lack it
+        if not is_training:
+            self.parts.env.set_statistics(env_state)
+            return
+        try:
+            self.parts.env.set_state_columns(env_state)
+        except ValueError as error:
+            raise ConfigError(f"num_envs={self.settings.num_envs}: {error}; leave it out when you resume") from error
+        self.recorder.resume_from(source.parent, self.frames)
+
+    def train(self) -> bool:
+        """Run until `num_frames` or `eval.stop_score`, save the agent; return whether the user stopped it before."""
+        context = {"cfg": self.cfg, "settings": self.settings, "parts": self.parts, "frames": self.frames}
+        collection = build("collector", self.cfg.collector, **context)
+        total = self.settings.num_frames
+        bar = tqdm(total=total, initial=self.frames, unit=self.unit, unit_scale=True, mininterval=1.0)
+        previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # a cluster's stop is a Ctrl-C
+        try:
+            self._loop(collection, bar)
+            return False
+        except KeyboardInterrupt:
+            return True
+        finally:
+            # Nothing may cut the saving short.
+            handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+            bar.close()
+            self.save(collection)
+            collection.close()
+            signal.signal(signal.SIGINT, handlers[signal.SIGINT])
+            signal.signal(signal.SIGTERM, previous)
+
+    def _loop(self, collection: Collection, bar: tqdm) -> None:
+        wall_before, cpu_before = self.wall_s - time.perf_counter(), self.cpu_s - time.process_time()
+        if self.last_score is None and self.frames == 0:
+            self._evaluate(bar)
+            if self.parts.data is not None:
+                self.parts.agent.remember(self.parts.data)
+        while not self._is_over():
+            num = self._learn(collection)
+            last, self.frames = self.frames, self.frames + num
+            self.wall_s = wall_before + time.perf_counter()
+            self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
+            bar.update(num)
+            if self.frames >= self.settings.num_frames or _is_due(last, self.frames, self.settings.eval_every):
+                self._evaluate(bar)
+            elif _is_due(last, self.frames, self.settings.log_every):
+                self.recorder.log(self.frames, self.wall_s, is_evaluated=False)
+            if not self._is_over() and _is_due(last, self.frames, self.settings.checkpoint_every):
+                self.save(collection)
+
+    def _learn(self, collection: Collection) -> int:
+        """Let the agent learn, from presses or from the data set; return how many frames that took."""
+        if self.settings.mode == "offline":
+            num = min(_UPDATES_A_TURN, self.settings.num_frames - self.frames)
+            self.recorder.take(None, self.parts.agent.practise(num))
+            return num
+        batch = collection.next()
+        self.recorder.take(batch, self.parts.agent.learn(batch))
+        return batch.numel()
+
+    def _is_over(self) -> bool:
+        stop_score, last_score = self.settings.eval.stop_score, self.last_score
+        is_reached = stop_score is not None and last_score is not None and last_score >= stop_score
+        return is_reached or self.frames >= self.settings.num_frames
+
+    def _evaluate(self, bar: tqdm) -> None:
+        row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True)
+        success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
+        self.last_score = row["eval/score"]
+        bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
+
+    def save(self, collection: Collection) -> None:
+        """Write the checkpoint."""
+        progress = {"config": OmegaConf.to_container(self.cfg, resolve=True), "frames": self.frames}
+        progress |= {"wall_s": self.wall_s, "cpu_s": self.cpu_s, "last_score": self.last_score}
+        checkpoint.save(self.output_dir / checkpoint.FILE_NAME, self.parts.agent, collection.state_columns(), progress)
+
+
+def _is_due(before: int, now: int, every: int) -> bool:
+    """Return whether a multiple of `every` was passed; never where it is 0."""
+    return every > 0 and now // every > before // every
