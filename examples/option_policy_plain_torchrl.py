@@ -24,7 +24,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.choice import ControllerChoiceEnv
+from hpamdp.env.choice import OptionChoiceEnv
 
 NUM_BOATS = 256  # that sail side by side
 EPISODES_PER_BATCH, EPOCHS, MINIBATCH = 1024, 4, 64
@@ -34,7 +34,7 @@ class Sailor(TensorDictModuleBase):
     """Press the key that points best to the goal, just long enough to come to rest beside it."""
 
     in_keys: ClassVar = ["observation", "option"]
-    out_keys: ClassVar = [("action", "key"), ("action", "duration")]
+    out_keys: ClassVar = [("action", "discrete"), ("action", "parameters")]
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,15 +46,15 @@ class Sailor(TensorDictModuleBase):
         """Write key `[N]` and durations `[N, 3]`."""
         way = 120.0 * td["observation"][:, -2:]  # px
         ahead = (self.directions[td["option"]] * way.unsqueeze(1)).sum(-1)
-        td["action", "key"] = ahead.argmax(-1)
+        td["action", "discrete"] = ahead.argmax(-1)
         # A press of d seconds carries a boat about 62 d^3 px.
-        td["action", "duration"] = (ahead.clamp(min=1.0) / 62.0) ** (1 / 3)
+        td["action", "parameters"] = (ahead.clamp(min=1.0) / 62.0) ** (1 / 3)
         return td
 
 
-def boats(seed: int) -> ControllerChoiceEnv:
+def boats(seed: int) -> OptionChoiceEnv:
     """Return the choice of a boat as an environment: one step is one whole episode, sailed by `Sailor`."""
-    return ControllerChoiceEnv(Sailor(), BoatDockEnv(NUM_BOATS, seed=seed))
+    return OptionChoiceEnv(Sailor(), BoatDockEnv(NUM_BOATS, seed=seed))
 
 
 def train(env: EnvBase, num_batches: int) -> TensorDictModuleBase:
@@ -74,7 +74,7 @@ def train(env: EnvBase, num_batches: int) -> TensorDictModuleBase:
     loss = ClipPPOLoss(policy, critic, entropy_coeff=0.01)
     loss.set_keys(action="option", sample_log_prob="option_log_prob")
     advantage = GAE(gamma=1.0, lmbda=1.0, value_network=critic, average_gae=True)
-    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     frames = dict(frames_per_batch=EPISODES_PER_BATCH, total_frames=num_batches * EPISODES_PER_BATCH)
     collector = Collector(env, policy, **frames, auto_register_policy_transforms=False)
     for batch in collector:
@@ -82,14 +82,14 @@ def train(env: EnvBase, num_batches: int) -> TensorDictModuleBase:
             rows = advantage(batch).reshape(-1)
             for indices in torch.randperm(len(rows)).split(MINIBATCH):
                 losses = loss(rows[indices])
-                optimiser.zero_grad()
+                optimizer.zero_grad()
                 sum(losses[name] for name in ("loss_objective", "loss_critic", "loss_entropy")).backward()
-                optimiser.step()
+                optimizer.step()
     collector.shutdown(close_env=False)
     return policy
 
 
-def score(env: ControllerChoiceEnv, option: int | None, policy: TensorDictModuleBase) -> float:
+def score(env: OptionChoiceEnv, option: int | None, policy: TensorDictModuleBase) -> float:
     """Return the mean score over the same episodes, with one option everywhere or, if None, with the policy's."""
     env.set_seed(0)
     td = env.reset(env.fixed_episodes(0))

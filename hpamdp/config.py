@@ -72,7 +72,7 @@ class AgentConfig(BaseModel):
 
     sharing: Literal["per_option", "shared"]
     option_length: Literal["episode"] | PositiveInt
-    practice_frames: NonNegativeInt
+    uniform_option_frames: NonNegativeInt
 
 
 class OfflineConfig(BaseModel):

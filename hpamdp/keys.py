@@ -3,8 +3,8 @@
 OBSERVATION = "observation"
 OPTION = "option"
 ACTION = "action"
-KEY = (ACTION, "key")
-DURATION = (ACTION, "duration")
+DISCRETE = (ACTION, "discrete")
+PARAMETERS = (ACTION, "parameters")
 REWARD = "reward"
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 OUTCOME, FUEL = "outcome", "fuel"
@@ -17,11 +17,11 @@ EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
 
 # Written by an environment that knows the best action: what the `oracle` selector and the `planner` learner read.
 ORACLE_OPTION = ("oracle", "option")
-ORACLE_KEY = ("oracle", "key")
-ORACLE_DURATION = ("oracle", "duration")
+ORACLE_DISCRETE = ("oracle", "discrete")
+ORACLE_PARAMETERS = ("oracle", "parameters")
 
 # Written by an environment that knows what people do: their shares of the options, what the `human` selector reads.
-PEOPLE_OPTION = ("people", "option")
+HUMAN_OPTION = ("human", "option")
 
 # Written by the agent for a selector that asks for it: what each option's learner expects of the state.
 OPTION_VALUES = "option_values"

@@ -34,7 +34,7 @@ class PAMDPSpecs:
         return len(self.option_names)
 
     @property
-    def num_keys(self) -> int:
+    def num_discrete(self) -> int:
         """How many keys (discrete actions) there are."""
         return len(self.parameter_dims)
 
@@ -46,8 +46,8 @@ class PAMDPSpecs:
     @property
     def parameter_mask(self) -> Tensor:
         """Return bool `[num_keys, num_parameters]`: which parameters are each key's own."""
-        owner = torch.repeat_interleave(torch.arange(self.num_keys), torch.tensor(self.parameter_dims))
-        return owner == torch.arange(self.num_keys).unsqueeze(-1)
+        owner = torch.repeat_interleave(torch.arange(self.num_discrete), torch.tensor(self.parameter_dims))
+        return owner == torch.arange(self.num_discrete).unsqueeze(-1)
 
     def to_unit(self, parameters: Tensor) -> Tensor:
         """Map parameters `[*B, num_parameters]` from their bounds to [-1, 1]."""
@@ -67,7 +67,7 @@ class PAMDPSpecs:
     def from_env(cls, env: EnvBase) -> PAMDPSpecs:
         """Read the sizes off an environment whose action has the leaves `keys.KEY` and `keys.DURATION`."""
         action = env.full_action_spec_unbatched
-        duration = action[keys.DURATION]
+        duration = action[keys.PARAMETERS]
         return cls(
             observation_dim=env.observation_spec_unbatched[keys.OBSERVATION].shape[-1],
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),

@@ -19,7 +19,7 @@ def make(num_envs: int = 1, *, form: str = "nested", max_steps: int | None = 6, 
 
 
 def action(env: GymnasiumEnv, pressed, parameters) -> TensorDict:
-    press = {"key": torch.as_tensor(pressed), "duration": torch.as_tensor(parameters, dtype=torch.float32)}
+    press = {"discrete": torch.as_tensor(pressed), "parameters": torch.as_tensor(parameters, dtype=torch.float32)}
     return TensorDict({"action": TensorDict(press, env.batch_size)}, env.batch_size)
 
 

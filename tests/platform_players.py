@@ -19,7 +19,7 @@ def action(key, parameter) -> TensorDict:
     """Build an action of every environment: `key` a list or `[N]`, `parameter` one number each or `[N, 3]`."""
     key, parameter = torch.as_tensor(key), torch.as_tensor(parameter, dtype=torch.float32)
     parameter = parameter if parameter.ndim == 2 else parameter.unsqueeze(-1).expand(-1, 3)
-    press = TensorDict(key=key, duration=parameter, batch_size=[len(key)])
+    press = TensorDict(discrete=key, parameters=parameter, batch_size=[len(key)])
     return TensorDict({keys.ACTION: press}, batch_size=[len(key)])
 
 
@@ -59,9 +59,9 @@ def play(env: PlatformEnv, policy: Callable[[Tensor], TensorDict], most: int = 5
 
 def place(env: PlatformEnv, **columns: Tensor | float) -> None:
     """Put the agents and enemies elsewhere."""
-    state = env.state_columns()
+    state = env.env_state()
     given = {name: torch.as_tensor(value).expand(env.num_envs) for name, value in columns.items()}
-    env.set_state_columns({**state, **given})
+    env.set_env_state({**state, **given})
 
 
 def random_columns(num: int, generator: torch.Generator) -> dict[str, Tensor]:

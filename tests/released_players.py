@@ -58,7 +58,7 @@ def action(key, duration) -> TensorDict:
     """Build an action: `key` a list, `duration` a number for each environment or `[N, 3]`."""
     key, duration = torch.as_tensor(key), torch.as_tensor(duration, dtype=torch.float32)
     duration = duration if duration.ndim == 2 else duration.unsqueeze(-1).expand(-1, 3)
-    return TensorDict({keys.ACTION: TensorDict(key=key, duration=duration, batch_size=[len(key)])}, [len(key)])
+    return TensorDict({keys.ACTION: TensorDict(discrete=key, parameters=duration, batch_size=[len(key)])}, [len(key)])
 
 
 def press(env: ReleasedBoatDockEnv, key: int, duration: float) -> TensorDict:

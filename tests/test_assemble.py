@@ -11,7 +11,7 @@ from toy_options import Crossing
 
 from hpamdp import keys
 from hpamdp.config import ConfigError, run_config
-from hpamdp.env.choice import ControllerChoiceEnv
+from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.train import Trainer
 
@@ -45,7 +45,7 @@ def crossing(*words: str) -> DictConfig:
     ("words", "complaint"),
     [
         ("high=ucb env=platform", "high=ucb: env=platform has no options to choose; use high=none"),
-        ("high=human env=platform", "high=human: env=platform has no record of people"),
+        ("high=human env=platform", "high=human: env=platform has no human data"),
         ("high=oracle env=platform", "high=oracle: env=platform has no planner to ask"),
         ("high=none low=planner env=platform", "low=planner: env=platform has no planner to ask"),
         ("high=none low=planner env=boatdock_released", "low=planner: env=boatdock_released has no planner to ask"),
@@ -132,7 +132,7 @@ def test_frozen_learners_of_another_run_stay_as_they_are_while_the_selector_lear
     fresh = copied(make(compose_config([*words, "high=ucb"]), tmp_path / "fresh").agent.learners)
     words += [*QUICK_CRITIC, f"low.checkpoint={trained}", "low.freeze=true"]
     parts = make(compose_config(words), tmp_path / "before")
-    assert isinstance(parts.env.base_env, ControllerChoiceEnv)
+    assert isinstance(parts.env.base_env, OptionChoiceEnv)
     start, selector = copied(parts.agent.learners), copied(parts.agent.selector)
     assert not is_same(start, fresh)
     parts = train(compose_config(words), tmp_path / "after")
@@ -151,7 +151,7 @@ def test_learners_of_another_run_go_on_learning_where_they_are_not_frozen(traine
 def test_frozen_learners_that_need_no_training_need_no_checkpoint(tmp_path):
     words = [*SMALL, "high=ucb", "low=random", "low.freeze=true"]
     parts = train(compose_config(words), tmp_path / "out")
-    assert parts.agent.selector.payoffs.num_decisions.item() == 256
+    assert parts.agent.selector.rewards.num_decisions.item() == 256
 
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])

@@ -12,7 +12,7 @@ from hpamdp.policies.high_level.epsilon_greedy import EpsilonGreedy
 from hpamdp.policies.high_level.exp3 import PROBABILITY, Exp3
 from hpamdp.policies.high_level.thompson import Thompson
 from hpamdp.policies.high_level.ucb import UCB
-from hpamdp.policies.shared.bandit_statistics import Bandit, Payoffs
+from hpamdp.policies.shared.bandit_statistics import Bandit, RewardStatistics
 
 MEMORIES = ("all", "discounted", "sliding_window")
 BANDITS = {
@@ -38,41 +38,41 @@ def share_of_right(options: torch.Tensor) -> float:
 
 
 def test_all_payoffs_count_the_same():
-    payoffs = Payoffs(2, "all", 0.9, 3)
-    for option, payoff in ((0, 1.0), (1, 2.5), (0, 2.0), (0, 3.0)):
-        payoffs.add(torch.tensor([option]), torch.tensor([payoff]))
-    assert payoffs.counts.tolist() == [3, 1] and payoffs.means.tolist() == [2.0, 2.5]
-    assert payoffs.deviation.item() == pytest.approx(torch.tensor([1.0, 2.5, 2.0, 3.0]).std(correction=0).item())
-    assert payoffs.best() == 1 and payoffs.num_decisions.item() == 4
+    rewards = RewardStatistics(2, "all", 0.9, 3)
+    for option, reward in ((0, 1.0), (1, 2.5), (0, 2.0), (0, 3.0)):
+        rewards.add(torch.tensor([option]), torch.tensor([reward]))
+    assert rewards.counts.tolist() == [3, 1] and rewards.means.tolist() == [2.0, 2.5]
+    assert rewards.deviation.item() == pytest.approx(torch.tensor([1.0, 2.5, 2.0, 3.0]).std(correction=0).item())
+    assert rewards.best() == 1 and rewards.num_decisions.item() == 4
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 3, 6])
 def test_discounted_payoffs_weigh_by_their_age_in_decisions(at_once):
     options, values = torch.tensor([0, 1, 0, 0, 1, 0]), torch.tensor([1.0, 2.0, -3.0, 4.0, 5.0, -6.0])
-    payoffs = Payoffs(2, "discounted", 0.9, 3)
+    rewards = RewardStatistics(2, "discounted", 0.9, 3)
     for o, v in zip(options.split(at_once), values.split(at_once), strict=True):
-        payoffs.add(o, v)
+        rewards.add(o, v)
     weights = 0.9 ** torch.arange(5, -1, -1).double()
     for option in (0, 1):
         own = options == option
-        assert payoffs.counts[option].item() == pytest.approx(weights[own].sum().item())
+        assert rewards.counts[option].item() == pytest.approx(weights[own].sum().item())
         mean = (weights * values)[own].sum() / weights[own].sum()
-        assert payoffs.means[option].item() == pytest.approx(mean.item())
+        assert rewards.means[option].item() == pytest.approx(mean.item())
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 3, 6])
 def test_a_sliding_window_holds_the_last_decisions_alone(at_once):
-    payoffs = Payoffs(2, "sliding_window", 0.9, 4)
+    rewards = RewardStatistics(2, "sliding_window", 0.9, 4)
     options, values = torch.tensor([0, 0, 1, 1, 0, 0]), torch.tensor([9.0, 9.0, 1.0, 2.0, 3.0, 5.0])
     for o, v in zip(options.split(at_once), values.split(at_once), strict=True):
-        payoffs.add(o, v)
-    assert payoffs.counts.tolist() == [2, 2] and payoffs.means.tolist() == [4.0, 1.5]
+        rewards.add(o, v)
+    assert rewards.counts.tolist() == [2, 2] and rewards.means.tolist() == [4.0, 1.5]
 
 
 def test_an_option_that_left_the_window_is_untried_again():
-    payoffs = Payoffs(2, "sliding_window", 0.9, 2)
-    payoffs.add(torch.tensor([1, 0, 0]), torch.tensor([5.0, -1.0, -1.0]))
-    assert payoffs.is_untried.tolist() == [False, True] and payoffs.best() == 0
+    rewards = RewardStatistics(2, "sliding_window", 0.9, 2)
+    rewards.add(torch.tensor([1, 0, 0]), torch.tensor([5.0, -1.0, -1.0]))
+    assert rewards.is_untried.tolist() == [False, True] and rewards.best() == 0
 
 
 # What is chosen.
@@ -92,14 +92,14 @@ def test_greedy_choices_are_the_best_option_everywhere(name, memory):
 
 
 @every_bandit
-@pytest.mark.parametrize("payoffs", [[], [5.0], [1.0, 2.0, 3.0, 2.0, 2.0]])
-def test_options_without_payoffs_get_tried(name, payoffs):
+@pytest.mark.parametrize("rewards", [[], [5.0], [1.0, 2.0, 3.0, 2.0, 2.0]])
+def test_options_without_payoffs_get_tried(name, rewards):
     torch.manual_seed(0)
     bandit = make(name, **({"epsilon_scale": 1e-3, "epsilon_final": 0.0} if name == "epsilon_greedy" else {}))
-    if payoffs:
-        bandit.learn(paid([0] * len(payoffs), payoffs, **{PROBABILITY: torch.full((len(payoffs),), 0.5)}))
+    if rewards:
+        bandit.learn(paid([0] * len(rewards), rewards, **{PROBABILITY: torch.full((len(rewards),), 0.5)}))
     tried = bandit.select(due(100)).sum().item()
-    assert tried >= 20 if payoffs else 20 <= tried <= 80
+    assert tried >= 20 if rewards else 20 <= tried <= 80
 
 
 @every_bandit
@@ -108,7 +108,7 @@ def test_only_decisions_that_are_due_are_drawn(name):
     root = due(100)
     root[keys.IS_DECISION][:50] = False
     bandit, drawn = make(name), []
-    bandit.draw = lambda num: drawn.append(num) or torch.ones(num, dtype=torch.long)
+    bandit.sample = lambda num: drawn.append(num) or torch.ones(num, dtype=torch.long)
     assert bandit.select(root)[50:].tolist() == [1] * 50
     assert drawn == [50]
 
@@ -123,10 +123,10 @@ def test_epsilon_falls_with_one_over_the_decisions_to_its_end():
 
 
 def test_ucb1_chooses_by_its_formula():
-    ucb, payoffs = make("ucb"), [1.0, 2.0, 3.0, 1.2]
-    ucb.learn(paid([0, 0, 0, 1], payoffs))
+    ucb, rewards = make("ucb"), [1.0, 2.0, 3.0, 1.2]
+    ucb.learn(paid([0, 0, 0, 1], rewards))
     # Means 2 and 1.2, decision 5: the factor at which the bounds of 3 payoffs and of 1 are the same.
-    deviation = torch.tensor(payoffs).std(correction=0).item()
+    deviation = torch.tensor(rewards).std(correction=0).item()
     even = (2.0 - 1.2) / (deviation * math.sqrt(2 * math.log(5)) * (1 - 1 / math.sqrt(3)))
     for factor, chosen in ((0.99, 0), (1.01, 1)):
         ucb.exploration = factor * even
@@ -137,14 +137,14 @@ def test_ucb1_chooses_by_its_formula():
 def test_ucb_serves_simultaneous_decisions_as_if_one_after_another(tried):
     torch.manual_seed(0)
     ucb = make("ucb", exploration=1.0)
-    payoffs = torch.randn(sum(tried))
+    rewards = torch.randn(sum(tried))
     if sum(tried):
-        ucb.learn(paid([0] * tried[0] + [1] * tried[1], payoffs.tolist()))
-    means = [part.mean() if len(part) else payoffs.mean() for part in payoffs.split(list(tried))]
+        ucb.learn(paid([0] * tried[0] + [1] * tried[1], rewards.tolist()))
+    means = [part.mean() if len(part) else rewards.mean() for part in rewards.split(list(tried))]
     means = torch.stack(means) if sum(tried) else torch.zeros(2)
     counts = torch.tensor(tried, dtype=torch.float64)
     for _ in range(64):
-        bounds = means + ucb.payoffs.deviation * (2 * math.log(sum(tried) + 64) / counts).sqrt()
+        bounds = means + ucb.rewards.deviation * (2 * math.log(sum(tried) + 64) / counts).sqrt()
         counts[bounds.argmax()] += 1
     chosen = torch.bincount(ucb.select(due(64)), minlength=2)
     assert chosen.tolist() == (counts - torch.tensor(tried)).tolist()
@@ -154,7 +154,7 @@ def test_thompson_chooses_an_option_as_often_as_it_is_likely_to_be_the_best():
     torch.manual_seed(0)
     thompson = make("thompson", exploration=0.8)
     thompson.learn(paid([0] * 8 + [1] * 2, [1.0, 0.0] * 4 + [1.2, 0.0]))
-    deviation = 0.8 * thompson.payoffs.deviation * math.sqrt(1 / 8 + 1 / 2)
+    deviation = 0.8 * thompson.rewards.deviation * math.sqrt(1 / 8 + 1 / 2)
     likely = torch.distributions.Normal(0.0, 1.0).cdf(0.1 / deviation).item()
     assert share_of_right(thompson.select(due(40_000))) == pytest.approx(likely, abs=0.01)
 
@@ -250,6 +250,6 @@ def test_regret_of_exp3_tuned_to_the_horizon_grows_with_the_root_of_time():
             bandit = make("exp3", exploration=gamma)
             total += play(bandit, constant(1.0, 0.0), horizon, 10, noise=0.5)[1].sum().item() / 3
         regret[horizon] = total
-        payoffs = bandit.high - bandit.low
-        assert total < 2.63 * payoffs * math.sqrt(horizon * 2 * math.log(2))
+        rewards = bandit.high - bandit.low
+        assert total < 2.63 * rewards * math.sqrt(horizon * 2 * math.log(2))
     assert regret[4 * T] / regret[T] < 2.6  # of the root: 2

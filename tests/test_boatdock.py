@@ -32,7 +32,7 @@ def action(key, duration, option=None) -> TensorDict:
     key, duration = torch.as_tensor(key), torch.as_tensor(duration, dtype=torch.float32)
     num = len(key)
     duration = duration if duration.ndim == 2 else duration.reshape(-1, 1).expand(num, 3)
-    press = TensorDict(key=key, duration=duration, batch_size=[num])
+    press = TensorDict(discrete=key, parameters=duration, batch_size=[num])
     chosen = {} if option is None else {keys.OPTION: torch.as_tensor(option)}
     return TensorDict({keys.ACTION: press, **chosen}, batch_size=[num])
 
@@ -204,7 +204,7 @@ BAD_ACTIONS = {
     "one duration a boat": action([0, 1], [[0.1], [0.1]], [0, 0]),
     "fractional key": action([0.5, 1.0], [0.1, 0.1], [0, 0]),
     "no option": action([0, 1], [0.1, 0.1]),
-    "no key": action([0, 1], [0.1, 0.1], [0, 0]).exclude(keys.KEY),
+    "no key": action([0, 1], [0.1, 0.1], [0, 0]).exclude(keys.DISCRETE),
     "option of another shape": action([0, 1], [0.1, 0.1], [[0], [1]]),
 }
 

@@ -38,7 +38,7 @@ def test_specs_are_kept(controller, observation, dtype):
 
 
 def test_the_action_spec_has_durations_from_minus_one_to_one():
-    spec = ReleasedBoatDockEnv(2).full_action_spec[keys.DURATION]
+    spec = ReleasedBoatDockEnv(2).full_action_spec[keys.PARAMETERS]
     assert (spec.space.low == -1.0).all() and (spec.space.high == 1.0).all()
 
 
@@ -106,15 +106,15 @@ def test_a_saved_state_goes_on_as_it_would_have():
     env, copy = (ReleasedBoatDockEnv(6, controller="incongruent", frozen_layouts=False, seed=2) for _ in range(2))
     env.reset()
     press(env, 1, -0.95)
-    copy.set_state_columns({name: column.clone() for name, column in env.state_columns().items()})
+    copy.set_env_state({name: column.clone() for name, column in env.env_state().items()})
     for step in (lambda e: press(e, 2, -0.97), lambda e: e.reset(), lambda e: press(e, 0, -0.93)):
         assert (step(env) == step(copy)).all()
     for columns, complaint in (
-        (ReleasedBoatDockEnv(2).state_columns(), r"\[2\], but must be \[6\]"),
+        (ReleasedBoatDockEnv(2).env_state(), r"\[2\], but must be \[6\]"),
         ({"x": 0}, "not x"),
     ):
         with pytest.raises(ValueError, match=complaint):
-            env.set_state_columns(columns)
+            env.set_env_state(columns)
 
 
 @pytest.mark.parametrize(
@@ -129,10 +129,10 @@ def test_a_saved_state_goes_on_as_it_would_have():
 def test_a_bad_action_is_refused_and_harms_nothing(bad, complaint):
     env = ReleasedBoatDockEnv(2)
     env.reset()
-    before = env.state_columns()
+    before = env.env_state()
     with pytest.raises(ValueError, match=complaint):
         env.step(bad)
-    assert all(torch.equal(now, before[name]) for name, now in env.state_columns().items())
+    assert all(torch.equal(now, before[name]) for name, now in env.env_state().items())
 
 
 @pytest.mark.parametrize(

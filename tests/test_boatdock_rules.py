@@ -20,7 +20,7 @@ def press(env: BoatDockEnv, key, duration) -> TensorDictBase:
     """Press a key in every boat; `duration` holds one number a boat or `[N, 3]`."""
     key, duration = torch.as_tensor(key), torch.as_tensor(duration, dtype=torch.float32)
     duration = duration if duration.ndim == 2 else duration.reshape(-1, 1).expand(len(key), 3)
-    leaves = TensorDict(key=key, duration=duration, batch_size=[len(key)])
+    leaves = TensorDict(discrete=key, parameters=duration, batch_size=[len(key)])
     return env.step(TensorDict({keys.ACTION: leaves}, batch_size=[len(key)]))["next"]
 
 
@@ -38,7 +38,7 @@ def play(env: BoatDockEnv, num_presses: int) -> list[TensorDictBase]:
         (torch.randint(3, (env.num_envs,), generator=generator), torch.rand(env.num_envs, 3, generator=generator))
         for _ in range(num_presses)
     ]
-    return [press(env, *draw) for draw in draws]
+    return [press(env, *sample) for sample in draws]
 
 
 def test_only_the_pressed_keys_duration_counts():

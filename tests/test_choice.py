@@ -14,7 +14,7 @@ from toy_options import Crossing, WholeStep, steppers
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.choice import ControllerChoiceEnv
+from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
@@ -30,18 +30,18 @@ class Presser(torch.nn.Module):
     def forward(self, td):
         distance = td[keys.OBSERVATION][..., -2:].norm(dim=-1)
         duration = (0.5 + 0.5 * distance.clamp(max=1.0)).unsqueeze(-1).expand(-1, 3)
-        key = (td[keys.OBSERVATION][..., 12] * 7).long() % 3
-        return td.update({keys.ACTION: {"key": key, "duration": duration}})
+        discrete = (td[keys.OBSERVATION][..., 12] * 7).long() % 3
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": duration}})
 
 
-def make(num_envs: int) -> ControllerChoiceEnv:
-    return ControllerChoiceEnv(Presser(), BoatDockEnv(num_envs, seed=3))
+def make(num_envs: int) -> OptionChoiceEnv:
+    return OptionChoiceEnv(Presser(), BoatDockEnv(num_envs, seed=3))
 
 
 def test_specs_are_clean():
     env = BoatDockEnv(4)
-    check_env_specs(ControllerChoiceEnv(RandomPolicy(PAMDPSpecs.from_env(env)), env))
-    check_env_specs(with_decisions(ControllerChoiceEnv(WholeStep(), Crossing(4, start=6.0))))
+    check_env_specs(OptionChoiceEnv(RandomPolicy(PAMDPSpecs.from_env(env)), env))
+    check_env_specs(with_decisions(OptionChoiceEnv(WholeStep(), Crossing(4, start=6.0))))
 
 
 def test_every_step_is_one_whole_episode():
@@ -63,7 +63,7 @@ def test_reward_is_the_return_of_the_episode_played_press_by_press(option):
     for _ in range(2):
         learner = Learner(specs)
         learner.policy = Presser()
-        learner.policy.in_keys, learner.policy.out_keys = [keys.OBSERVATION], [keys.KEY, keys.DURATION]
+        learner.policy.in_keys, learner.policy.out_keys = [keys.OBSERVATION], [keys.DISCRETE, keys.PARAMETERS]
         learners.append(learner)
     agent = HierarchicalAgent(Fixed(specs, option=option), learners, specs)
     rows = presses.rollout(25, agent.policy, break_when_any_done=False)
@@ -77,7 +77,7 @@ def test_any_environment_with_a_choice_will_do(option):
     class Hurried(Crossing):
         max_steps = 10
 
-    env = ControllerChoiceEnv(WholeStep(), Hurried(40, start=6.0, seed=1))
+    env = OptionChoiceEnv(WholeStep(), Hurried(40, start=6.0, seed=1))
     after = env.step(env.reset().set(keys.OPTION, torch.full((40,), option)))["next"]
 
     specs = PAMDPSpecs.from_env(Hurried(1))
@@ -100,7 +100,7 @@ def test_the_low_level_acts_greedily_while_the_options_are_explored(outside):
             seen.add(exploration_type())
             return super().forward(td)
 
-    env = ControllerChoiceEnv(Listening(), BoatDockEnv(3))
+    env = OptionChoiceEnv(Listening(), BoatDockEnv(3))
     with set_exploration_type(outside):
         env.rollout(2)
         assert exploration_type() == outside
@@ -120,7 +120,7 @@ def test_it_is_itself_a_problem_that_the_framework_takes():
 def test_episodes_go_on_where_the_state_was_taken():
     env, other = make(5), make(5)
     env.rollout(3, break_when_any_done=False)
-    other.set_state_columns(env.state_columns())
+    other.set_env_state(env.env_state())
     expected = env.reset()[keys.OBSERVATION]
     torch.testing.assert_close(other.reset()[keys.OBSERVATION], expected)
 
@@ -136,12 +136,12 @@ def test_given_layouts_are_played():
 @pytest.mark.parametrize("controller", ["congruent", "random"])
 def test_an_environment_without_a_choice_is_refused(controller):
     with pytest.raises(ValueError, match="choose"):
-        ControllerChoiceEnv(Presser(), BoatDockEnv(2, controller=controller))
+        OptionChoiceEnv(Presser(), BoatDockEnv(2, controller=controller))
 
 
-def planned(num_envs: int, seed: int = 0) -> ControllerChoiceEnv:
+def planned(num_envs: int, seed: int = 0) -> OptionChoiceEnv:
     boats = BoatDockEnv(num_envs, oracle=True, seed=seed)
-    return ControllerChoiceEnv(PlannerPolicy(PAMDPSpecs.from_env(boats)), boats)
+    return OptionChoiceEnv(PlannerPolicy(PAMDPSpecs.from_env(boats)), boats)
 
 
 def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
@@ -155,7 +155,7 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
     loss = DQNLoss(greedy, action_space="categorical", delay_value=False)
     loss.set_keys(action=keys.OPTION)
     loss.make_value_estimator(gamma=1.0)
-    optimiser = torch.optim.Adam(loss.parameters(), lr=5e-3)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=5e-3)
     buffer = ReplayBuffer(storage=LazyTensorStorage(600), batch_size=256)
     policy = TensorDictSequential(greedy, explore)
     collector = Collector(env, policy, frames_per_batch=50, total_frames=600, auto_register_policy_transforms=False)
@@ -163,9 +163,9 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
         buffer.extend(batch.reshape(-1))
         explore.step(len(batch))
         for _ in range(40):
-            optimiser.zero_grad()
+            optimizer.zero_grad()
             loss(buffer.sample())["loss"].backward()
-            optimiser.step()
+            optimizer.step()
     collector.shutdown(close_env=False)
 
     test, returns = planned(200), []

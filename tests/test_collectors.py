@@ -14,7 +14,7 @@ from conftest import CONF, TRAINED, compose_config
 
 from hpamdp.config import ConfigError, build, run_config
 from hpamdp.run.assemble import assemble
-from hpamdp.run.collection.worker import PolicyCopy, Share, packed
+from hpamdp.run.collection.worker import EnvShard, PolicyCopy, packed
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
@@ -43,7 +43,7 @@ def make(folder, *overrides):
 def share(folder, *overrides, first_env=0, num_envs=8, low=None, columns=None):
     cfg = compose_config([*SMALL, *overrides])
     specs = assemble(cfg, run_config(cfg), folder).agent.specs
-    return Share(cfg, specs, first_env, num_envs, exploration_seed=0, columns=columns or {}, low=low)
+    return EnvShard(cfg, specs, first_env, num_envs, exploration_seed=0, columns=columns or {}, low=low)
 
 
 def leaves(batch):
@@ -83,7 +83,7 @@ def test_the_next_batch_goes_on_where_the_last_one_ended(workers):
     is_on = ~last["next", "done"][:, -1, 0]
     assert is_on.any()
     assert torch.equal(last["next", "observation"][:, -1][is_on], following["observation"][:, 0][is_on])
-    columns = collection.state_columns()
+    columns = collection.env_state()
     assert all(len(column) == 8 for column in columns.values())
     # Scaled observations end in goal - boat, px over the harbour's radius.
     offset = following["next", "observation"][:, -1, -2:]
@@ -113,7 +113,7 @@ def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
     parts = assemble(cfg, run_config(cfg), tmp_path)
     collection = build("collector", cfg.collector, cfg=cfg, settings=run_config(cfg), parts=parts, frames=0)
     torch.manual_seed(1)
-    copy = Share(cfg, parts.agent.specs, 0, 8, exploration_seed=1, columns={}, low=None).make_policy()
+    copy = EnvShard(cfg, parts.agent.specs, 0, 8, exploration_seed=1, columns={}, low=None).make_policy()
     for _ in range(2):
         parts.agent.learn(collection.next())
     assert copy.receive(packed(parts.policy)) > 0.0
@@ -151,13 +151,13 @@ def test_shares_together_are_the_environments_of_a_single_process(env, tmp_path)
 def test_a_share_goes_on_where_its_environments_stood(tmp_path):
     env = share(tmp_path, first_env=4, num_envs=4).make_env()
     env.reset()
-    columns = env.state_columns()
+    columns = env.env_state()
     again = share(tmp_path, first_env=4, num_envs=4, columns=columns).make_env()
     again.reset()
-    assert again.state_columns()["episode"].tolist() == [1] * 4
+    assert again.env_state()["episode"].tolist() == [1] * 4
     env.reset()
     for name in BOATS:
-        assert torch.equal(again.state_columns()[name], env.state_columns()[name])
+        assert torch.equal(again.env_state()[name], env.env_state()[name])
 
 
 def test_a_frozen_presser_goes_with_the_share(tmp_path):

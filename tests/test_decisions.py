@@ -9,7 +9,7 @@ from toy_options import Crossing, Toll, best_value, earned, steppers
 
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.choice import ControllerChoiceEnv
+from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
@@ -114,7 +114,7 @@ def test_decisions_of_one_environment_survive_the_resets_of_others():
 def test_layouts_given_to_a_reset_reach_the_boats(mask, is_choice):
     env = BoatDockEnv(3, seed=1)
     if is_choice:
-        env = ControllerChoiceEnv(Random(PAMDPSpecs.from_env(env)).policy, env)
+        env = OptionChoiceEnv(Random(PAMDPSpecs.from_env(env)).policy, env)
     env = with_decisions(env)
     before = env.reset()
     layout = TensorDict({"start": points(560.0), "goal": points(700.0)}, [3])

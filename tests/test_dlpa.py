@@ -41,11 +41,11 @@ def boats(seen: torch.Tensor) -> episode.BoatState:
     )
 
 
-def true_model(state: torch.Tensor, key: torch.Tensor, unit: torch.Tensor) -> Prediction:
+def true_model(state: torch.Tensor, discrete: torch.Tensor, unit: torch.Tensor) -> Prediction:
     """Predict a press of the boat task as it is."""
     rules, seed, row = episode.Rules("congruent"), torch.zeros((), dtype=torch.int32), torch.arange(len(state)).int()
     before = boats(state)
-    after, reward, _ = episode.step(before, before.controller, key, unit + 1.0, seed, row, rules)
+    after, reward, _ = episode.step(before, before.controller, discrete, unit + 1.0, seed, row, rules)
     reading = episode.read(after, seed, row, rules)
     logit = torch.where(reading.terminated.squeeze(-1), 50.0, -50.0)
     return Prediction(reading.observation, reward[None], reward[None], logit[None])
@@ -60,7 +60,7 @@ def test_planning_in_the_true_model_comes_close_to_the_ceiling():
     ceiling = env.describe()["optimum"][:, 1].mean()
     for _ in range(8):
         plan = planner.plan(td[keys.OBSERVATION])
-        td[keys.ACTION] = {"key": plan.probability[:, 0].argmax(-1), "duration": plan.mean[:, 0] + 1.0}
+        td[keys.ACTION] = {"discrete": plan.probability[:, 0].argmax(-1), "parameters": plan.mean[:, 0] + 1.0}
         td = env.step_mdp(env.step(td))
         if td[keys.DONE].all():
             break
@@ -70,15 +70,15 @@ def test_planning_in_the_true_model_comes_close_to_the_ceiling():
 @pytest.mark.parametrize("form", FORMS)
 def test_a_model_of_every_form_sees_the_pressed_keys_own_parameters_alone(form):
     model = PAMDPModel(SPECS, form, [32, 32], 3)
-    state, key, unit = torch.randn(90, 4), torch.arange(3).repeat(30), torch.rand(90, 3) * 2 - 1
-    predicted = model(state, key, unit)
+    state, discrete, unit = torch.randn(90, 4), torch.arange(3).repeat(30), torch.rand(90, 3) * 2 - 1
+    predicted = model(state, discrete, unit)
     assert predicted.next_state.shape == (90, 4)
     assert all(part.shape == (3, 90) for part in predicted[1:])
-    own = SPECS.parameter_mask[key]
-    same = model(state, key, torch.where(own, unit, torch.rand(90, 3)))
+    own = SPECS.parameter_mask[discrete]
+    same = model(state, discrete, torch.where(own, unit, torch.rand(90, 3)))
     assert all(torch.equal(a, b) for a, b in zip(predicted, same, strict=True))
-    other = model(state, key, torch.where(own, -unit, unit))
-    has_parameters = key < 2
+    other = model(state, discrete, torch.where(own, -unit, unit))
+    has_parameters = discrete < 2
     assert ((other.logit - predicted.logit).abs().amin(0) > 0)[has_parameters].all()
     assert torch.equal(other.logit[:, ~has_parameters], predicted.logit[:, ~has_parameters])
 
@@ -90,7 +90,7 @@ def test_the_h_step_loss_is_what_a_hand_computation_gives_with_an_end_inside_the
         {
             "state": torch.randn(2, 3, 4),
             "next_state": torch.randn(2, 3, 4),
-            "key": torch.tensor([[0, 1, 2], [1, 0, 1]]),
+            "discrete": torch.tensor([[0, 1, 2], [1, 0, 1]]),
             "unit": torch.rand(2, 3, 3) * 2 - 1,
             "reward": torch.randn(2, 3),
             "terminated": torch.tensor([[False, True, False], [False, False, False]]),
@@ -103,7 +103,7 @@ def test_the_h_step_loss_is_what_a_hand_computation_gives_with_an_end_inside_the
         state = window["state"][0]
         for h in range(num_steps):
             row = window[h]
-            predicted = learner.model(state[None], row["key"][None], row["unit"][None])
+            predicted = learner.model(state[None], row["discrete"][None], row["unit"][None])
             state, ends = predicted.next_state[0], row["terminated"]
             weight = 0.5**h / 2
             if not ends:
@@ -134,7 +134,7 @@ def counting_batches(num_environments: int, num_batches: int, num_steps: int) ->
                 option[e, t] = (number + e) % 2
                 clock[e] = [number + 1, 0] if over[e, t] else [number, step + 1]
         batch[keys.OBSERVATION], batch[keys.OPTION] = seen[0], option
-        batch[keys.ACTION] = {"key": option, "duration": torch.zeros(*batch.shape, 3)}
+        batch[keys.ACTION] = {"discrete": option, "parameters": torch.zeros(*batch.shape, 3)}
         is_cut = over & (seen[0, ..., 1:2] % 3 == 0)
         batch["next"] = {keys.OBSERVATION: seen[1], keys.REWARD: torch.zeros(over.shape), keys.DONE: over}
         batch["next", keys.TERMINATED] = over & ~is_cut
@@ -149,7 +149,7 @@ def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_o
         learner.store(batch, batch[keys.OPTION] == 1)
     windows = learner.windows()
     seen, valid = windows["state"], windows["valid"]
-    assert valid[:, 0].all() and (windows["key"] == 1).all()
+    assert valid[:, 0].all() and (windows["discrete"] == 1).all()
     for h in (1, 2):
         follows = (seen[:, h] == seen[:, h - 1] + torch.tensor([0.0, 0.0, 1.0, 0.0])).all(-1)
         assert follows[valid[:, h]].all(), "a window left its episode or skipped a step"
@@ -163,10 +163,10 @@ def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_o
 def test_the_elites_make_the_next_distribution_key_by_key():
     planner = Planner(None, SPECS, **{**SEARCH, "horizon": 1, "num_samples": 5, "num_elites": 4, "temperature": 0.5})
     plan = Plan(torch.tensor([[[0.2, 0.3, 0.5]]]), torch.full((1, 1, 3), 0.1), torch.full((1, 1, 3), 0.7))
-    key = torch.tensor([0, 0, 2, 0, 1]).view(1, 5, 1)
+    discrete = torch.tensor([0, 0, 2, 0, 1]).view(1, 5, 1)
     unit = torch.tensor([0.5, -0.5, 0.9, 0.3, 0.9]).view(1, 5, 1, 1).expand(1, 5, 1, 3)
     returns = torch.tensor([[1.0, 0.5, 0.2, 0.8, -3.0]])
-    new = planner.re_estimate(plan, key, unit, returns)
+    new = planner.re_estimate(plan, discrete, unit, returns)
     weight = (torch.tensor([1.0, 0.5, 0.2, 0.8]) / 0.5).exp()
     weight = weight / weight.sum()
     own = weight[[0, 1, 3]] / weight[[0, 1, 3]].sum()
@@ -180,7 +180,7 @@ def test_the_elites_make_the_next_distribution_key_by_key():
 
 
 def test_a_return_counts_what_comes_after_by_the_probability_of_getting_there():
-    def model(state, key, unit):
+    def model(state, discrete, unit):
         one = torch.ones(2, len(state))
         return Prediction(state, 2.0 * one, torch.stack([3.0 * one[0], 5.0 * one[0]]), torch.zeros(2, len(state)))
 
@@ -194,10 +194,10 @@ def one_step_rows(learner: DLPA, num: int) -> TensorDict:
     """Play a problem of one step: only key 1 pays, the more the nearer its parameters are to (s0, -s1)."""
     td = TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1])
     td = learner.policy(td)
-    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
+    unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
     error = (unit[..., 1] - state[..., 0]).square() + (unit[..., 2] + state[..., 1]).square()
     over = torch.ones(num, 1, 1, dtype=torch.bool)
-    reward = torch.where(td[keys.KEY] == 1, 1.0 - error, -0.5).unsqueeze(-1)
+    reward = torch.where(td[keys.DISCRETE] == 1, 1.0 - error, -0.5).unsqueeze(-1)
     td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.DONE: over, keys.TERMINATED: over}
     return td
 
@@ -214,7 +214,7 @@ def trained() -> DLPA:
 def test_the_learner_finds_the_key_and_parameters_that_pay(trained):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(trained, 500)
-    assert (rows[keys.KEY] == 1).float().mean() > 0.98
+    assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
     assert rows["next", keys.REWARD].mean() > 0.85, "random presses earn about -0.4, the optimum 1"
 
 
@@ -225,9 +225,9 @@ def test_a_greedy_press_is_a_function_of_the_seed_and_lies_in_bounds(trained):
         torch.manual_seed(seed)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             pressed.append(trained.policy(td.clone()))
-    assert torch.equal(pressed[0][keys.KEY], pressed[1][keys.KEY])
-    assert torch.equal(pressed[0][keys.DURATION], pressed[1][keys.DURATION])
-    duration = trained.policy(td.clone())[keys.DURATION]
+    assert torch.equal(pressed[0][keys.DISCRETE], pressed[1][keys.DISCRETE])
+    assert torch.equal(pressed[0][keys.PARAMETERS], pressed[1][keys.PARAMETERS])
+    duration = trained.policy(td.clone())[keys.PARAMETERS]
     assert (duration >= torch.tensor(SPECS.parameter_low)).all()
     assert (duration <= torch.tensor(SPECS.parameter_high)).all()
 

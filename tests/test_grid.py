@@ -83,12 +83,12 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
     collected = parts.env.rollout(20, parts.agent.policy, break_when_any_done=False).contiguous()
     parts.agent.learn(collected)
     file = tmp_path / checkpoint.FILE_NAME
-    checkpoint.save(file, parts.agent, parts.env.state_columns(), {"frames": 320})
+    checkpoint.save(file, parts.agent, parts.env.env_state(), {"frames": 320})
 
     other = make(high, low, tmp_path)
     torch.manual_seed(99)
     env_state = checkpoint.load(file, other.agent, other.device, with_training=True)
-    other.env.set_state_columns(env_state)
+    other.env.set_env_state(env_state)
     assert checkpoint.progress_of(file) == {"frames": 320}
     results = []
     for one in (other, parts):
@@ -96,5 +96,5 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
         one.agent.learn(collected)
         td: TensorDict = one.env.rollout(5, one.agent.policy, break_when_any_done=False)
         results.append(td)
-    for key in ("observation", ("action", "key"), ("action", "duration")):
+    for key in ("observation", ("action", "discrete"), ("action", "parameters")):
         torch.testing.assert_close(results[0][key], results[1][key])

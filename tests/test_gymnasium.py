@@ -35,7 +35,7 @@ def test_what_arrives_is_what_was_chosen(form):
     env = make(2, form=form, max_steps=1000)
     assert env.parameter_dims == ((2, 2, 2) if form == "shared" else (2, 0, 1))
     specs = PAMDPSpecs.from_env(env)
-    assert (specs.num_keys, specs.parameter_dims) == (3, env.parameter_dims)
+    assert (specs.num_discrete, specs.parameter_dims) == (3, env.parameter_dims)
     low, high = ([-1.0, 10.0] * 3, [1.0, 30.0] * 3) if form == "shared" else (ALL.low, ALL.high)
     assert np.allclose(specs.parameter_low, low) and np.allclose(specs.parameter_high, high)
     env.reset()
@@ -72,13 +72,13 @@ def test_values_outside_their_bounds_are_clipped():
 @pytest.mark.parametrize(
     ("pressed", "parameters", "complaint"),
     [
-        ([0, 0], [[0.0, 20.0, 0.2], [0.0, np.nan, 0.2]], r"environment 1 got key=0 \(allowed 0 to 2\), .*nan"),
-        ([0, 2], [[0.0, 20.0, 0.2], [0.0, 20.0, np.inf]], "environment 1 got key=2"),
-        ([3, 0], [[0.0, 20.0, 0.2]] * 2, "environment 0 got key=3"),
-        ([0, -1], [[0.0, 20.0, 0.2]] * 2, "environment 1 got key=-1"),
+        ([0, 0], [[0.0, 20.0, 0.2], [0.0, np.nan, 0.2]], r"environment 1 got discrete=0 \(allowed 0 to 2\), .*nan"),
+        ([0, 2], [[0.0, 20.0, 0.2], [0.0, 20.0, np.inf]], "environment 1 got discrete=2"),
+        ([3, 0], [[0.0, 20.0, 0.2]] * 2, "environment 0 got discrete=3"),
+        ([0, -1], [[0.0, 20.0, 0.2]] * 2, "environment 1 got discrete=-1"),
         ([0.0, 1.0], [[0.0, 20.0, 0.2]] * 2, "has type float32, but must be integer"),
-        ([0, 0], [[0.0, 20.0]] * 2, r"'duration'\) has shape \[2, 2\], but must be \[2, 3\]"),
-        ([[0], [0]], [[0.0, 20.0, 0.2]] * 2, r"'key'\) has shape \[2, 1\], but must be \[2\]"),
+        ([0, 0], [[0.0, 20.0]] * 2, r"'parameters'\) has shape \[2, 2\], but must be \[2, 3\]"),
+        ([[0], [0]], [[0.0, 20.0, 0.2]] * 2, r"'discrete'\) has shape \[2, 1\], but must be \[2\]"),
     ],
 )
 def test_a_wrong_action_is_refused_and_harms_nothing(pressed, parameters, complaint):
@@ -123,7 +123,7 @@ def test_our_own_task_goes_the_same_way_as_without_a_detour(action_format):
 
 
 def step_one(boat: BoatDockEnv, pressed: torch.Tensor, seconds: torch.Tensor) -> TensorDict:
-    press = TensorDict(key=pressed, duration=seconds, batch_size=[1])
+    press = TensorDict(discrete=pressed, parameters=seconds, batch_size=[1])
     after = boat.step(TensorDict(action=press, batch_size=[1]))["next"]
     return after.select("observation", "reward", "done", "terminated", "truncated")
 

@@ -50,18 +50,18 @@ def test_running_statistics_are_saved_and_restored():
     one, other = running(seed=1), running(seed=2)
     one.reset()
     step(one)
-    columns = one.state_columns()
+    columns = one.env_state()
     kept = {name: column.clone() for name, column in columns.items()}
     step(one)
     assert all(torch.equal(columns[name], kept[name]) for name in kept)
-    other.set_state_columns(columns)
-    assert all(torch.equal(other.state_columns()[name], kept[name]) for name in kept)
+    other.set_env_state(columns)
+    assert all(torch.equal(other.env_state()[name], kept[name]) for name in kept)
     other.reset()
     assert all(torch.equal(columns[name], kept[name]) for name in kept)
     with pytest.raises(ValueError, match="must have shape"):
-        other.set_state_columns({name: column[..., None] for name, column in columns.items()})
-    assert make().state_columns() == {}
-    make().set_state_columns({})
+        other.set_env_state({name: column[..., None] for name, column in columns.items()})
+    assert make().env_state() == {}
+    make().set_env_state({})
 
 
 def test_an_environment_for_evaluation_follows_the_statistics_and_adds_nothing():
@@ -70,16 +70,16 @@ def test_an_environment_for_evaluation_follows_the_statistics_and_adds_nothing()
     plain = make(3).reset()["observation"]
     assert torch.equal(evaluation.reset()["observation"], plain.clamp(-10.0, 10.0))
     training.reset()
-    before = training.state_columns()
+    before = training.env_state()
     step(evaluation)
     evaluation.set_seed(0)
     seen = evaluation.reset()["observation"].double()
-    assert all(torch.equal(column, before[name]) for name, column in training.state_columns().items())
+    assert all(torch.equal(column, before[name]) for name, column in training.env_state().items())
     deviation = training.observations.statistics.variance.sqrt().where(
         training.observations.statistics.variance > 0, 1.0
     )
     assert torch.allclose(seen, (plain - training.observations.statistics.mean) / deviation, atol=1e-5)
-    training.set_state_columns({name: column + 1.0 for name, column in before.items()})
+    training.set_env_state({name: column + 1.0 for name, column in before.items()})
     evaluation.set_seed(0)
     assert not torch.equal(evaluation.reset()["observation"].double(), seen)
     make().set_scaling_from(make())

@@ -139,7 +139,7 @@ def test_a_controller_and_a_keymap_are_drawn_evenly_and_apart_from_the_layout():
 
 def test_uniform_numbers_are_even_and_independent_of_every_counter():
     key = keys_for(NUM)
-    numbers = [counter_rng.uniform(key, draw) for draw in (0, 1, 2, 15, 400)]
+    numbers = [counter_rng.uniform(key, sample) for sample in (0, 1, 2, 15, 400)]
     numbers += [counter_rng.uniform(keys_for(NUM, *at), 0) for at in ((1,), (2,), (0, 1), (0, 0, 1), (0, 0, 2))]
     for number in numbers:
         assert number.dtype == torch.float32

@@ -8,7 +8,7 @@ from torch.distributions import Categorical, Normal
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.low_level.hppo import HPPO, KEY_LOG_PROB, PARAMETER_LOG_PROB, RAW
+from hpamdp.policies.low_level.hppo import DISCRETE_LOG_PROB, HPPO, PARAMETER_LOG_PROB, RAW
 from hpamdp.specs import PAMDPSpecs
 
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
@@ -16,7 +16,7 @@ SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 OPTIONS = dict(
     hidden_dims=[32, 32], critic_hidden_dims=[32, 32], initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
     max_scale=1.0, epochs=4, minibatch_size=256, clip=0.2, gamma=0.9, gae_lambda=0.8, lr=3e-3, lr_final=3e-4,
-    critic_weight=0.5, key_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_frames=40_000,
+    critic_weight=0.5, discrete_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_frames=40_000,
     max_grad_norm=1.0,
 )  # fmt: skip
 
@@ -29,12 +29,12 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> HPPO:
 def one_step_rows(learner: HPPO, num: int) -> TensorDict:
     """Play a problem of one step, `[num, 1]`: only key 1 pays, most where its parameters are (s0, -s1)/2."""
     td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1]))
-    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
+    unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
     error = (unit[..., 1] - 0.5 * state[..., 0]).square() + (unit[..., 2] + 0.5 * state[..., 1]).square()
     is_end = torch.ones(num, 1, 1, dtype=torch.bool)
     td["next"] = {
         keys.OBSERVATION: torch.zeros_like(state),
-        keys.REWARD: torch.where(td[keys.KEY] == 1, 1.0 - error, -0.5).unsqueeze(-1),
+        keys.REWARD: torch.where(td[keys.DISCRETE] == 1, 1.0 - error, -0.5).unsqueeze(-1),
         keys.DONE: is_end,
         keys.TERMINATED: is_end,
     }
@@ -61,37 +61,37 @@ def everything(td: TensorDict) -> torch.Tensor:
 def test_the_log_ratios_are_those_of_the_key_and_of_its_own_parameters():
     learner = make()
     td = random_rows(learner, 50, 2)
-    key, raw = td[keys.KEY], td[RAW]
+    discrete, raw = td[keys.DISCRETE], td[RAW]
     with torch.no_grad():
-        learner.actor.key_head.bias.add_(torch.tensor([0.3, -0.2, 0.1]))
+        learner.actor.discrete_head.bias.add_(torch.tensor([0.3, -0.2, 0.1]))
         learner.actor.parameter_head.bias.add_(0.2 * torch.arange(6))
         now = learner.actor(td[keys.OBSERVATION])
-        of_key, of_parameters = now.log_prob(key, raw)
-    torch.testing.assert_close(of_key, Categorical(logits=now.key_log_probs).log_prob(key))
+        of_discrete, of_parameters = now.log_prob(discrete, raw)
+    torch.testing.assert_close(of_discrete, Categorical(logits=now.discrete_log_probs).log_prob(discrete))
     single = Normal(now.mean, now.log_scale.exp()).log_prob(raw)
     own = {0: single[..., 0], 1: single[..., 1] + single[..., 2], 2: torch.zeros(50, 2)}
     for k, expected in own.items():
-        torch.testing.assert_close(of_parameters[key == k], expected[key == k])
+        torch.testing.assert_close(of_parameters[discrete == k], expected[discrete == k])
     before = td[PARAMETER_LOG_PROB]
-    assert (before[key == 2] == 0).all() and (of_parameters - before)[key != 2].abs().min() > 0
+    assert (before[discrete == 2] == 0).all() and (of_parameters - before)[discrete != 2].abs().min() > 0
 
 
 def test_the_parameters_of_other_keys_move_nothing():
     learner = make()
     td = random_rows(learner, 50, 2)
-    other = ~SPECS.parameter_mask[td[keys.KEY]]
+    other = ~SPECS.parameter_mask[td[keys.DISCRETE]]
     changed = td[RAW] + 7.0 * other
     now = learner.actor(td[keys.OBSERVATION])
-    torch.testing.assert_close(now.log_prob(td[keys.KEY], changed), now.log_prob(td[keys.KEY], td[RAW]))
+    torch.testing.assert_close(now.log_prob(td[keys.DISCRETE], changed), now.log_prob(td[keys.DISCRETE], td[RAW]))
 
 
 def test_the_ratios_are_one_before_the_first_update():
     learner = make()
     td = random_rows(learner, 50, 4)
-    of_key, of_parameters = learner.actor(td[keys.OBSERVATION].flatten(0, 1)).log_prob(
-        td[keys.KEY].flatten(), td[RAW].flatten(0, 1)
+    of_discrete, of_parameters = learner.actor(td[keys.OBSERVATION].flatten(0, 1)).log_prob(
+        td[keys.DISCRETE].flatten(), td[RAW].flatten(0, 1)
     )
-    torch.testing.assert_close(of_key, td[KEY_LOG_PROB].flatten(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(of_discrete, td[DISCRETE_LOG_PROB].flatten(), atol=1e-5, rtol=0)
     torch.testing.assert_close(of_parameters, td[PARAMETER_LOG_PROB].flatten(), atol=1e-5, rtol=0)
 
 
@@ -133,7 +133,7 @@ def test_what_others_did_changes_nothing():
     starts[:, 0] = 0
     mask = starts % 2 == 0
     other = td.clone()
-    for leaf in (keys.OBSERVATION, RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB, keys.DURATION):
+    for leaf in (keys.OBSERVATION, RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB, keys.PARAMETERS):
         other[leaf][~mask] = 1e3
         other["next", keys.OBSERVATION][~mask] = torch.nan
     other["next", keys.REWARD][~mask] = torch.nan
@@ -151,7 +151,7 @@ def test_the_learner_finds_the_key_and_parameters_that_pay():
         scalars = learner.learn(td, everything(td))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         td = one_step_rows(learner, 1000)
-    assert (td[keys.KEY] == 1).float().mean() > 0.99
+    assert (td[keys.DISCRETE] == 1).float().mean() > 0.99
     assert td["next", keys.REWARD].mean() > 0.98, "random presses earn about -0.3, the optimum 1"
     assert scalars["scale"] < 0.5
 
@@ -160,22 +160,22 @@ def test_parameters_stay_in_bounds_and_the_greedy_policy_draws_nothing():
     learner = make()
     td = TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500])
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    duration = learner.policy(td.clone())[keys.DURATION]
+    duration = learner.policy(td.clone())[keys.PARAMETERS]
     assert (duration >= low).all() and (duration <= high).all()
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         acted = learner.policy(td.clone())
     with torch.no_grad():
         now = learner.actor(td[keys.OBSERVATION])
-    assert torch.equal(acted[keys.KEY], now.key_log_probs.argmax(-1)) and torch.equal(acted[RAW], now.mean)
+    assert torch.equal(acted[keys.DISCRETE], now.discrete_log_probs.argmax(-1)) and torch.equal(acted[RAW], now.mean)
     assert set(learner.policy.out_keys) <= set(acted.keys(include_nested=True, leaves_only=True))
 
 
 def test_keys_are_drawn_with_their_probability_and_parameters_with_their_deviation():
     learner = make()
     with torch.no_grad():
-        learner.actor.key_head.bias.copy_(torch.tensor([0.6, 0.3, 0.1]).log())
+        learner.actor.discrete_head.bias.copy_(torch.tensor([0.6, 0.3, 0.1]).log())
     td = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(20_000, 4)}, [20_000]))
-    share = td[keys.KEY].bincount(minlength=3) / 20_000
+    share = td[keys.DISCRETE].bincount(minlength=3) / 20_000
     torch.testing.assert_close(share, torch.tensor([0.6, 0.3, 0.1]), atol=0.02, rtol=0)
     torch.testing.assert_close(td[RAW].std(0), torch.full((3,), 0.5), atol=0.02, rtol=0)
 
@@ -185,11 +185,11 @@ def test_keys_without_parameters_are_learned_like_others():
     for _ in range(15):
         td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(512, 1, 4)}, [512, 1]))
         is_end = torch.ones(512, 1, 1, dtype=torch.bool)
-        reward = (td[keys.KEY] == 1).float().unsqueeze(-1)
+        reward = (td[keys.DISCRETE] == 1).float().unsqueeze(-1)
         td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward}
         td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
         learner.learn(td, everything(td))
-    assert td[keys.DURATION].shape == (512, 1, 0) and reward.mean() > 0.95
+    assert td[keys.PARAMETERS].shape == (512, 1, 0) and reward.mean() > 0.95
 
 
 def test_rates_fall_with_the_presses_of_the_whole_run():
@@ -200,7 +200,7 @@ def test_rates_fall_with_the_presses_of_the_whole_run():
     rates, scales = [], []
     for _ in range(4):
         learner.learn(td, mask)
-        rates.append(learner.optimiser.param_groups[0]["lr"])
+        rates.append(learner.optimizer.param_groups[0]["lr"])
         scales.append(learner.actor.log_min_scale.exp().item())
     assert rates == pytest.approx([3e-3, 1.65e-3, 3e-4, 3e-4])
     assert scales == pytest.approx([0.05, 0.0005**0.5, 0.01, 0.01])
@@ -209,15 +209,15 @@ def test_rates_fall_with_the_presses_of_the_whole_run():
 def test_too_few_rows_wait_for_more_and_survive_a_state_dict():
     learner, other = make(minibatch_size=150), make(minibatch_size=150)
     first, second = random_rows(learner, 50, 2), random_rows(learner, 50, 2)
-    before = learner.actor.key_head.weight.clone()
+    before = learner.actor.discrete_head.weight.clone()
     assert learner.learn(first, everything(first)) == {}
-    assert torch.equal(learner.actor.key_head.weight, before)
+    assert torch.equal(learner.actor.discrete_head.weight, before)
     other.load_state_dict(learner.state_dict())
     for one in (learner, other):
         torch.manual_seed(1)
         assert one.learn(second, everything(second)) and not one.waiting
-    assert not torch.equal(learner.actor.key_head.weight, before)
-    assert torch.equal(learner.actor.key_head.weight, other.actor.key_head.weight)
+    assert not torch.equal(learner.actor.discrete_head.weight, before)
+    assert torch.equal(learner.actor.discrete_head.weight, other.actor.discrete_head.weight)
 
 
 def test_a_scale_outside_its_range_is_refused():

@@ -15,8 +15,8 @@ from hpamdp.policies.low_level.hsac import HSAC, HybridDistribution
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
-    hidden_dims=[64, 64], min_scale=0.01, max_scale=1.0, key_temperature=0.05, parameter_temperature=0.03,
-    tune_key_temperature=True, tune_parameter_temperature=True, key_target_entropy=0.1, parameter_target_entropy=-1.5,
+    hidden_dims=[64, 64], min_scale=0.01, max_scale=1.0, discrete_temperature=0.05, parameter_temperature=0.03,
+    tune_discrete_temperature=True, tune_parameter_temperature=True, discrete_target_entropy=0.1, parameter_target_entropy=-1.5,
     temperature_lr=3e-3, warmup_frames=1000, buffer_size=20_000, batch_size=64, updates_per_frame=0.12,
     policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
 )  # fmt: skip
@@ -28,16 +28,16 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> HSAC:
 
 def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Tensor) -> float:
     """Return the value of a single state `[1, 4]` for the parameters that the generator as it stands would draw."""
-    key_log_probs, mean, scale = learner.actor(state)
+    discrete_log_probs, mean, scale = learner.actor(state)
     raw = mean + scale * torch.randn_like(mean)
-    pi, unit = key_log_probs.exp()[0], raw.tanh()[0].tolist()
+    pi, unit = discrete_log_probs.exp()[0], raw.tanh()[0].tolist()
     gaussian = torch.distributions.Normal(mean, scale).log_prob(raw)[0].tolist()
     log_density = [g - math.log(1.0 - x * x) for g, x in zip(gaussian, unit, strict=True)]
     value = 0.0
     for k, own in enumerate([[0], [1, 2], []]):
         seen = torch.tensor([[x if i in own else 0.0 for i, x in enumerate(unit)]])
         q = min(member[0, k].item() for member in critics.net(torch.cat([state, seen], -1)))
-        q -= OPTIONS["key_temperature"] * key_log_probs[0, k].item()
+        q -= OPTIONS["discrete_temperature"] * discrete_log_probs[0, k].item()
         q -= OPTIONS["parameter_temperature"] * sum(log_density[i] for i in own)
         value += pi[k].item() * q
     return value
@@ -50,17 +50,17 @@ def test_the_learner_finds_the_key_and_parameters_that_pay():
         learner.learn(one_step_rows(learner, 200), torch.ones(200, 1, dtype=torch.bool))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)
-    assert (rows[keys.KEY] == 1).float().mean() > 0.98
+    assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
     assert rows["next", keys.REWARD].mean() > 0.9, "random presses earn about -0.2, key 2 alone 0.2, the optimum 1"
 
 
 def test_densities_are_those_of_torchrls_squashed_gaussian_and_finite_at_the_bounds():
     mean, scale = torch.randn(64, 3), torch.rand(64, 3) + 0.1
-    unit, log_density = HybridDistribution(torch.zeros(64, 2), mean, scale).draw_parameters()
+    unit, log_density = HybridDistribution(torch.zeros(64, 2), mean, scale).sample_parameters()
     expected = TanhNormal(mean, scale, event_dims=0).log_prob(unit)
     torch.testing.assert_close(log_density, expected, rtol=1e-3, atol=1e-3)
     far = HybridDistribution(torch.zeros(1, 2), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1))
-    assert far.draw_parameters()[1].isfinite().all()
+    assert far.sample_parameters()[1].isfinite().all()
 
 
 def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone():
@@ -99,19 +99,19 @@ def test_the_actor_loss_equals_that_computed_by_hand_and_leaves_the_critics_alon
     assert all(p.grad is None and p.requires_grad for p in learner.critics.parameters())
 
 
-@pytest.mark.parametrize("key", [0, 1, 2])
-def test_only_the_executed_keys_parameters_count_in_the_entropy(key):
+@pytest.mark.parametrize("discrete", [0, 1, 2])
+def test_only_the_executed_keys_parameters_count_in_the_entropy(discrete):
     learner, state = make(), torch.randn(64, 4)
     with torch.no_grad():
-        learner.actor.net[-1].bias[:3] = 50.0 * torch.eye(3)[key]
+        learner.actor.net[-1].bias[:3] = 50.0 * torch.eye(3)[discrete]
     torch.manual_seed(5)
-    log_density = learner.actor(state).draw_parameters()[1]
+    log_density = learner.actor(state).sample_parameters()[1]
     torch.manual_seed(5)
-    _, key_excess, parameter_excess = learner.soft_value(learner.critics, state)
-    own = [[0], [1, 2], []][key]
+    _, discrete_excess, parameter_excess = learner.soft_value(learner.critics, state)
+    own = [[0], [1, 2], []][discrete]
     target = OPTIONS["parameter_target_entropy"] * len(own)
     torch.testing.assert_close(parameter_excess, -log_density[:, own].sum(-1) - target)
-    torch.testing.assert_close(key_excess, torch.full((64,), -OPTIONS["key_target_entropy"] * math.log(3.0)))
+    torch.testing.assert_close(discrete_excess, torch.full((64,), -OPTIONS["discrete_target_entropy"] * math.log(3.0)))
 
 
 @pytest.mark.parametrize("excess", [0.5, -0.5])
@@ -119,16 +119,16 @@ def test_only_the_executed_keys_parameters_count_in_the_entropy(key):
 def test_a_temperature_falls_above_its_target_rises_below_and_stays_where_it_is_fixed(excess, is_tuned):
     learner = make(tune_parameter_temperature=is_tuned)
     learner._update_temperatures(torch.tensor(-excess), torch.tensor(excess))
-    key_weight, parameter_weight = (weight.item() for weight in learner.temperatures())
-    assert (key_weight > OPTIONS["key_temperature"]) == (excess > 0.0)
+    discrete_weight, parameter_weight = (weight.item() for weight in learner.temperatures())
+    assert (discrete_weight > OPTIONS["discrete_temperature"]) == (excess > 0.0)
     change = parameter_weight / OPTIONS["parameter_temperature"] - 1.0
     assert change * excess < -1e-6 if is_tuned else abs(change) < 1e-6
 
 
 def test_with_both_temperatures_fixed_updates_leave_them_as_they_are():
-    learner = make(tune_key_temperature=False, tune_parameter_temperature=False, policy_delay=1)
+    learner = make(tune_discrete_temperature=False, tune_parameter_temperature=False, policy_delay=1)
     before = learner.temperatures()
-    learner.update(sample())
+    learner.train_step(sample())
     assert learner.temperatures() == before
 
 
@@ -137,28 +137,28 @@ def test_the_greedy_policy_draws_nothing_and_the_exploring_one_is_uniform_in_the
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(td.clone())
     distribution = learner.actor(td[keys.OBSERVATION])
-    assert torch.equal(greedy[keys.KEY], distribution.key_log_probs.argmax(-1))
-    torch.testing.assert_close(SPECS.to_unit(greedy[keys.DURATION]), distribution.mean.tanh())
-    random = SPECS.to_unit(learner.policy(td.clone())[keys.DURATION])
+    assert torch.equal(greedy[keys.DISCRETE], distribution.discrete_log_probs.argmax(-1))
+    torch.testing.assert_close(SPECS.to_unit(greedy[keys.PARAMETERS]), distribution.mean.tanh())
+    random = SPECS.to_unit(learner.policy(td.clone())[keys.PARAMETERS])
     torch.testing.assert_close(random.std(0), torch.full((3,), 3.0**-0.5), rtol=0.05, atol=0.0)
     learner.policy.is_random.fill_(False)
     with torch.no_grad():
         learner.actor.net[-1].bias[-3:] = -50.0  # the smallest deviation
-    drawn = SPECS.to_unit(learner.policy(td.clone())[keys.DURATION])
-    assert (drawn - SPECS.to_unit(greedy[keys.DURATION])).std() < 0.02
+    drawn = SPECS.to_unit(learner.policy(td.clone())[keys.PARAMETERS])
+    assert (drawn - SPECS.to_unit(greedy[keys.PARAMETERS])).std() < 0.02
 
 
 def test_keys_without_parameters_work():
     learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
     td = learner.policy(states(200))
-    assert td[keys.DURATION].shape == (200, 0)
+    assert td[keys.PARAMETERS].shape == (200, 0)
     is_end = torch.ones(200, 1, dtype=torch.bool)
-    reward = td[keys.KEY].float().unsqueeze(-1)
+    reward = td[keys.DISCRETE].float().unsqueeze(-1)
     td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward, keys.TERMINATED: is_end}
     for _ in range(4):
         learner.learn(td, is_end.squeeze(-1))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert (learner.policy(states(100))[keys.KEY] == 1).all()
+        assert (learner.policy(states(100))[keys.DISCRETE] == 1).all()
 
 
 @pytest.mark.parametrize("is_random", [True, False])
@@ -168,8 +168,8 @@ def test_a_policy_takes_any_batch_shape_and_stays_in_bounds(is_random):
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
     for shape in ((), (3,), (3, 200)):
         td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(*shape, 4) * 30}, shape))
-        duration = td[keys.DURATION]
-        assert td[keys.KEY].shape == shape and duration.shape == (*shape, 3)
+        duration = td[keys.PARAMETERS]
+        assert td[keys.DISCRETE].shape == shape and duration.shape == (*shape, 3)
         assert (duration >= low).all() and (duration <= high).all()
 
 

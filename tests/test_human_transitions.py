@@ -46,8 +46,8 @@ def replayed(data: HumanData, **arguments) -> list[TensorDict]:
     for number in range(int(episodes["presses"].max())):
         rows = data.presses["press"] == number
         at = data.presses["episode"][rows]
-        td[keys.KEY] = torch.zeros(len(episodes), dtype=torch.long).index_put((at,), batch[keys.KEY][rows])
-        td[keys.DURATION] = torch.zeros(len(episodes), 3).index_put((at,), batch[keys.DURATION][rows])
+        td[keys.DISCRETE] = torch.zeros(len(episodes), dtype=torch.long).index_put((at,), batch[keys.DISCRETE][rows])
+        td[keys.PARAMETERS] = torch.zeros(len(episodes), 3).index_put((at,), batch[keys.PARAMETERS][rows])
         if env.has_choice:
             td[keys.OPTION] = episodes["controller"]
         td = env.step(td)
@@ -103,9 +103,9 @@ def test_decisions_options_and_trajectories_mark_the_episodes(data):
     assert (shown[starts] == harbour.NOT_CHOSEN).all() and torch.equal(
         shown[~starts], batch[keys.OPTION][~starts] * 1.0
     )
-    pressed = batch[keys.DURATION].gather(1, batch[keys.KEY].unsqueeze(1)).squeeze(1)
+    pressed = batch[keys.PARAMETERS].gather(1, batch[keys.DISCRETE].unsqueeze(1)).squeeze(1)
     assert torch.equal(pressed, data.presses["duration"])
-    assert torch.equal(batch[keys.DURATION].count_nonzero(1), torch.ones(len(batch), dtype=torch.long))
+    assert torch.equal(batch[keys.PARAMETERS].count_nonzero(1), torch.ones(len(batch), dtype=torch.long))
 
 
 def test_fuel_counts_logged_presses_until_the_recorded_tank_says_what_was_left(data):
@@ -115,7 +115,7 @@ def test_fuel_counts_logged_presses_until_the_recorded_tank_says_what_was_left(d
         if not len(rows):
             assert data.episodes["presses"][number] == 0
             continue
-        spent = rows[keys.DURATION].sum(1).cumsum(0)
+        spent = rows[keys.PARAMETERS].sum(1).cumsum(0)
         torch.testing.assert_close(rows["next", keys.FUEL][:-1, 0], 1 - spent[:-1] / physics.TANK, atol=1e-5, rtol=0)
         assert rows[keys.FUEL][0] == 1.0
         assert rows["next", keys.FUEL][-1, 0] == pytest.approx(data.episodes["tank"][number].item() / 360)

@@ -12,7 +12,7 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
-    key_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000, codec_pretrain_updates=1500,
+    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000, codec_pretrain_updates=1500,
     codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1, latent_coverage=0.96, correction_threshold=0.1,
     buffer_size=20_000, batch_size=128, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
     policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1, epsilon_final=0.05,
@@ -28,12 +28,12 @@ def one_step_rows(learner: HyAR, num: int) -> TensorDict:
     """Play a problem of one step: only key 1 pays, the more the nearer its parameters are to (s0, -s1)."""
     td = TensorDict({keys.OBSERVATION: torch.rand(num, 4) * 2 - 1}, [num])
     td = learner.policy(td)
-    unit = learner.specs.to_unit(td[keys.DURATION])
-    state, own = td[keys.OBSERVATION], unit * learner.codec.mask[td[keys.KEY]]
+    unit = learner.specs.to_unit(td[keys.PARAMETERS])
+    state, own = td[keys.OBSERVATION], unit * learner.codec.mask[td[keys.DISCRETE]]
     error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
     td["next"] = {
         keys.OBSERVATION: state + own.sum(-1, keepdim=True) * torch.tensor([1.0, 0.5, 0.0, 0.0]),
-        keys.REWARD: torch.where(td[keys.KEY] == 1, 1.0 - error, -0.5).unsqueeze(-1),
+        keys.REWARD: torch.where(td[keys.DISCRETE] == 1, 1.0 - error, -0.5).unsqueeze(-1),
         keys.TERMINATED: torch.ones(num, 1, dtype=torch.bool),
     }
     return td
@@ -57,26 +57,26 @@ def test_decoding_an_encoded_press_returns_its_key_and_parameters(trained):
     rows = trained.buffer.sample(500)
     codec = trained.codec
     with torch.no_grad():
-        mean, _ = codec.encode(rows["state"], rows["key"], rows["unit"])
-        key = codec.nearest_key(codec.embeddings[rows["key"]])
-        unit, _ = codec.decode(rows["state"], key, mean)
-    assert torch.equal(key, rows["key"])
-    error = ((unit - rows["unit"]) * codec.mask[rows["key"]]).abs()
+        mean, _ = codec.encode(rows["state"], rows["discrete"], rows["unit"])
+        discrete = codec.nearest_discrete(codec.embeddings[rows["discrete"]])
+        unit, _ = codec.decode(rows["state"], discrete, mean)
+    assert torch.equal(discrete, rows["discrete"])
+    error = ((unit - rows["unit"]) * codec.mask[rows["discrete"]]).abs()
     assert error.mean() < 0.05
 
 
 def test_the_learner_finds_the_key_and_parameters_that_pay(trained):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(trained, 1000)
-    assert (rows[keys.KEY] == 1).float().mean() > 0.98
+    assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
     assert rows["next", keys.REWARD].mean() > 0.85, "random presses earn about -0.4, the optimum 1"
 
 
 def test_latents_that_still_mean_their_press_are_kept_and_a_shifted_encoder_triggers_correction(trained):
     rows = trained.buffer.sample(1000)
     with torch.no_grad():
-        mean, _ = trained.codec.encode(rows["state"], rows["key"], rows["unit"])
-        rows["latent"] = torch.cat([trained.codec.embeddings[rows["key"]], trained.codec.z_to_unit(mean)], -1)
+        mean, _ = trained.codec.encode(rows["state"], rows["discrete"], rows["unit"])
+        rows["latent"] = torch.cat([trained.codec.embeddings[rows["discrete"]], trained.codec.z_to_unit(mean)], -1)
     _, redone = trained.corrected_latent(rows)
     assert redone.float().mean() < 0.1
     shifted = make()
@@ -84,9 +84,9 @@ def test_latents_that_still_mean_their_press_are_kept_and_a_shifted_encoder_trig
     with torch.no_grad():
         shifted.codec.table.copy_(shifted.codec.table.flip(0))
     latent, redone = shifted.corrected_latent(rows)
-    moved = rows["key"] != 1
+    moved = rows["discrete"] != 1
     assert redone[moved].all()
-    assert torch.equal(shifted.codec.nearest_key(latent[:, :3]), rows["key"])
+    assert torch.equal(shifted.codec.nearest_discrete(latent[:, :3]), rows["discrete"])
 
 
 def test_a_random_press_is_encoded_when_sampled(trained):
@@ -99,11 +99,11 @@ def test_a_random_press_is_encoded_when_sampled(trained):
 def test_parameters_stay_in_bounds_and_the_greedy_policy_draws_nothing(trained):
     td = TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 3}, [500])
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    duration = trained.policy(td.clone())[keys.DURATION]
+    duration = trained.policy(td.clone())[keys.PARAMETERS]
     assert (duration >= low).all() and (duration <= high).all()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         first, second = trained.policy(td.clone()), trained.policy(td.clone())
-    assert torch.equal(first[keys.DURATION], second[keys.DURATION]) and not first[LATENT].isnan().any()
+    assert torch.equal(first[keys.PARAMETERS], second[keys.PARAMETERS]) and not first[LATENT].isnan().any()
 
 
 def test_the_state_change_is_scaled_by_its_own_deviation(trained):

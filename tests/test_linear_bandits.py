@@ -34,10 +34,10 @@ def wide(observation_dim: int) -> PAMDPSpecs:
 def teach(bandit: LinearBandit, num: int, at_once: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Let the bandit learn `num` random decisions; return their observations, options and payoffs."""
     torch.manual_seed(0)
-    observation, option, payoff = torch.rand(num, 2) * 2 - 1, torch.randint(2, (num,)), torch.randn(num)
+    observation, option, reward = torch.rand(num, 2) * 2 - 1, torch.randint(2, (num,)), torch.randn(num)
     for rows in torch.arange(num).split(at_once):
-        bandit.learn(ended(due(observation[rows], option=option[rows]), payoff[rows]))
-    return observation, option, payoff
+        bandit.learn(ended(due(observation[rows], option=option[rows]), reward[rows]))
+    return observation, option, reward
 
 
 # Features.
@@ -98,13 +98,13 @@ def test_features_that_cannot_be_are_refused_in_one_line(changes, complaint):
 @pytest.mark.parametrize("at_once", [1, 7, 60])
 def test_predictions_and_deviations_are_those_of_a_ridge_regression(memory, at_once):
     bandit = make("linucb", ridge=0.5, memory=memory, discount=0.9, window=25)
-    observation, option, payoff = teach(bandit, 60, at_once)
+    observation, option, reward = teach(bandit, 60, at_once)
     weight = torch.ones(60).double()
     if memory == "discounted":
         weight = 0.9 ** torch.arange(59, -1, -1).double()
     if memory == "sliding_window":
         weight[:-25] = 0.0
-    x, y = bandit.features(observation), payoff.double()
+    x, y = bandit.features(observation), reward.double()
     probe = torch.rand(9, 2) * 2 - 1
     mean, deviation = bandit.predict(probe)
     squares, spread = 0.0, []

@@ -11,9 +11,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.config import ConfigError, run_config
-from hpamdp.data.human.demonstrations import HumanPresses
+from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.released_file import read
-from hpamdp.data.human.rest_to_rest import TAP, settle
+from hpamdp.data.human.rest_to_rest import TAP, to_rest_to_rest
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
@@ -34,8 +34,8 @@ def path(tmp_path_factory) -> str:
     return str(synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat"))
 
 
-def presses(path: str, settled: bool = False, **env):
-    return HumanPresses(BoatDockEnv(**env), path=path, settled=settled, **ALL).batch
+def presses(path: str, rest_to_rest: bool = False, **env):
+    return HumanDemonstrations(BoatDockEnv(**env), path=path, rest_to_rest=rest_to_rest, **ALL).batch
 
 
 @pytest.fixture
@@ -61,11 +61,11 @@ def test_a_learner_trains_on_a_data_set_without_a_press(low, path, tmp_path, no_
 def test_a_selector_learns_from_the_decisions_in_the_data(high, path, tmp_path):
     cfg = compose_config(words(path, "iql", high))
     parts = assemble(cfg, run_config(cfg), tmp_path)
-    parts.agent.remember(parts.data)
+    parts.agent.add_demonstrations(parts.data)
     num_episodes = int((parts.data["next", keys.DONE]).sum())
     selector = parts.agent.selector
     if high == "ucb" or high == "linucb":
-        assert selector.payoffs.num_decisions == num_episodes
+        assert selector.rewards.num_decisions == num_episodes
     else:
         assert len(selector.buffer) == num_episodes
 
@@ -99,9 +99,9 @@ def test_keys_are_those_of_the_environments_key_map(path):
     def heading(keymap, key):
         return torch.stack(harbour.direction(of["controller"].int(), keymap.int(), key.int()), -1)
 
-    there = heading(torch.ones_like(of["keymap"]), batch[keys.KEY])
+    there = heading(torch.ones_like(of["keymap"]), batch[keys.DISCRETE])
     torch.testing.assert_close(there, heading(of["keymap"], data.presses["key"]))
-    pressed = batch[keys.DURATION].gather(-1, batch[keys.KEY].unsqueeze(-1)).squeeze(-1)
+    pressed = batch[keys.PARAMETERS].gather(-1, batch[keys.DISCRETE].unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(pressed, data.presses["duration"])
 
 
@@ -111,19 +111,19 @@ def test_a_settled_press_brings_a_gliding_boat_to_where_the_next_one_began(path)
     presses, is_cut = data.presses.clone(), ~data.presses["is_final"]
     moved = presses["next_position"] - presses["position"]
     presses["next_position"][is_cut] = (presses["position"] + 0.5 * moved)[is_cut]
-    settled = settle(type(data)(data.episodes, presses)).presses
-    kept = ~settled["is_final"]
+    moved_presses = to_rest_to_rest(type(data)(data.episodes, presses)).presses
+    kept = ~moved_presses["is_final"]
     assert kept.sum() > 50
-    distance = physics.total_distance(settled["duration"][kept])
+    distance = physics.total_distance(moved_presses["duration"][kept])
     assert (distance >= TAP - 1e-3).all()
-    assert (settled["duration"] <= physics.MAX_DURATION).all()
+    assert (moved_presses["duration"] <= physics.MAX_DURATION).all()
     # Both ways of recording give the same episodes in the same order, numbered from 0.
-    first = torch.searchsorted(settled["episode"], settled["episode"])
-    assert (settled["press"] == torch.arange(len(first)) - first).all()
+    first = torch.searchsorted(moved_presses["episode"], moved_presses["episode"])
+    assert (moved_presses["press"] == torch.arange(len(first)) - first).all()
 
 
 def test_an_episode_whose_final_press_is_gone_is_cut_and_not_over(path):
-    batch = presses(path, settled=True)[0]
+    batch = presses(path, rest_to_rest=True)[0]
     trajectory = batch["collector", "traj_ids"]
     is_last = torch.cat([trajectory[1:] != trajectory[:-1], torch.ones(1, dtype=torch.bool)])
     done = batch["next", keys.DONE].squeeze(-1)
@@ -170,7 +170,7 @@ def test_demonstrations_lie_in_the_replay_beside_own_presses(path, tmp_path):
     given = ["low=pdqn", "data=human", "data.checksum=null", f"data.path={path}", "eval.layouts=4", "num_envs=4"]
     cfg = compose_config(given)
     parts = assemble(cfg, run_config(cfg), tmp_path)
-    parts.agent.remember(parts.data)
+    parts.agent.add_demonstrations(parts.data)
     assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.numel()
 
 
@@ -196,7 +196,7 @@ def one_step_batch():
     zeros, ends = torch.zeros(num, 1), torch.ones(num, 1, dtype=torch.bool)
     durations = torch.zeros(num, 3).scatter(1, key.unsqueeze(1), duration.unsqueeze(1))
     after = {"observation": zeros, "reward": reward.unsqueeze(1), "done": ends, "terminated": ends}
-    rows = {"observation": zeros, "action": {"key": key, "duration": durations}, "next": after}
+    rows = {"observation": zeros, "action": {"discrete": key, "parameters": durations}, "next": after}
     return TensorDict(rows, batch_size=[num]).unsqueeze(0)
 
 
@@ -206,7 +206,7 @@ IQL_OPTIONS = COMMON | dict(
     actor_lr=3e-3, critic_lr=3e-3, warmup_frames=0, updates_per_frame=1.0,
 )  # fmt: skip
 TD3BC_OPTIONS = COMMON | dict(
-    behaviour_weight=0.2, key_threshold=0.3, target_smoothing=0.0, target_smoothing_clip=0.1, policy_delay=2,
+    behaviour_weight=0.2, discrete_threshold=0.3, target_smoothing=0.0, target_smoothing_clip=0.1, policy_delay=2,
     parameter_noise=0.1, gamma=0.9, tau=0.01, actor_lr=3e-3, critic_lr=3e-3, warmup_frames=0, updates_per_frame=1.0,
 )  # fmt: skip
 
@@ -215,12 +215,12 @@ def practised(learner, num_updates: int) -> tuple[int, float]:
     """Let a learner learn from the one-step data; return its greedy key and duration."""
     torch.manual_seed(0)
     batch = one_step_batch()
-    learner.remember(batch, torch.ones(batch.shape, dtype=torch.bool))
-    learner.practise(num_updates)
+    learner.add_demonstrations(batch, torch.ones(batch.shape, dtype=torch.bool))
+    learner.update(num_updates)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acted = learner.policy(batch[0, :1].select("observation"))
-    key = acted["action", "key"].item()
-    return key, acted["action", "duration"][0, key].item()
+    key = acted["action", "discrete"].item()
+    return key, acted["action", "parameters"][0, key].item()
 
 
 def test_behaviour_cloning_takes_the_mean_of_what_it_sees():

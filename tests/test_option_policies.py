@@ -98,8 +98,8 @@ def test_values_of_the_learners_also_teach_of_options_that_were_never_chosen(boo
     for _ in range(30):
         root = due(torch.rand(50, 2) * 2 - 1, option=torch.zeros(50, dtype=torch.long))
         values = by_sign(root[keys.OBSERVATION])
-        payoff = torch.full((50,), 100.0) if bootstrap == 1.0 else values[:, 0]
-        critic.learn(ended(root, payoff).set(keys.OPTION_VALUES, values))
+        reward = torch.full((50,), 100.0) if bootstrap == 1.0 else values[:, 0]
+        critic.learn(ended(root, reward).set(keys.OPTION_VALUES, values))
     assert greedy_regret(critic) < 0.2
 
 
@@ -181,7 +181,7 @@ def test_decisions_that_wait_for_an_update_survive_a_state_dict():
     assert sum(len(rows) for rows in actor.waiting) == 40
     other = make(Actor, seed=1)
     other.load_state_dict(actor.state_dict())
-    other.optimiser.load_state_dict(actor.optimiser.state_dict())
+    other.optimizer.load_state_dict(actor.optimizer.state_dict())
     decisions = ended(actor(due(torch.rand(40, 2))), torch.randn(40))
     for one in (actor, other):
         torch.manual_seed(3)

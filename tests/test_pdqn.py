@@ -36,7 +36,7 @@ def test_the_learner_finds_the_key_and_parameters_that_pay(changes):
     learn(learner, 40)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)
-    assert (rows[keys.KEY] == 1).float().mean() > 0.98
+    assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
     assert rows["next", keys.REWARD].mean() > 0.9, "random presses earn about -0.2, key 2 alone 0.2, the optimum 1"
 
 
@@ -55,8 +55,8 @@ def test_a_keys_value_depends_on_its_own_parameters_alone_only_with_multipass(mu
 def test_the_value_of_the_pressed_key_is_that_of_the_full_pass(multipass):
     learner, batch = make(multipass=multipass), sample()
     full = learner.critics(batch["state"], batch["unit"])
-    expected = full[:, torch.arange(32), batch["key"]]
-    torch.testing.assert_close(learner.critics.of_key(batch["state"], batch["key"], batch["unit"]), expected)
+    expected = full[:, torch.arange(32), batch["discrete"]]
+    torch.testing.assert_close(learner.critics.of_discrete(batch["state"], batch["discrete"], batch["unit"]), expected)
 
 
 def test_the_parameter_update_moves_the_actor_and_leaves_the_critics_alone():
@@ -111,7 +111,7 @@ def test_returns_over_several_steps_end_with_episodes_and_bootstrap_where_they_s
     batch = TensorDict(
         {
             keys.OBSERVATION: state,
-            keys.ACTION: {"key": torch.zeros(2, 5, dtype=torch.long), "duration": torch.ones(2, 5, 3)},
+            keys.ACTION: {"discrete": torch.zeros(2, 5, dtype=torch.long), "parameters": torch.ones(2, 5, 3)},
             "next": {
                 keys.OBSERVATION: state + 100.0,
                 keys.REWARD: reward.unsqueeze(-1),
@@ -154,7 +154,7 @@ def test_parameters_stay_in_bounds(bounding):
     learner = make(bounding=bounding, parameter_noise=1.0)
     learner.policy.epsilon.fill_(0.1)
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    duration = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500]))[keys.DURATION]
+    duration = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500]))[keys.PARAMETERS]
     assert (duration >= low).all() and (duration <= high).all()
 
 
@@ -163,37 +163,37 @@ def test_the_greedy_policy_draws_nothing_and_the_exploring_one_moves_key_and_par
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(td.clone())
     random = learner.policy(td.clone())
-    assert random[keys.KEY].unique().tolist() == [0, 1, 2]
+    assert random[keys.DISCRETE].unique().tolist() == [0, 1, 2]
     learner.policy.epsilon.zero_()
     noisy = learner.policy(td.clone())
-    assert torch.equal(noisy[keys.KEY], greedy[keys.KEY])
-    moved = SPECS.to_unit(noisy[keys.DURATION]) - SPECS.to_unit(greedy[keys.DURATION])
+    assert torch.equal(noisy[keys.DISCRETE], greedy[keys.DISCRETE])
+    moved = SPECS.to_unit(noisy[keys.PARAMETERS]) - SPECS.to_unit(greedy[keys.PARAMETERS])
     assert 0.08 < moved.std() < 0.12
 
 
 def test_keys_without_parameters_work():
     learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
     td = learner.policy(states(200))
-    assert td[keys.DURATION].shape == (200, 0)
+    assert td[keys.PARAMETERS].shape == (200, 0)
     is_end = torch.ones(200, 1, dtype=torch.bool)
-    reward = td[keys.KEY].float().unsqueeze(-1)
+    reward = td[keys.DISCRETE].float().unsqueeze(-1)
     td["next"] = {keys.OBSERVATION: td[keys.OBSERVATION], keys.REWARD: reward}
     td["next"].update({keys.DONE: is_end, keys.TERMINATED: is_end})
     for _ in range(4):
         learner.learn(td.unsqueeze(-1), is_end)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert (learner.policy(states(100))[keys.KEY] == 1).all()
+        assert (learner.policy(states(100))[keys.DISCRETE] == 1).all()
 
 
 def test_a_policy_takes_any_batch_shape():
     learner = make()
     for shape in ((), (3,), (3, 2)):
         td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(*shape, 4)}, shape))
-        assert td[keys.KEY].shape == shape and td[keys.DURATION].shape == (*shape, 3)
+        assert td[keys.DISCRETE].shape == shape and td[keys.PARAMETERS].shape == (*shape, 3)
 
 
 def test_clipped_gradients_have_at_most_the_norm_asked_for():
     learner = make(max_grad_norm=1e-3)
-    learner.update(sample())
+    learner.train_step(sample())
     norm = torch.stack([p.grad.norm() for p in learner.critics.parameters()]).norm()
     assert norm <= 1.001e-3

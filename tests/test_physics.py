@@ -40,14 +40,14 @@ class Simulated(NamedTuple):
 
 
 @st.composite
-def cases(draw):
+def cases(sample):
     """Boats anywhere in the harbour with a dock in any direction, about half of them steering towards it."""
-    radius, angle = draw(st.floats(0, 118)), draw(st.floats(0, 2 * math.pi))
+    radius, angle = sample(st.floats(0, 118)), sample(st.floats(0, 2 * math.pi))
     x, y = radius * math.cos(angle), radius * math.sin(angle)
-    distance, bearing = draw(st.floats(15.6, 200)), draw(st.floats(0, 2 * math.pi))
+    distance, bearing = sample(st.floats(15.6, 200)), sample(st.floats(0, 2 * math.pi))
     goal_x, goal_y = x + distance * math.cos(bearing), y + distance * math.sin(bearing)
-    heading = bearing + draw(st.floats(-0.3, 0.3) | st.floats(-math.pi, math.pi))
-    return Case(x, y, goal_x, goal_y, heading, draw(st.floats(0.1, 2)), draw(st.floats(0.05, 6)))
+    heading = bearing + sample(st.floats(-0.3, 0.3) | st.floats(-math.pi, math.pi))
+    return Case(x, y, goal_x, goal_y, heading, sample(st.floats(0.1, 2)), sample(st.floats(0.05, 6)))
 
 
 def press(batch: list[Case], function=physics.press) -> physics.Press:

@@ -25,11 +25,11 @@ def restart(env: PlatformEnv, reading: TensorDictBase, mask: Tensor) -> TensorDi
 
 
 def snapshot(env: PlatformEnv) -> dict[str, Tensor]:
-    return {name: column.clone() for name, column in env.state_columns().items()}
+    return {name: column.clone() for name, column in env.env_state().items()}
 
 
 def is_as(env: PlatformEnv, before: dict[str, Tensor], rows=slice(None)) -> bool:
-    return all(torch.equal(now[rows], before[name][rows]) for name, now in env.state_columns().items())
+    return all(torch.equal(now[rows], before[name][rows]) for name, now in env.env_state().items())
 
 
 @pytest.mark.parametrize("num", [1, 3])
@@ -41,7 +41,7 @@ def test_learners_get_three_keys_of_one_parameter_each_and_no_options():
     env = PlatformEnv(2)
     specs = PAMDPSpecs.from_env(env)
     assert specs == PAMDPSpecs(9, (), (1, 1, 1), (0.0, 0.0, 0.0), (30.0, 720.0, 430.0))
-    assert env.key_names == ("run", "hop", "leap")
+    assert env.discrete_names == ("run", "hop", "leap")
     assert not env.has_choice
 
 
@@ -59,7 +59,7 @@ def test_random_actions_cover_less_than_a_sixth_of_the_course():
     last, total = play(env, lambda _: random_action(env, generator))
     assert last[keys.DONE].all()
     assert total.mean().item() == pytest.approx(0.154, abs=0.01)  # gym-platform has .154, error .002
-    torch.testing.assert_close(total, env.state_columns()["x"] / COURSE)  # the rewards sum to the distance covered
+    torch.testing.assert_close(total, env.env_state()["x"] / COURSE)  # the rewards sum to the distance covered
 
 
 def test_a_jump_that_is_too_short_falls():
@@ -68,7 +68,7 @@ def test_a_jump_that_is_too_short_falls():
     reading = act(env, [HOP, LEAP], [720.0, 430.0])  # from standing
     assert reading[keys.OUTCOME].tolist() == [FELL, FELL]
     assert reading[keys.TERMINATED].all() and not reading[keys.TRUNCATED].any()
-    assert (env.state_columns()["x"] < 455.0).all()
+    assert (env.env_state()["x"] < 455.0).all()
     assert (reading[keys.REWARD] > 0.0).all()
 
 
@@ -105,7 +105,7 @@ def test_only_the_pressed_key_s_parameter_counts_and_is_clipped():
 def test_observations_lie_in_their_range_and_tell_where_everybody_is():
     env, generator = PlatformEnv(300), torch.Generator().manual_seed(0)
     place(env, **random_columns(300, generator))
-    columns = env.state_columns()
+    columns = env.env_state()
     # A step that is masked for all of them reads the state as it is.
     still = env._step(random_action(env, generator).set("_step", torch.zeros(300, dtype=torch.bool)))
     observation = still[keys.OBSERVATION]
@@ -128,7 +128,7 @@ def test_an_environment_s_episodes_do_not_depend_on_the_others():
     readings = few.reset(), many.reset()
     for _ in range(6):
         actions = rule(readings[1][keys.OBSERVATION])
-        actions[keys.KEY][3:] = RUN
+        actions[keys.DISCRETE][3:] = RUN
         readings = few.step(actions[:3].clone())["next"], many.step(actions.clone())["next"]
         assert (readings[0] == readings[1][:3]).all()
         # Only some of the others start anew.
@@ -183,7 +183,7 @@ def test_a_partial_reset_leaves_the_others_alone():
     before = snapshot(env)
     mask = torch.tensor([False, True, False, True])
     fresh = restart(env, reading, mask)
-    state = env.state_columns()
+    state = env.env_state()
     assert is_as(env, before, ~mask)
     assert (fresh[keys.OBSERVATION] == reading[keys.OBSERVATION]).all(-1).tolist() == [True, False, True, False]
     assert state["episode"].tolist() == [0, 1, 0, 1]
@@ -202,14 +202,14 @@ def test_a_finished_episode_stays_finished_and_earns_nothing():
     assert is_as(env, before, over)
     assert after[keys.DONE][over].all()
     assert (after[keys.REWARD][over] == 0.0).all()
-    assert (env.state_columns()["steps"][~over] == 2).all()
+    assert (env.env_state()["steps"][~over] == 2).all()
 
 
 def test_what_was_returned_is_never_changed_later():
     env, generator = PlatformEnv(16), torch.Generator().manual_seed(0)
     returned = [env.reset()]
     copies = [returned[0].clone()]
-    columns = env.state_columns()
+    columns = env.env_state()
     column_copies = snapshot(env)
     for _ in range(3):
         stepped = env.step(random_action(env, generator))["next"]
@@ -224,9 +224,9 @@ def test_a_saved_state_goes_on_as_it_would_have():
     env, copy = PlatformEnv(8, seed=2), PlatformEnv(8, seed=2)
     for _ in range(2):
         play(env, rule, 2)
-    copy.set_state_columns(snapshot(env))
-    for key in (HOP, RUN, LEAP):
-        results = [act(e, [key] * 8, [20.0] * 8) for e in (env, copy)]
+    copy.set_env_state(snapshot(env))
+    for discrete in (HOP, RUN, LEAP):
+        results = [act(e, [discrete] * 8, [20.0] * 8) for e in (env, copy)]
         assert (results[0] == results[1]).all()
 
 
@@ -235,13 +235,13 @@ def test_a_state_of_other_environments_is_refused_and_none_starts_anew():
     play(env, rule, 2)
     before = snapshot(env)
     with pytest.raises(ValueError, match=r"x is \[2\], but must be \[3\]"):
-        env.set_state_columns(PlatformEnv(2).state_columns())
+        env.set_env_state(PlatformEnv(2).env_state())
     with pytest.raises(ValueError, match="not x, speed"):
-        env.set_state_columns({name: before[name] for name in ("x", "speed")})
+        env.set_env_state({name: before[name] for name in ("x", "speed")})
     assert is_as(env, before)
-    env.set_state_columns({})
-    assert env.state_columns()["steps"].tolist() == [0, 0, 0]
-    assert env.state_columns()["episode"].tolist() == [1, 1, 1]
+    env.set_env_state({})
+    assert env.env_state()["steps"].tolist() == [0, 0, 0]
+    assert env.env_state()["episode"].tolist() == [1, 1, 1]
 
 
 BAD_ACTIONS = {
@@ -252,7 +252,7 @@ BAD_ACTIONS = {
     "key of another shape": action([[0], [1]], torch.zeros(2, 3)),
     "one parameter each": action([0, 1], [[0.1], [0.1]]),
     "fractional key": action([0.5, 1.0], [0.1, 0.1]),
-    "no key": action([0, 1], [0.1, 0.1]).exclude(keys.KEY),
+    "no key": action([0, 1], [0.1, 0.1]).exclude(keys.DISCRETE),
 }
 
 

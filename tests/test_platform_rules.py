@@ -33,25 +33,25 @@ class ScalarCourse:
     def stands(self) -> bool:
         return self.y == self.TOP and any(left - self.WIDTH <= self.x <= right for left, right in self.PLATFORMS)
 
-    def act(self, key: int, parameter: float, numbers: list[float]) -> tuple[float, int]:
+    def act(self, discrete: int, parameter: float, numbers: list[float]) -> tuple[float, int]:
         """Return reward and outcome; `numbers` are normal: two for a jump, then the agent's and the enemy's a tick."""
         start, tick, time_left = self.x, 0, 1.0
         while True:
-            self._choose(key, parameter, numbers, tick)
+            self._choose(discrete, parameter, numbers, tick)
             self._patrol(numbers[3 + 2 * tick])
             self._move()
             outcome = self._outcome()
             tick, time_left = tick + 1, time_left - self.TICK
-            if outcome != ON_THE_WAY or (time_left <= 0.0 if key == RUN else self.stands()):
+            if outcome != ON_THE_WAY or (time_left <= 0.0 if discrete == RUN else self.stands()):
                 return (self.x - start) / COURSE, outcome
 
-    def _choose(self, key: int, parameter: float, numbers: list[float], tick: int) -> None:
+    def _choose(self, discrete: int, parameter: float, numbers: list[float], tick: int) -> None:
         on_ground = self.stands()
         across, up = 0.0, -9.8
-        if on_ground and key == RUN:
+        if on_ground and discrete == RUN:
             across, up = parameter / self.TICK, 0.0
         elif on_ground:
-            rise = 35.0 if key == HOP else 25.0
+            rise = 35.0 if discrete == HOP else 25.0
             change = min(max(parameter / (2.0 * rise / 9.8 + 1.0) - self.speed, -600.0), 200.0 - rise)
             across, up = (change - abs(numbers[0])) / self.TICK, (rise - abs(numbers[1])) / self.TICK
         self.speed += min(max(across, -600.0), 600.0) * self.TICK - abs(0.025 * numbers[2 + 2 * tick])
@@ -90,30 +90,30 @@ class ScalarCourse:
 
 def numbers_of_next_action(env: PlatformEnv, seed: int) -> list[list[float]]:
     """Return what the random numbers of every environment's next action are, `[N, NUMBERS]`."""
-    state = env.state_columns()
+    state = env.env_state()
     environment = torch.arange(env.num_envs, dtype=torch.int32)
     rng = counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.NOISE, environment, state["episode"])
-    draw = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
-    return counter_rng.normal(rng.unsqueeze(-1), draw).tolist()
+    sample = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
+    return counter_rng.normal(rng.unsqueeze(-1), sample).tolist()
 
 
 def compare(
     env: PlatformEnv, courses: list[ScalarCourse], actions: TensorDict, seed: int, noise: float
 ) -> tuple[Tensor, list[int]]:
     """Do one action in every unfinished environment and by the published rules; return observation and outcomes."""
-    over = env.state_columns()["outcome"] != ON_THE_WAY
+    over = env.env_state()["outcome"] != ON_THE_WAY
     numbers = numbers_of_next_action(env, seed)
     reading = env.step(actions.clone())["next"]
-    key, parameter = actions[keys.KEY].tolist(), actions[keys.DURATION].tolist()
+    discrete, parameter = actions[keys.DISCRETE].tolist(), actions[keys.PARAMETERS].tolist()
     rewards, got_outcomes = reading[keys.REWARD].squeeze(-1).tolist(), reading[keys.OUTCOME].tolist()
     names = ("x", "speed", "enemy_x", "enemy_speed")
-    state = list(zip(*(env.state_columns()[name].tolist() for name in names), strict=True))
+    state = list(zip(*(env.env_state()[name].tolist() for name in names), strict=True))
     outcomes = []
     for i in (~over).nonzero().squeeze(-1).tolist():
         course = courses[i]
-        reward, outcome = course.act(key[i], parameter[i][key[i]], [noise * number for number in numbers[i]])
+        reward, outcome = course.act(discrete[i], parameter[i][discrete[i]], [noise * number for number in numbers[i]])
         expected = (course.x, course.speed, *course.enemy, COURSE * reward)
-        assert (*state[i], COURSE * rewards[i]) == pytest.approx(expected, abs=0.01), f"environment {i}, key {key[i]}"
+        assert (*state[i], COURSE * rewards[i]) == pytest.approx(expected, abs=0.01), f"environment {i}, discrete {discrete[i]}"
         assert got_outcomes[i] == outcome
         outcomes.append(outcome)
     return reading[keys.OBSERVATION], outcomes
@@ -124,7 +124,7 @@ def test_actions_from_anywhere_follow_the_published_rules(noise):
     num, seed, generator = 500, 5, torch.Generator().manual_seed(1)
     env = PlatformEnv(num, noise=noise, seed=seed)
     place(env, **random_columns(num, generator))
-    state = env.state_columns()
+    state = env.env_state()
     columns = (state[name].tolist() for name in ("x", "speed", "enemy_x", "enemy_speed"))
     courses = [ScalarCourse(*column) for column in zip(*columns, strict=True)]
     outcomes = [
@@ -141,9 +141,9 @@ def test_episodes_from_start_to_end_follow_the_published_rules():
     for _ in range(12):
         careless = torch.rand(num, 1, generator=generator) < 0.1
         by_rule, by_chance = rule(observation), random_action(env, generator)
-        key = torch.where(careless.squeeze(-1), by_chance[keys.KEY], by_rule[keys.KEY])
-        parameter = torch.where(careless, by_chance[keys.DURATION], by_rule[keys.DURATION])
-        observation, outcomes = compare(env, courses, action(key, parameter), seed, 1.0)
+        discrete = torch.where(careless.squeeze(-1), by_chance[keys.DISCRETE], by_rule[keys.DISCRETE])
+        parameter = torch.where(careless, by_chance[keys.PARAMETERS], by_rule[keys.PARAMETERS])
+        observation, outcomes = compare(env, courses, action(discrete, parameter), seed, 1.0)
         ends += [outcome for outcome in outcomes if outcome != ON_THE_WAY]
     assert min(ends.count(outcome) for outcome in (ARRIVED, FELL, MET_ENEMY)) > 10
     assert len(ends) == num
@@ -154,10 +154,10 @@ def test_who_comes_down_at_an_edge_is_thrown_out_on_the_shorter_way(edge, inward
     env = PlatformEnv(3, noise=0.0)
     place(env, x=200.0, speed=70.0, enemy_x=0.0)
     act(env, [LEAP] * 3, [430.0] * 3)
-    flight = env.state_columns()["x"] - 200.0  # which ends in the gap, 1.2 px below the top
+    flight = env.env_state()["x"] - 200.0  # which ends in the gap, 1.2 px below the top
     aims = edge + inwards * torch.tensor([-0.5, 0.6, 1.8])
     env.reset()
     place(env, x=aims - flight, speed=70.0, enemy_x=0.0)
     reading = act(env, [LEAP] * 3, [430.0] * 3)
     assert reading[keys.OUTCOME].tolist() == [FELL, FELL, ON_THE_WAY]
-    torch.testing.assert_close(env.state_columns()["x"], torch.stack([aims[0], torch.tensor(edge), aims[2]]))
+    torch.testing.assert_close(env.env_state()["x"], torch.stack([aims[0], torch.tensor(edge), aims[2]]))

@@ -36,12 +36,12 @@ def play(learner: QPAMDP, num_envs: int = 64, num_steps: int = 2) -> TensorDict:
     td.batch_size = [num_envs, num_steps]
     td = learner.policy(td)
     optimum = torch.tensor([-0.4, 0.6])[: learner.specs.num_parameters]
-    own = learner.specs.parameter_mask[td[keys.KEY]]
-    error = ((learner.specs.to_unit(td[keys.DURATION]) - optimum).square() * own).sum(-1, keepdim=True)
+    own = learner.specs.parameter_mask[td[keys.DISCRETE]]
+    error = ((learner.specs.to_unit(td[keys.PARAMETERS]) - optimum).square() * own).sum(-1, keepdim=True)
     done = torch.ones(num_envs, num_steps, 1, dtype=torch.bool)
     td["next"] = {
         keys.OBSERVATION: torch.rand_like(td[keys.OBSERVATION]),
-        keys.REWARD: 1.0 + 0.2 * td[keys.KEY].unsqueeze(-1) - error,
+        keys.REWARD: 1.0 + 0.2 * td[keys.DISCRETE].unsqueeze(-1) - error,
         keys.TERMINATED: done,
         keys.DONE: done.clone(),
     }
@@ -86,10 +86,10 @@ def test_entries_that_are_not_there_are_refused():
         make(features=[0, 2])
 
 
-def sarsa_rows(phi, next_phi, key, reward, terminated, done) -> TensorDict:
-    rows = {"phi": torch.tensor(phi), "next_phi": torch.tensor(next_phi), "key": torch.tensor(key)}
+def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
+    rows = {"phi": torch.tensor(phi), "next_phi": torch.tensor(next_phi), "discrete": torch.tensor(discrete)}
     rows |= {"reward": torch.tensor(reward), "terminated": torch.tensor(terminated), "done": torch.tensor(done)}
-    return TensorDict({**rows, "mask": torch.ones(2, len(key[0]), dtype=torch.bool)}, [2, len(key[0])])
+    return TensorDict({**rows, "mask": torch.ones(2, len(discrete[0]), dtype=torch.bool)}, [2, len(discrete[0])])
 
 
 def test_sarsa_does_what_a_computation_by_hand_gives():
@@ -219,7 +219,7 @@ def test_keys_of_any_number_of_parameters_work(dims):
     for _ in range(30):
         td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(64, 2, 2)}, [64, 2]))
         done = torch.ones(64, 2, 1, dtype=torch.bool)
-        reward = (td[keys.KEY] == 1).float().unsqueeze(-1)
+        reward = (td[keys.DISCRETE] == 1).float().unsqueeze(-1)
         td["next"] = {
             keys.OBSERVATION: torch.rand(64, 2, 2),
             keys.REWARD: reward,
@@ -230,14 +230,14 @@ def test_keys_of_any_number_of_parameters_work(dims):
     assert learner.updates > 0 and learner.policy.theta.isfinite().all()
     with GREEDY:
         td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(64, 2)}, [64]))
-    assert (td[keys.KEY] == 1).all() and td[keys.DURATION].shape == (64, sum(dims))
+    assert (td[keys.DISCRETE] == 1).all() and td[keys.PARAMETERS].shape == (64, sum(dims))
 
 
 def test_the_greedy_policy_draws_nothing_and_stays_in_bounds():
     learner = ready(sigma=3.0)
     td = TensorDict({keys.OBSERVATION: torch.rand(100, 2)}, [100])
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    duration = learner.policy(td.clone())[keys.DURATION]
+    duration = learner.policy(td.clone())[keys.PARAMETERS]
     assert (duration >= low).all() and (duration <= high).all()
     with global_generators_unmoved(), GREEDY:
         td = learner.policy(td)

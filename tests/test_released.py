@@ -134,7 +134,7 @@ def test_the_reward_under_way_is_the_distance_covered_as_a_share_of_the_start_s(
 
 def with_fuel(env: ReleasedBoatDockEnv, fuel: float, **more) -> None:
     columns = {"fuel": torch.tensor([fuel]).double(), **more}
-    env.set_state_columns({**env.state_columns(), **columns})
+    env.set_env_state({**env.env_state(), **columns})
 
 
 @pytest.mark.parametrize(

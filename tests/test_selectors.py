@@ -133,7 +133,7 @@ def test_oracle_passes_on_what_the_environment_knows():
 @pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
 def test_human_chooses_the_congruent_boat_as_often_as_people_do_at_each_bearing(exploration):
     torch.manual_seed(0)
-    env = BoatDockEnv(20_000, people=True)
+    env = BoatDockEnv(20_000, human=True)
     human = Human(PAMDPSpecs.from_env(env))
     with set_exploration_type(exploration):
         chosen = human(with_decisions(env).reset())[keys.OPTION].float()
@@ -151,17 +151,17 @@ def test_human_chooses_the_congruent_boat_as_often_as_people_do_at_each_bearing(
     "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
 )
 def test_options_are_uniform_until_practice_is_over_and_greedy_choices_never(high, tmp_path):
-    words = [f"high={high}", "low=random", "num_envs=400", "eval.layouts=4", "agent.practice_frames=800"]
+    words = [f"high={high}", "low=random", "num_envs=400", "eval.layouts=4", "agent.uniform_option_frames=800"]
     cfg = compose_config([*words, *(["high.warmup_decisions=0"] if high == "meta_critic" else [])])
     parts = assemble(cfg, run_config(cfg), tmp_path)
     torch.manual_seed(0)
     agent = parts.agent
     for _ in range(2):
-        assert agent.selector.is_practice
+        assert agent.selector.is_uniform
         batch = parts.env.rollout(1, agent.policy)
         assert 0.4 < batch["option"].float().mean() < 0.6
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             td = parts.env.reset()
             assert (agent.selector(td.clone())["option"] == agent.selector.choose(td)["option"]).all()
         agent.learn(batch)
-    assert not agent.selector.is_practice
+    assert not agent.selector.is_uniform

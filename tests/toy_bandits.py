@@ -41,23 +41,23 @@ def due(observation: Tensor | int, **more: object) -> TensorDict:
     return TensorDict({keys.OBSERVATION: observation, keys.IS_DECISION: is_decision, **more}, [len(observation)])
 
 
-def ended(chosen: TensorDict, payoffs: Tensor) -> TensorDict:
+def ended(chosen: TensorDict, rewards: Tensor) -> TensorDict:
     """Return the decisions `[N]` made at a root, each paid after one step, which ended its episode."""
     is_end = torch.ones(len(chosen), 1, dtype=torch.bool)
     after = {
         keys.OBSERVATION: torch.zeros_like(chosen[keys.OBSERVATION]),
         keys.TERMINATED: is_end,
         keys.IS_DECISION: is_end,
-        keys.OPTION_RETURN: payoffs.unsqueeze(-1),
+        keys.OPTION_RETURN: rewards.unsqueeze(-1),
         keys.OPTION_STEPS: is_end.long(),
         keys.DECISION_OBSERVATION: chosen[keys.OBSERVATION],
     }
     return chosen.copy().set("next", TensorDict(after, chosen.batch_size))
 
 
-def paid(options: list[int], payoffs: list[float], **more: object) -> TensorDict:
+def paid(options: list[int], rewards: list[float], **more: object) -> TensorDict:
     """Return the decisions for these options with these payoffs, all of them made at the observation 0."""
-    return ended(due(len(options), option=torch.tensor(options), **more), torch.tensor(payoffs))
+    return ended(due(len(options), option=torch.tensor(options), **more), torch.tensor(rewards))
 
 
 def play(selector: Selector, means: Means, num: int, batch: int = 1, noise: float = 1.0) -> tuple[Tensor, Tensor]:

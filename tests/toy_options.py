@@ -45,7 +45,7 @@ class Crossing(PAMDPEnv):
         self.observation_spec = Composite(
             observation=Bounded(0.0, 1.0, shape=(n, _CELLS)), place=Bounded(0.0, LENGTH, shape=(n, 1)), shape=(n,)
         )
-        action = Composite(key=Categorical(2, shape=(n,)), duration=Bounded(0.0, 1.0, shape=(n, 2)), shape=(n,))
+        action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(0.0, 1.0, shape=(n, 2)), shape=(n,))
         self.action_spec = Composite(action=action, option=Categorical(2, shape=(n,)), shape=(n,))
         self.reward_spec, self.done_spec = Unbounded(shape=(n, 1)), self.make_done_spec()
         self._set_seed(seed)
@@ -66,10 +66,14 @@ class Crossing(PAMDPEnv):
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        key, share, option = tensordict[keys.KEY], tensordict[keys.DURATION][:, STEP], tensordict[keys.OPTION]
+        discrete, share, option = (
+            tensordict[keys.DISCRETE],
+            tensordict[keys.PARAMETERS][:, STEP],
+            tensordict[keys.OPTION],
+        )
         over = (self.place >= LENGTH) | (self.steps >= self.max_steps)
         whole = torch.where(option == (self.place >= SHORE), 1.0, SLOW)
-        way = torch.where((key == REST) | over, 0.0, share.clamp(0.0, 1.0) * whole)
+        way = torch.where((discrete == REST) | over, 0.0, share.clamp(0.0, 1.0) * whole)
         self.place, self.steps = (self.place + way).clamp(max=LENGTH), self.steps + ~over
         return self._read().set(keys.REWARD, ((self.place >= LENGTH) & ~over).float().unsqueeze(-1))
 
@@ -113,11 +117,11 @@ class WholeStep(TensorDictModuleBase):
     """Always make a whole step."""
 
     in_keys: ClassVar[list] = [keys.OBSERVATION]
-    out_keys: ClassVar[list] = [keys.KEY, keys.DURATION]
+    out_keys: ClassVar[list] = [keys.DISCRETE, keys.PARAMETERS]
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        key = torch.zeros(td.batch_size, dtype=torch.long)
-        return td.update({keys.ACTION: {"key": key, "duration": torch.ones(*td.batch_size, 2)}})
+        discrete = torch.zeros(td.batch_size, dtype=torch.long)
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": torch.ones(*td.batch_size, 2)}})
 
 
 class Stepper(Learner):

@@ -17,11 +17,11 @@ def states(num: int) -> TensorDict:
 def one_step_rows(learner: Learner, num: int) -> TensorDict:
     """Play `num` episodes, `[num, 1]`: key 1 pays the more the nearer its parameters are to (s0, -s1), key 2 a bit."""
     td = learner.policy(states(num))
-    unit, state = learner.specs.to_unit(td[keys.DURATION]), td[keys.OBSERVATION]
+    unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
     error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
-    payoff = torch.stack([torch.full_like(error, -0.5), 1.0 - error, torch.full_like(error, 0.2)], -1)
+    reward = torch.stack([torch.full_like(error, -0.5), 1.0 - error, torch.full_like(error, 0.2)], -1)
     is_end = torch.ones(num, 1, dtype=torch.bool)
-    reward = payoff.gather(-1, td[keys.KEY].unsqueeze(-1))
+    reward = reward.gather(-1, td[keys.DISCRETE].unsqueeze(-1))
     td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.DONE: is_end, keys.TERMINATED: is_end}
     return td.unsqueeze(-1)
 
@@ -31,7 +31,7 @@ def sample(num: int = 32) -> TensorDict:
     return TensorDict(
         {
             "state": torch.randn(num, 4),
-            "key": torch.randint(3, (num,)),
+            "discrete": torch.randint(3, (num,)),
             "unit": torch.rand(num, 3) * 2 - 1,
             "reward": torch.randn(num),
             "next_state": torch.randn(num, 4),

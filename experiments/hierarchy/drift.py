@@ -44,24 +44,24 @@ def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, floa
     for phase, cfg in enumerate(phases):
         env, policy = acting(make_env(cfg, NUM_ENVS, torch.device("cpu"), seed), agent, settings)
         options: list[torch.Tensor] = []
-        payoffs: list[torch.Tensor] = []
+        rewards: list[torch.Tensor] = []
         td = env.reset()
         for _ in range(DECISIONS // NUM_ENVS):
             with torch.no_grad():
                 td, following = env.step_and_maybe_reset(policy(td))
             agent.learn(td.unsqueeze(-1))
             options.append(td[keys.OPTION])
-            payoffs.append(td["next", keys.REWARD].squeeze(-1))
+            rewards.append(td["next", keys.REWARD].squeeze(-1))
             td = following
             if sum(map(len, options)) >= EVERY:
-                option, payoff = torch.cat(options), torch.cat(payoffs)
-                options, payoffs = [], []
+                option, reward = torch.cat(options), torch.cat(rewards)
+                options, rewards = [], []
                 row = {"high": high, "memory": memory, "seed": seed, "phase": phase}
                 yield (
                     row
                     | {"better": round((option == 1 - phase).float().mean().item(), 4)}
                     | {
-                        f"payoff_{i}": round(payoff[option == i].mean().item(), 4) if (option == i).any() else ""
+                        f"reward_{i}": round(reward[option == i].mean().item(), 4) if (option == i).any() else ""
                         for i in range(2)
                     }
                 )

@@ -54,7 +54,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
     results, curves, choices = [], [], []
     for run in runs:
         summary = run.summary
-        practice = run.config.agent.get("practice_frames", 0)
+        practice = run.config.agent.get("uniform_option_frames", 0)
         name = {"high": summary["high"], "low": summary["low"], "total": run.config.total_frames, "practice": practice}
         name["seed"] = summary["seed"]
         results.append(name | {column: round(summary[key], 4) for column, key in FIGURES.items()})

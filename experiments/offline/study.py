@@ -33,7 +33,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
         start = OFFLINE
         if config.mode != "offline":
             start = SCRATCH if config.low.checkpoint is None else PRETRAINED
-        data = "none" if start != OFFLINE else "settled" if config.data.settled else "recorded"
+        data = "none" if start != OFFLINE else "settled" if config.data.rest_to_rest else "recorded"
         which = "successes" if data != "none" and config.data.successes else "all"
         name = {"low": summary["low"], "start": start, "data": data, "episodes": which, "seed": summary["seed"]}
         rows = run.evaluations()
@@ -74,10 +74,10 @@ def draw(curves: Rows, path: Path) -> None:
     """Draw the scores against updates from the data set, and against presses from scratch and after pre-training."""
     figure = Figure(figsize=(12.0, 4.0), layout="constrained")
     offline, online = figure.subplots(1, 2, sharey=True)
-    settled = [
+    rest_to_rest = [
         row for row in curves if row["start"] == OFFLINE and row["data"] == "settled" and row["episodes"] == "all"
     ]
-    for (low,), rows in groups(settled, "low").items():
+    for (low,), rows in groups(rest_to_rest, "low").items():
         _draw_curve(offline, rows, low, COLOURS[low], "-")
     fresh = [row for row in curves if row["start"] != OFFLINE]
     for (low, start), rows in groups(fresh, "low", "start").items():

@@ -48,7 +48,7 @@ def _replay_boat(controller: str, episodes: list[dict[str, Any]], dtype: str) ->
         # Episodes that are over stay as they are, whatever is pressed.
         recorded = [episode["steps"][min(t, len(episode["steps"]) - 1)] for episode in episodes]
         is_there = torch.tensor([t < len(episode["steps"]) for episode in episodes])
-        press = {"key": _column(recorded, "key").long(), "duration": _column(recorded, "parameter").float()}
+        press = {"discrete": _column(recorded, "key").long(), "parameters": _column(recorded, "parameter").float()}
         td = env.step(TensorDict({keys.ACTION: press}, [len(episodes)]))["next"]
         for mine, name in ((td[keys.OBSERVATION], "observation"), (td[keys.REWARD].squeeze(-1), "reward")):
             worst = max(worst, _difference(mine[is_there], _column(recorded, name)[is_there]))

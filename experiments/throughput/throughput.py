@@ -76,7 +76,7 @@ def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[
     def step() -> None:
         nonlocal state
         action = next(actions)
-        state, _, _ = press(state, action[keys.OPTION], action[keys.KEY], action[keys.DURATION])
+        state, _, _ = press(state, action[keys.OPTION], action[keys.DISCRETE], action[keys.PARAMETERS])
 
     return step
 

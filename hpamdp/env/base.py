@@ -18,8 +18,8 @@ from hpamdp import keys
 class PAMDPEnv(EnvBase):
     """`num_envs` copies of a problem with parameterised actions, in one batch dimension.
 
-    A subclass has the specs: `observation` float32 `[N, observation_dim]`; the action leaves `("action", "key")` int64
-    `[N]` and `("action", "duration")` float32 `[N, num_parameters]`, the bounded parameters of all keys side by side,
+    A subclass has the specs: `observation` float32 `[N, observation_dim]`; the action leaves `("action", "discrete")` int64
+    `[N]` and `("action", "parameters")` float32 `[N, num_parameters]`, the bounded parameters of all keys side by side,
     of which only the pressed key's count; where the agent chooses options, the leaf `option` int64 `[N]`; `reward`,
     `done`, `terminated`, `truncated` `[N, 1]`, where a time limit is `truncated` only. A step leaves an episode that is
     over as it is and earns 0.
@@ -37,7 +37,7 @@ class PAMDPEnv(EnvBase):
         return keys.OPTION in self.full_action_spec.keys()
 
     @property
-    def is_divisible(self) -> bool:
+    def is_shardable(self) -> bool:
         """Whether several processes can each step a share of the environments: these learn nothing from one another."""
         return True
 
@@ -71,11 +71,11 @@ class PAMDPEnv(EnvBase):
         """
         return {}
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return what episodes' future depends on, each `[N, ...]`, for a checkpoint; empty where it cannot be had."""
         return {}
 
-    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Go on where `state_columns` were taken; with none, episodes start anew.
 
         Raises:
@@ -92,13 +92,13 @@ class PAMDPEnv(EnvBase):
         """Return the spec of the action leaves by the bounds `[num_parameters]` of all keys' parameters."""
         n, device = self.batch_size, self.device
         low, high = (side.to(device, torch.float32).expand(*n, -1) for side in (low, high))
-        press = Composite(
-            key=Categorical(len(self.parameter_dims), shape=n, device=device),
-            duration=Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device),
+        action = Composite(
+            discrete=Categorical(len(self.parameter_dims), shape=n, device=device),
+            parameters=Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device),
             shape=n,
         )
         option = {keys.OPTION: Categorical(len(self.option_names), shape=n, device=device)} if has_option else {}
-        return Composite(**option, action=press, shape=n)
+        return Composite(**option, action=action, shape=n)
 
     def check_action(self, tensordict: TensorDictBase) -> None:
         """Check the action leaves' shapes and types; their values are the subclass's to check.
@@ -107,13 +107,13 @@ class PAMDPEnv(EnvBase):
             ValueError: a leaf is missing, or has another shape or type.
         """
         n = self.batch_size
-        shapes = {keys.KEY: n, keys.DURATION: (*n, sum(self.parameter_dims))}
+        shapes = {keys.DISCRETE: n, keys.PARAMETERS: (*n, sum(self.parameter_dims))}
         for name, shape in ({**shapes, keys.OPTION: n} if self.has_choice else shapes).items():
             value = tensordict.get(name)
             if value is None or value.shape != shape:
                 given = None if value is None else list(value.shape)
                 raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
-            if name != keys.DURATION and (value.is_floating_point() or value.dtype == torch.bool):
+            if name != keys.PARAMETERS and (value.is_floating_point() or value.dtype == torch.bool):
                 given = str(value.dtype).removeprefix("torch.")
                 raise ValueError(f"step: {name} has type {given}, but must be integer")
 

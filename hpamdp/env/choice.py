@@ -15,7 +15,7 @@ from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 
 
-class ControllerChoiceEnv(PAMDPEnv):
+class OptionChoiceEnv(PAMDPEnv):
     """Choose an option, see the episode's return: an ordinary environment with one discrete action.
 
     The action is `option` int64 `[N]`; every step plays the episode to its end with the low-level policy, greedily, and
@@ -50,13 +50,13 @@ class ControllerChoiceEnv(PAMDPEnv):
         """Return how episodes went."""
         return self._low[1].results(last)
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return the environment's."""
-        return self._low[1].state_columns()
+        return self._low[1].env_state()
 
-    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Set the environment's."""
-        self._low[1].set_state_columns(columns)
+        self._low[1].set_env_state(columns)
 
     def _set_seed(self, seed: int | None) -> None:
         self._low[1].set_seed(seed)

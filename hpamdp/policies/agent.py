@@ -85,7 +85,7 @@ class HierarchicalAgent(nn.Module):
         specs: of the problem as the environment states it.
         is_shared: whether the single learner takes the option as input (its own specs then count the one-hot option).
         is_frozen: whether the learners stay as they are.
-        practice_frames: presses (decisions, where the learners are frozen) at the start for which the selector's
+        uniform_option_frames: presses (decisions, where the learners are frozen) at the start for which the selector's
             exploring choices are uniform; it learns from them.
     """
 
@@ -96,15 +96,15 @@ class HierarchicalAgent(nn.Module):
         specs: PAMDPSpecs,
         is_shared: bool = False,
         is_frozen: bool = False,
-        practice_frames: int = 0,
+        uniform_option_frames: int = 0,
     ) -> None:
         super().__init__()
         self.selector = selector
         self.learners = nn.ModuleList(learners)
         self.specs, self.is_shared, self.is_frozen = specs, is_shared, is_frozen
-        self.practice_frames = practice_frames
+        self.uniform_option_frames = uniform_option_frames
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self._end_practice_if_due()
+        self._set_is_uniform()
         self.router = OptionRouter(learners, specs, is_shared)
         self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
 
@@ -126,7 +126,7 @@ class HierarchicalAgent(nn.Module):
         scalars: dict[str, float] = {}
         self.frames += batch.numel()
         if self.selector is not None:
-            self._end_practice_if_due()
+            self._set_is_uniform()
             scalars |= {f"high/{name}": value for name, value in self._teach_selector(batch).items()}
         if self.is_frozen:
             return scalars
@@ -141,9 +141,9 @@ class HierarchicalAgent(nn.Module):
     def _name_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
 
-    def _end_practice_if_due(self) -> None:
+    def _set_is_uniform(self) -> None:
         if self.selector is not None:
-            self.selector.is_practice.fill_(self.frames < self.practice_frames)
+            self.selector.is_uniform.fill_(self.frames < self.uniform_option_frames)
 
     def _teach_selector(self, batch: TensorDictBase) -> dict[str, float]:
         is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
@@ -156,7 +156,7 @@ class HierarchicalAgent(nn.Module):
             decisions.set(keys.OPTION_VALUES, self.option_values(decided_at))
         return self.selector.learn(decisions)
 
-    def remember(self, batch: TensorDictBase) -> None:
+    def add_demonstrations(self, batch: TensorDictBase) -> None:
         """Let the learners keep a data set's transitions `[*B, T]`, each its own option's; the selector learns."""
         if self.selector is not None:
             self._teach_selector(batch)
@@ -164,13 +164,13 @@ class HierarchicalAgent(nn.Module):
         if self.is_shared:
             batch = with_option(batch, self.specs.num_options)
         for i, learner in enumerate(self.learners):
-            learner.remember(batch, everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i)
+            learner.add_demonstrations(batch, everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i)
 
-    def practise(self, num_updates: int) -> dict[str, float]:
+    def update(self, num_updates: int) -> dict[str, float]:
         """Let each learner make updates from what it remembers; return scalars named `low/...`."""
         scalars: dict[str, float] = {}
         for i, learner in enumerate(self.learners):
-            made = learner.practise(num_updates)
+            made = learner.update(num_updates)
             scalars |= {f"{self._name_of(i)}/{name}": value for name, value in made.items()}
         return scalars
 

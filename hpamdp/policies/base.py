@@ -31,7 +31,7 @@ class Selector(TensorDictModuleBase):
     holds it. Its `__init__` takes `specs` and its options as keyword arguments, which are the schema of its yaml.
     """
 
-    # What it reads that an environment writes only when asked: `oracle`, `people`.
+    # What it reads that an environment writes only when asked: `oracle`, `human`.
     needs: ClassVar[tuple[str, ...]] = ()
     needs_values: bool = False  # whether it reads the learners' own values of a state
     gamma: float = 1.0  # discount of a step, where options end before their episode
@@ -42,7 +42,7 @@ class Selector(TensorDictModuleBase):
         self.out_keys = [keys.OPTION]
         self.specs = specs
         # While it is true, exploring choices are uniform, so that every option's learner gets its practice.
-        self.register_buffer("is_practice", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("is_uniform", torch.zeros((), dtype=torch.bool))
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return a fresh choice for every environment, int64 `[*B]`."""
@@ -54,7 +54,7 @@ class Selector(TensorDictModuleBase):
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return all `out_keys` of uniformly random choices, each `[*B]`."""
-        return {keys.OPTION: torch.randint(self.specs.num_options, td.batch_size, device=self.is_practice.device)}
+        return {keys.OPTION: torch.randint(self.specs.num_options, td.batch_size, device=self.is_uniform.device)}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first; return scalars to log.
@@ -75,7 +75,7 @@ class Selector(TensorDictModuleBase):
         held = {key: td.get(key, None) for key in self.out_keys}
         is_new = any(value is None for value in held.values())
         if is_new or is_decision.any():
-            is_uniform = bool(self.is_practice) and not is_greedy()
+            is_uniform = bool(self.is_uniform) and not is_greedy()
             fresh = self.choose_uniformly(td) if is_uniform else self.choose(td)
             held = fresh if is_new else {key: torch.where(is_decision, fresh[key], held[key]) for key in held}
         for key, value in held.items():
@@ -109,14 +109,14 @@ class Learner(nn.Module):
         """
         return {}
 
-    def remember(self, batch: TensorDictBase, mask: Tensor) -> None:
+    def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Keep those of a data set's transitions `[*B, T]` that are in `mask`, beside what the learner will collect.
 
         Only for learners with the mode `offline`.
         """
         raise NotImplementedError
 
-    def practise(self, num_updates: int) -> dict[str, float]:
+    def update(self, num_updates: int) -> dict[str, float]:
         """Make updates from what is remembered; return scalars to log, averaged over them."""
         raise NotImplementedError
 

@@ -18,7 +18,7 @@ from torchrl.envs import TransformedEnv
 
 from hpamdp.config import ConfigError, RunConfig, build, name_of, run_config, validate
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.choice import ControllerChoiceEnv
+from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # What the builder supplies; the rest of a constructor's arguments is the yaml's.
 CONTEXT = {
-    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "people"),
+    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "data": ("env",),
@@ -101,7 +101,7 @@ def acting(env: PAMDPEnv, agent: HierarchicalAgent, settings: RunConfig) -> tupl
     """Return the environment to train in, with its decisions tracked, and the policy that acts there."""
     gamma, policy = 1.0 if agent.selector is None else agent.selector.gamma, agent.policy
     if settings.low.freeze:
-        env, policy = ControllerChoiceEnv(agent.router, env), agent.selector
+        env, policy = OptionChoiceEnv(agent.router, env), agent.selector
     return _with_decisions(env, settings, gamma), policy
 
 
@@ -112,7 +112,7 @@ def _asked_of_env(cfg: DictConfig, classes: dict[str, type | None]) -> dict[str,
     for group in ("high", "low"):
         for name in classes[group].needs if classes[group] is not None else ():
             if name not in offered:
-                lacks = {"oracle": "has no planner to ask", "people": "has no record of people"}[name]
+                lacks = {"oracle": "has no planner to ask", "human": "has no human data"}[name]
                 raise ConfigError(f"{group}={name_of(cfg[group])}: env={name_of(cfg.env)} {lacks}")
             asked[name] = True
     return asked
@@ -186,7 +186,7 @@ def _check_collector(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, collec
             f"collector.num_workers={num_workers}: must divide num_envs={settings.num_envs}, of which each worker has "
             "an equal share"
         )
-    if num_workers > 1 and not env.is_divisible:
+    if num_workers > 1 and not env.is_shardable:
         raise ConfigError(
             f"collector={name}: env={name_of(cfg.env)} learns the scale of its observations from all environments "
             "together; use collector=single or env.observation_scaling=bounds"
@@ -205,7 +205,9 @@ def make_agent(cfg: DictConfig, settings: RunConfig, specs: PAMDPSpecs, device: 
     if is_shared:
         learner_specs, num_learners = specs.with_option_observed(), 1
     learners = [_make_learner(cfg.low, learner_specs, device) for _ in range(num_learners)]
-    agent = HierarchicalAgent(selector, learners, specs, is_shared, settings.low.freeze, settings.agent.practice_frames)
+    agent = HierarchicalAgent(
+        selector, learners, specs, is_shared, settings.low.freeze, settings.agent.uniform_option_frames
+    )
     return agent.to(device)
 
 

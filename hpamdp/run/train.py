@@ -72,7 +72,7 @@ class Trainer:
             self.parts.env.set_statistics(env_state)
             return
         try:
-            self.parts.env.set_state_columns(env_state)
+            self.parts.env.set_env_state(env_state)
         except ValueError as error:
             raise ConfigError(f"num_envs={self.settings.num_envs}: {error}; leave it out when you resume") from error
         self.recorder.resume_from(source.parent, self.frames)
@@ -103,7 +103,7 @@ class Trainer:
         if self.last_score is None and self.frames == 0:
             self._evaluate(bar)
             if self.parts.data is not None:
-                self.parts.agent.remember(self.parts.data)
+                self.parts.agent.add_demonstrations(self.parts.data)
         while not self._is_over():
             num = self._learn(collection)
             last, self.frames = self.frames, self.frames + num
@@ -121,7 +121,7 @@ class Trainer:
         """Let the agent learn, from presses or from the data set; return how many frames that took."""
         if self.settings.mode == "offline":
             num = min(_UPDATES_A_TURN, self.settings.num_frames - self.frames)
-            self.recorder.take(None, self.parts.agent.practise(num))
+            self.recorder.take(None, self.parts.agent.update(num))
             return num
         batch = collection.next()
         self.recorder.take(batch, self.parts.agent.learn(batch))
@@ -142,7 +142,7 @@ class Trainer:
         """Write the checkpoint."""
         progress = {"config": OmegaConf.to_container(self.cfg, resolve=True), "frames": self.frames}
         progress |= {"wall_s": self.wall_s, "cpu_s": self.cpu_s, "last_score": self.last_score}
-        checkpoint.save(self.output_dir / checkpoint.FILE_NAME, self.parts.agent, collection.state_columns(), progress)
+        checkpoint.save(self.output_dir / checkpoint.FILE_NAME, self.parts.agent, collection.env_state(), progress)
 
 
 def _is_due(before: int, now: int, every: int) -> bool:

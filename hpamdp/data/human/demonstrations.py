@@ -12,13 +12,13 @@ from hpamdp import keys
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.errors import HumanDataError
 from hpamdp.data.human.released_file import HumanData, read
-from hpamdp.data.human.rest_to_rest import settle
+from hpamdp.data.human.rest_to_rest import to_rest_to_rest
 from hpamdp.data.human.transitions import TRAJECTORY, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
 
 
-class HumanPresses:
+class HumanDemonstrations:
     """The presses of the episodes that meet every condition, as the environment at hand would have given them.
 
     Where the environment has one key map, the keys are those that push the boat there as people's did.
@@ -28,7 +28,7 @@ class HumanPresses:
         path: the released file; None: where `released_file.default_path` expects it.
         checksum: the SHA-256 that the file must have; None: any.
         complete, successes, best_people: as in `hpamdp.data.human.episodes.select`.
-        settled: whether `hpamdp.data.human.rest_to_rest.settle` makes presses of them that start from rest and glide out.
+        rest_to_rest: whether `hpamdp.data.human.rest_to_rest.to_rest_to_rest` makes presses of them that start from rest and glide out.
 
     Raises:
         ValueError: another environment than the boats, no such file, not the right one, or nothing is left.
@@ -43,7 +43,7 @@ class HumanPresses:
         complete: bool,
         successes: bool,
         best_people: PositiveInt | None,
-        settled: bool,
+        rest_to_rest: bool,
     ) -> None:
         if not isinstance(env, BoatDockEnv):
             raise ValueError("people docked boats; use env=boatdock or data=none")
@@ -52,8 +52,8 @@ class HumanPresses:
         try:
             data = read(None if path is None else Path(path), checksum=checksum, one_frame=True)
             data = select(data, complete=complete, successes=successes, best_people=best_people, controller=controller)
-            if settled:
-                data = settle(data)
+            if rest_to_rest:
+                data = to_rest_to_rest(data)
             if rules.keymap != "random":
                 data = with_keymap(data, rules.keymap)
             rows = transitions(data, reward=rules.reward, observation=rules.observation, has_choice=env.has_choice)

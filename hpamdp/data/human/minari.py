@@ -82,7 +82,7 @@ def _episode(rows: TensorDict, has_choice: bool) -> dict[str, Any]:
     def with_last(name: str) -> np.ndarray:
         return torch.cat([rows[name], rows["next", name][-1:]]).numpy()
 
-    actions = {"key": rows[keys.KEY].numpy(), "duration": rows[keys.DURATION].numpy()}
+    actions = {"key": rows[keys.DISCRETE].numpy(), "duration": rows[keys.PARAMETERS].numpy()}
     return {
         "observations": with_last(keys.OBSERVATION),
         "actions": {"option": rows[keys.OPTION].numpy(), **actions} if has_choice else actions,
@@ -118,11 +118,12 @@ def _rows(episode: minari.EpisodeData, number: int) -> TensorDict:
     then |= {**ends, keys.IS_DECISION: ends[keys.DONE].clone()}
     then[keys.REWARD] = torch.as_tensor(episode.rewards, dtype=torch.float32)[:, None]
     action = {name: torch.as_tensor(value) for name, value in episode.actions.items()}
+    press = {"discrete": action["key"], "parameters": action["duration"]}
     now |= {name: torch.zeros_like(end) for name, end in ends.items()}
     now[keys.IS_DECISION] = (torch.arange(num) == 0)[:, None]
     if keys.OPTION in action:
-        now[keys.OPTION] = action.pop(keys.OPTION)
-    rows = TensorDict({**now, keys.ACTION: action, "next": then}, batch_size=[num])
+        now[keys.OPTION] = action[keys.OPTION]
+    rows = TensorDict({**now, keys.ACTION: press, "next": then}, batch_size=[num])
     if not (rows["next", keys.OUTCOME] < len(physics.OUTCOMES)).all():
         raise ValueError("an outcome that there is not")
     return rows.set(TRAJECTORY, torch.full((num,), number))

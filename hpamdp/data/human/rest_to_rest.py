@@ -23,7 +23,7 @@ TAP = 4.0  # px
 CENTRE = torch.tensor(harbour.CENTRE)
 
 
-def settle(data: HumanData) -> HumanData:
+def to_rest_to_rest(data: HumanData) -> HumanData:
     """Return the recording with presses that start from rest and glide out; the tanks are what these presses leave.
 
     Args:

@@ -33,8 +33,8 @@ def transitions(
 ) -> TensorDict:
     """Return the presses as a batch of transitions `[N]`, in the order of episodes and presses.
 
-    At the root: `observation` `[N, 16]` (14 with `pixels`), `option` `[N]`, `("action", "key")` `[N]`,
-    `("action", "duration")` `[N, 3]` (0 for the keys that were not pressed), `is_decision`, `done`, `terminated`,
+    At the root: `observation` `[N, 16]` (14 with `pixels`), `option` `[N]`, `("action", "discrete")` `[N]`,
+    `("action", "parameters")` `[N, 3]` (0 for the keys that were not pressed), `is_decision`, `done`, `terminated`,
     `truncated` `[N, 1]`, `outcome` `[N]`, `fuel` `[N, 1]`, and `("collector", "traj_ids")` `[N]`, the episode. Under
     `next`: all of these but action, option and trajectory, and `reward` `[N, 1]`.
 
@@ -60,7 +60,7 @@ def transitions(
     root, then = _seen(before, rules), _seen(after, rules)
     then |= {keys.REWARD: episode.reward_of(before, after, rules).unsqueeze(-1), keys.IS_DECISION: then[keys.DONE]}
     durations = torch.zeros(len(key), harbour.NUM_KEYS).scatter(1, key.unsqueeze(1), duration.unsqueeze(1))
-    root |= {keys.IS_DECISION: is_first, keys.ACTION: {"key": key.clone(), "duration": durations}}
+    root |= {keys.IS_DECISION: is_first, keys.ACTION: {"discrete": key.clone(), "parameters": durations}}
     root["collector"] = {"traj_ids": data.presses["episode"].clone()}
     if has_choice:
         root[keys.OPTION] = of["controller"]

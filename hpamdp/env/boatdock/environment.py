@@ -21,7 +21,7 @@ from hpamdp.env import counter_rng
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.episode import BoatState, Rules
-from hpamdp.env.boatdock.human_shares import people_shares, people_spec
+from hpamdp.env.boatdock.human_shares import human_shares, human_spec
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.columns import where
@@ -34,7 +34,7 @@ _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 class BoatDockEnv(PAMDPEnv):
     """Dock boats in `num_envs` harbours at once.
 
-    Action leaves: `("action", "key")` int64 `[N]` in {0, 1, 2}; `("action", "duration")` float32 `[N, 3]`, seconds in
+    Action leaves: `("action", "discrete")` int64 `[N]` in {0, 1, 2}; `("action", "parameters")` float32 `[N, 3]`, seconds in
     [0, 2], one for each key, of which only the pressed key's counts (values outside are clipped, NaN and infinite ones
     refused); with `controller="choose"` also `option` int64 `[N]` (0 incongruent, 1 congruent), read at an episode's
     first press and held until its end.
@@ -52,7 +52,7 @@ class BoatDockEnv(PAMDPEnv):
         slip: probability that a uniformly random key is pressed.
         compile_physics: compile the pure step, reset and observation functions (takes about half a minute).
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `key`, `duration` `[N, num_options]`).
-        people: also write people's shares of the options under `people` (`option` `[N, num_options]`).
+        human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
         first_env: number of the first boat, where other processes have those before.
@@ -83,7 +83,7 @@ class BoatDockEnv(PAMDPEnv):
         slip: float = 0.0,
         compile_physics: bool = False,
         oracle: bool = False,
-        people: bool = False,
+        human: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
@@ -102,9 +102,9 @@ class BoatDockEnv(PAMDPEnv):
             )
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
-        self._has_people, self._oracle = people, None
-        if people:
-            self.observation_spec["people"] = people_spec(num_envs, self.device)
+        self._has_human, self._oracle = human, None
+        if human:
+            self.observation_spec["human"] = human_spec(num_envs, self.device)
         if oracle:
             self._oracle = BoatDockOracle(num_envs, rules, self.device)
             self.observation_spec["oracle"] = oracle_spec(num_envs, rules, self.device)
@@ -162,11 +162,11 @@ class BoatDockEnv(PAMDPEnv):
         """Return the means of `measure_boats`."""
         return measure_boats(played)
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns."""
         return self._state._asdict()
 
-    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Put the boats where `state_columns` were taken."""
         if len(columns["episode"]) != self.num_envs:
             raise ValueError(
@@ -245,7 +245,7 @@ class BoatDockEnv(PAMDPEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.check_action(tensordict)
-        key, durations = tensordict.get(keys.KEY), tensordict.get(keys.DURATION)
+        key, durations = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
         option = tensordict.get(keys.OPTION) if self.has_choice else self._state.controller
         state, reward, is_action = self._pure_step(
             self._state, option, key, durations, self._seed, self._environment, self.rules
@@ -266,8 +266,8 @@ class BoatDockEnv(PAMDPEnv):
     def _read(self) -> TensorDict:
         reading = self._pure_read(self._state, self._seed, self._environment, self.rules)
         seen = TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device)
-        if self._has_people:
-            seen.set(keys.PEOPLE_OPTION, people_shares(self._state))
+        if self._has_human:
+            seen.set(keys.HUMAN_OPTION, human_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
 
 

@@ -11,13 +11,13 @@ from hpamdp.env.boatdock.episode import BoatState
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 
 
-def people_spec(num_envs: int, device: torch.device) -> Composite:
+def human_spec(num_envs: int, device: torch.device) -> Composite:
     """Return the spec of `people_shares` under the name of what is chosen."""
     shares = Bounded(0.0, 1.0, shape=(num_envs, len(harbour.CONTROLLERS)), device=device)
     return Composite(option=shares, shape=(num_envs,))
 
 
-def people_shares(state: BoatState) -> Tensor:
+def human_shares(state: BoatState) -> Tensor:
     """Return the shares of people choosing the incongruent and the congruent boat `[N, 2]`, by the bearing's offset."""
     layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
     offset = harbour.bearing_offset(layout)

@@ -33,13 +33,13 @@ _LARGEST_NORMAL = 6.0
 
 def action_space(has_choice: bool, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
     """Return one boat's action space; see the module's docstring."""
-    num_keys, longest = harbour.NUM_KEYS, physics.MAX_DURATION
+    num_discrete, longest = harbour.NUM_KEYS, physics.MAX_DURATION
     option = spaces.Discrete(len(harbour.CONTROLLERS))
     if action_format == "dict":
-        press = {"key": spaces.Discrete(num_keys), "duration": spaces.Box(0.0, longest, (num_keys,))}
+        press = {"key": spaces.Discrete(num_discrete), "duration": spaces.Box(0.0, longest, (num_discrete,))}
         return spaces.Dict({"option": option, **press} if has_choice else press)
-    durations = spaces.Tuple([spaces.Box(0.0, longest, (1,)) for _ in range(num_keys)])
-    press = (spaces.Discrete(num_keys), durations)
+    durations = spaces.Tuple([spaces.Box(0.0, longest, (1,)) for _ in range(num_discrete)])
+    press = (spaces.Discrete(num_discrete), durations)
     return spaces.Tuple((option, *press) if has_choice else press)
 
 
@@ -104,7 +104,7 @@ class NumpyBoats:
                 leaf[torch.from_numpy(ignored)] = 0
         n = self.env.num_envs
         option = {keys.OPTION: leaves["option"]} if self.env.has_choice else {}
-        press = TensorDict(key=leaves["key"], duration=leaves["duration"], batch_size=[n])
+        press = TensorDict(discrete=leaves["key"], parameters=leaves["duration"], batch_size=[n])
         return self.env.step(TensorDict({**option, keys.ACTION: press}, batch_size=[n], device=self.env.device))["next"]
 
     def infos(self) -> tuple[dict[str, np.ndarray], np.ndarray]:

@@ -16,8 +16,8 @@ def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
     n, plans = num_envs, _num_plans(rules)
     return Composite(
         option=Categorical(len(harbour.CONTROLLERS), shape=(n,), device=device),
-        key=Categorical(harbour.NUM_KEYS, shape=(n, plans), device=device),
-        duration=Bounded(0.0, physics.MAX_DURATION, shape=(n, plans), device=device),
+        discrete=Categorical(harbour.NUM_KEYS, shape=(n, plans), device=device),
+        parameters=Bounded(0.0, physics.MAX_DURATION, shape=(n, plans), device=device),
         shape=(n,),
     )
 
@@ -52,7 +52,7 @@ class BoatDockOracle:
         return planner.best_plan(boats.x, boats.y, boats.goal_x, boats.goal_y, boats.fuel, held, boats.keymap)
 
     def read(self, state: BoatState) -> TensorDict:
-        """Return `option` `[N]` and each option's next press, `key` and `duration` `[N, num_options]`."""
+        """Return `option` `[N]` and each option's next press, `discrete` and `parameters` `[N, num_options]`."""
         pressed = state.presses.long()
         if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
@@ -63,8 +63,8 @@ class BoatDockOracle:
         return TensorDict(
             {
                 "option": self.option.clone(),
-                "key": self.keys.gather(-1, index).squeeze(-1),
-                "duration": torch.where(is_planned, self.durations.gather(-1, index).squeeze(-1), 0.0),
+                "discrete": self.keys.gather(-1, index).squeeze(-1),
+                "parameters": torch.where(is_planned, self.durations.gather(-1, index).squeeze(-1), 0.0),
             },
             batch_size=pressed.shape,
             device=pressed.device,

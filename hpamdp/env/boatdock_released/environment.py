@@ -28,7 +28,7 @@ from hpamdp.env.columns import taken_back, where
 class ReleasedBoatDockEnv(PAMDPEnv):
     """Dock boats by the rules of the released code in `num_envs` environments at once.
 
-    Action leaves: `("action", "key")` int64 `[N]` in {0, 1, 2}; `("action", "duration")` float32 `[N, 3]`, one u in
+    Action leaves: `("action", "discrete")` int64 `[N]` in {0, 1, 2}; `("action", "parameters")` float32 `[N, 3]`, one u in
     [-1, 1] for each key, of which only the pressed key's counts (values outside are clipped, NaN and infinite ones
     refused). A press takes 2.5 (u + 1) seconds and u fuel, so u < 0 *re*fuels. A goal reached earns 10 x fuel / 5, an
     empty tank -1, the left and the upper wall and the time limit 0; other moves what they take off the distance to the
@@ -125,11 +125,11 @@ class ReleasedBoatDockEnv(PAMDPEnv):
             for code in (released.WALL, released.OUT_OF_FUEL, released.TIME_LIMIT)
         }
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each."""
         return self._state._asdict()
 
-    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Go on where `state_columns` were taken; with none, episodes start anew.
 
         Raises:
@@ -223,7 +223,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.check_action(tensordict)
-        key, duration = self._checked_press(tensordict.get(keys.KEY), tensordict.get(keys.DURATION))
+        key, duration = self._checked_press(tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS))
         before = self._state
         is_over = before.outcome != released.SAILING
         mask = tensordict.get("_step", None)

@@ -47,15 +47,15 @@ class ActionSpace:
     def __init__(self, space: spaces.Space, parameter_dims: Sequence[int] | None = None) -> None:
         self._space = space
         self._discrete, parameters = self._read_parts()
-        num_keys = int(self._discrete.n)
+        num_discrete = int(self._discrete.n)
         self._has_one_box = isinstance(parameters, spaces.Box)
         self._box_names, self._boxes = self._read_boxes(parameters)
-        if not self._has_one_box and len(self._boxes) != num_keys:
-            raise self._refusal(f"{num_keys} keys, but {len(self._boxes)} Boxes")
+        if not self._has_one_box and len(self._boxes) != num_discrete:
+            raise self._refusal(f"{num_discrete} keys, but {len(self._boxes)} Boxes")
         if parameter_dims is not None:
-            self._check_split(parameter_dims, num_keys)
+            self._check_split(parameter_dims, num_discrete)
         elif self._has_one_box:
-            self._boxes *= num_keys
+            self._boxes *= num_discrete
         sizes = [int(np.prod(box.shape)) for box in self._boxes]
         self._slices = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self.parameter_dims = tuple(sizes if parameter_dims is None else parameter_dims)
@@ -121,13 +121,13 @@ class ActionSpace:
                 raise self._refusal("a parameter's lower bound must be less than its upper one")
         return names, boxes
 
-    def _check_split(self, parameter_dims: Sequence[int], num_keys: int) -> None:
+    def _check_split(self, parameter_dims: Sequence[int], num_discrete: int) -> None:
         given = f"parameter_dims={list(parameter_dims)}"
         if not self._has_one_box:
             raise self._refusal(f"{given} goes with one Box for all keys, but there is a Box for each")
         size = int(np.prod(self._boxes[0].shape))
-        if len(parameter_dims) != num_keys or min(parameter_dims) < 0 or sum(parameter_dims) != size:
-            allowed = f"{num_keys} numbers of at least 0 that add up to {size}"
+        if len(parameter_dims) != num_discrete or min(parameter_dims) < 0 or sum(parameter_dims) != size:
+            allowed = f"{num_discrete} numbers of at least 0 that add up to {size}"
             raise ValueError(f"{given}, but must be {allowed}, with the action space {written(self._space)}")
 
     def _refusal(self, reason: str) -> ValueError:

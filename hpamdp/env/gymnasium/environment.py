@@ -92,7 +92,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._set_seed(seed)
 
     @property
-    def is_divisible(self) -> bool:
+    def is_shardable(self) -> bool:
         """Whether no running statistics are kept."""
         return self.observations.statistics is None
 
@@ -116,12 +116,12 @@ class GymnasiumEnv(PAMDPEnv):
         """
         self.observations.share(other.observations)
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return the running statistics, if there are some; where episodes stand cannot be had."""
         statistics = self.observations.statistics
         return {} if statistics is None else statistics.columns()
 
-    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Go on with running statistics; episodes start anew.
 
         Raises:
@@ -132,7 +132,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
         """Take saved running statistics, which are all that the state columns are."""
-        self.set_state_columns(columns)
+        self.set_env_state(columns)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""
@@ -223,13 +223,13 @@ class GymnasiumEnv(PAMDPEnv):
         """Return the keys `[N]` and the parameters `[N, num_parameters]`."""
         self.check_action(tensordict)
         dims = self.parameter_dims
-        pressed, parameters = (tensordict.get(name).detach().cpu().numpy() for name in (keys.KEY, keys.DURATION))
+        pressed, parameters = (tensordict.get(name).detach().cpu().numpy() for name in (keys.DISCRETE, keys.PARAMETERS))
         is_own = np.repeat(np.arange(len(dims)), dims) == pressed[:, None]
         is_action = (pressed >= 0) & (pressed < len(dims)) & (np.isfinite(parameters) | ~is_own).all(-1)
         if not is_action.all():
             row = (~is_action).nonzero()[0][0]
             raise ValueError(
-                f"step: environment {row} got key={pressed[row]} (allowed 0 to {len(dims) - 1}), "
+                f"step: environment {row} got discrete={pressed[row]} (allowed 0 to {len(dims) - 1}), "
                 f"parameters={parameters[row].tolist()} (the pressed key's must be finite)"
             )
         return pressed, parameters

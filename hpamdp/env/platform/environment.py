@@ -67,7 +67,7 @@ class PlatformState(NamedTuple):
 class PlatformEnv(PAMDPEnv):
     """Cross the platforms in `num_envs` courses at once.
 
-    Action leaves: `("action", "key")` int64 `[N]`: 0 run, 1 hop, 2 leap; `("action", "duration")` float32 `[N, 3]`: the
+    Action leaves: `("action", "discrete")` int64 `[N]`: 0 run, 1 hop, 2 leap; `("action", "parameters")` float32 `[N, 3]`: the
     run's power in [0, 30] px/s a tick, the distance to hop in [0, 720] px and to leap in [0, 430] px, of which only the
     pressed key's counts (values outside are clipped, NaN and infinite ones refused). A run takes a second, a jump lasts
     until the agent lands. The reward is the distance covered as a share of the course, so 1 is the return of who
@@ -87,7 +87,7 @@ class PlatformEnv(PAMDPEnv):
         ValueError: an argument or action that is out of range; the agents are left as they were.
     """
 
-    key_names: ClassVar[tuple[str, ...]] = ("run", "hop", "leap")
+    discrete_names: ClassVar[tuple[str, ...]] = ("run", "hop", "leap")
     parameter_dims = (1, 1, 1)
     result_keys = (keys.OUTCOME,)
 
@@ -121,11 +121,11 @@ class PlatformEnv(PAMDPEnv):
         """Return the best possible return as `ceiling`."""
         return {"ceiling": 1.0}
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each."""
         return self._state._asdict()
 
-    def set_state_columns(self, columns: Mapping[str, Tensor]) -> None:
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Go on where `state_columns` were taken; with none, episodes start anew.
 
         Raises:
@@ -159,8 +159,8 @@ class PlatformEnv(PAMDPEnv):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.check_action(tensordict)
-        key = tensordict.get(keys.KEY)
-        parameter = self._checked_parameter(key, tensordict.get(keys.DURATION))
+        discrete = tensordict.get(keys.DISCRETE)
+        parameter = self._checked_parameter(discrete, tensordict.get(keys.PARAMETERS))
         before = self._state
         over = before.outcome != ON_THE_WAY
         mask = tensordict.get("_step", None)
@@ -168,21 +168,21 @@ class PlatformEnv(PAMDPEnv):
             over = over | ~mask.reshape(self.num_envs)
         # Where nothing happens any more a short run is simulated, not to wait for a jump.
         rng = counter_rng.key_for(self._seed, counter_rng.NOISE, self._environment, before.episode)
-        after = _act(before, torch.where(over, RUN, key), parameter, rng, self.noise)
+        after = _act(before, torch.where(over, RUN, discrete), parameter, rng, self.noise)
         out_of_time = (after.steps >= self.max_steps) & (after.outcome == ON_THE_WAY)
         after = after._replace(outcome=torch.where(out_of_time, TIME_LIMIT, after.outcome))
         self._state = where(over, before, after)
         return self._read().set(keys.REWARD, ((self._state.x - before.x) / END).unsqueeze(-1))
 
-    def _checked_parameter(self, key: Tensor, parameters: Tensor) -> Tensor:
+    def _checked_parameter(self, discrete: Tensor, parameters: Tensor) -> Tensor:
         """Return the pressed keys' parameters `[N]`, clipped to their bounds."""
-        allowed = key.clamp(0, len(self.key_names) - 1).long()
+        allowed = discrete.clamp(0, len(self.discrete_names) - 1).long()
         parameter = parameters.gather(-1, allowed.unsqueeze(-1)).squeeze(-1)
-        is_action = (key == allowed) & parameter.isfinite()
+        is_action = (discrete == allowed) & parameter.isfinite()
         if not is_action.all():
             row = int((~is_action).nonzero()[0])
             raise ValueError(
-                f"step: environment {row} got key={key[row].item()} (allowed 0, 1, 2), parameters="
+                f"step: environment {row} got discrete={discrete[row].item()} (allowed 0, 1, 2), parameters="
                 f"{parameters[row].tolist()} (the pressed key's must be finite)"
             )
         return parameter.clamp(min=0.0).minimum(self._parameter_high[allowed])
@@ -214,16 +214,16 @@ def _start(episode: Tensor) -> PlatformState:
     )
 
 
-def _act(state: PlatformState, key: Tensor, parameter: Tensor, rng: Tensor, noise: float) -> PlatformState:
+def _act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: Tensor, noise: float) -> PlatformState:
     """Carry out one action `[N]` in every environment; the keys `rng` `[N]` give the random numbers.
 
     The action is simulated at full length, `[T, N]`, and then cut off where something ends it.
     """
     edge = torch.where(state.x < LEFT[2] - _BODY_WIDTH, RIGHT[1], RIGHT[2])
     edge = torch.where(state.x < LEFT[1] - _BODY_WIDTH, RIGHT[0], edge)
-    is_jump = (key != RUN) & (state.x <= edge)  # who has run over the edge falls, whatever the key
+    is_jump = (discrete != RUN) & (state.x <= edge)  # who has run over the edge falls, whatever the key
     first = state.steps * _DRAWS_AN_ACTION
-    rise = torch.where(key == HOP, _HOP_RISE, _LEAP_RISE)
+    rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE)
     push = parameter / (2.0 * rise / _GRAVITY + 1.0) - state.speed
     push = push - noise * _JUMP_NOISE * counter_rng.normal(rng, first).abs()
     rise = rise - noise * _JUMP_NOISE * counter_rng.normal(rng, first + 1).abs()

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.networks import draw_index, mlp
+from hpamdp.policies.shared.networks import mlp, sample_index
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
@@ -59,13 +59,13 @@ class Actor(OnPolicy, Selector):
         self.logits = mlp(specs.observation_dim, hidden_dims, specs.num_options)
         self.critic = mlp(specs.observation_dim, hidden_dims, 1)
         self.to(device)
-        self.optimiser = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
 
     @torch.no_grad()
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return options and log-probabilities `[*B]`: the likeliest where the policy is greedy, else draws."""
         log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
-        option = log_probs.argmax(-1) if is_greedy() else draw_index(log_probs)
+        option = log_probs.argmax(-1) if is_greedy() else sample_index(log_probs)
         return {keys.OPTION: option, LOG_PROB: log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)}
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
@@ -102,5 +102,5 @@ class Actor(OnPolicy, Selector):
         gain = self.surrogate(log_ratio, rows["advantage"]).mean()
         entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
         critic_loss = (self.critic(rows["state"]).squeeze(-1) - rows["target"]).square().mean()
-        self.descend(0.5 * critic_loss - gain - self.entropy * entropy)
+        self.optimizer_step(0.5 * critic_loss - gain - self.entropy * entropy)
         return {"critic": critic_loss.detach(), "entropy": entropy.detach()}

@@ -39,10 +39,10 @@ class EpsilonGreedy(Bandit):
         super().__init__(specs, memory, discount, window)
         self.epsilon_scale, self.epsilon_final = epsilon_scale, epsilon_final
 
-    def draw(self, num: int) -> Tensor:
+    def sample(self, num: int) -> Tensor:
         """Return `num` choices."""
-        device = self.payoffs.counts.device
-        time = self.payoffs.num_decisions + torch.arange(1, num + 1, device=device)
+        device = self.rewards.counts.device
+        time = self.rewards.num_decisions + torch.arange(1, num + 1, device=device)
         is_random = torch.rand(num, device=device) < (self.epsilon_scale / time).clamp(self.epsilon_final, 1.0)
         anything = torch.randint(self.specs.num_options, (num,), device=device)
-        return torch.where(is_random | self.payoffs.is_untried.any(), anything, self.best())
+        return torch.where(is_random | self.rewards.is_untried.any(), anything, self.best())

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, Payoffs
+from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, RewardStatistics
 from hpamdp.specs import PAMDPSpecs
 
 PROBABILITY = "option_probability"  # of the held option when it was chosen
@@ -45,7 +45,7 @@ class Exp3(Bandit):
         super().__init__(specs, memory, discount, window)
         self.out_keys = [*self.out_keys, PROBABILITY]
         self.exploration = exploration
-        self.gains = Payoffs(specs.num_options, memory, discount, window)
+        self.gains = RewardStatistics(specs.num_options, memory, discount, window)
         self.register_buffer("low", torch.tensor(torch.inf, dtype=torch.float64))
         self.register_buffer("high", torch.tensor(-torch.inf, dtype=torch.float64))
 
@@ -60,7 +60,7 @@ class Exp3(Bandit):
         """Return the option with the largest weight."""
         return int(self.gains.sums.argmax())
 
-    def draw(self, num: int) -> Tensor:
+    def sample(self, num: int) -> Tensor:
         """Return `num` choices."""
         return self.probabilities.multinomial(num, replacement=True) if num else self.gains.recent_options.new_zeros(0)
 
@@ -78,9 +78,9 @@ class Exp3(Bandit):
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add to the gains what the finished decisions earned over the probability of their choice."""
         scalars = super().learn(decisions)
-        payoffs = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
-        self.low, self.high = torch.minimum(self.low, payoffs.min()), torch.maximum(self.high, payoffs.max())
-        scaled = (payoffs - self.low) / (self.high - self.low).clamp(min=1e-12)
+        rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
+        self.low, self.high = torch.minimum(self.low, rewards.min()), torch.maximum(self.high, rewards.max())
+        scaled = (rewards - self.low) / (self.high - self.low).clamp(min=1e-12)
         self.gains.add(decisions.get(keys.OPTION), scaled / decisions.get(PROBABILITY))
         named = zip(self.specs.option_names, self.probabilities.tolist(), strict=True)
         chances = {f"probability_{name}": probability for name, probability in named}

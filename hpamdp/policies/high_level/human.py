@@ -15,13 +15,13 @@ from hpamdp.specs import PAMDPSpecs
 class Human(Selector):
     """Choose each option as often as people do in the same situation, also where the policy is greedy."""
 
-    needs: ClassVar[tuple[str, ...]] = ("people",)
+    needs: ClassVar[tuple[str, ...]] = ("human",)
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)
-        self.in_keys = [*self.in_keys, keys.PEOPLE_OPTION]
+        self.in_keys = [*self.in_keys, keys.HUMAN_OPTION]
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return draws `[*B]` from people's shares `[*B, num_options]`."""
-        shares = td.get(keys.PEOPLE_OPTION)
+        shares = td.get(keys.HUMAN_OPTION)
         return shares.flatten(0, -2).multinomial(1).reshape(shares.shape[:-1])

@@ -21,6 +21,6 @@ class LinThompson(LinearBandit):
     `exploration` is the factor of the posteriors' deviation, v of the source; 1 is Bayes.
     """
 
-    def draw(self, mean: Tensor, deviation: Tensor) -> Tensor:
+    def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return draws of the predictions."""
         return mean + self.exploration * deviation * torch.randn_like(mean)

@@ -20,6 +20,6 @@ class LinUCB(LinearBandit):
     `exploration` is the factor of the width, alpha of the source.
     """
 
-    def draw(self, mean: Tensor, deviation: Tensor) -> Tensor:
+    def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return the upper bounds."""
         return mean + self.exploration * deviation

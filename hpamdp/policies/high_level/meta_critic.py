@@ -20,8 +20,8 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.networks import EnsembleMLP, move_towards
-from hpamdp.policies.shared.replay import falling_share
+from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
+from hpamdp.policies.shared.replay import linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -74,12 +74,12 @@ class MetaCritic(Selector):
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
         self.to(device)
-        self.optimiser = torch.optim.Adam(self.critics.parameters(), lr=lr, fused=True)
+        self.optimizer = torch.optim.Adam(self.critics.parameters(), lr=lr, fused=True)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimiser and the replay buffer."""
-        return {"critics": self.optimiser, "buffer": self.buffer}
+        return {"critics": self.optimizer, "buffer": self.buffer}
 
     @property
     def epsilon(self) -> float:
@@ -89,7 +89,7 @@ class MetaCritic(Selector):
             return 1.0
         if self.exploration == "ucb":
             return 0.0
-        return falling_share(after, self.epsilon_decisions, self.epsilon_final)
+        return linear_schedule(after, self.epsilon_decisions, self.epsilon_final)
 
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:
@@ -145,8 +145,8 @@ class MetaCritic(Selector):
             # Each member sees a random half of the rows, which keeps them apart.
             member = torch.rand(*q.shape[:2], 1, device=q.device) < 0.5 if len(q) > 1 else 1.0
         loss = ((q - target).square() * weight * member).sum(-1).mean()
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        self.optimiser.step()
-        move_towards(self.target_critics, self.critics, self.tau)
+        self.optimizer.step()
+        polyak_update(self.target_critics, self.critics, self.tau)
         return loss.detach()

@@ -37,9 +37,9 @@ class Thompson(Bandit):
         super().__init__(specs, memory, discount, window)
         self.exploration = exploration
 
-    def draw(self, num: int) -> Tensor:
+    def sample(self, num: int) -> Tensor:
         """Return `num` choices, each from a draw of its own."""
-        known = self.payoffs
+        known = self.rewards
         noise = torch.randn(num, self.specs.num_options, dtype=torch.float64, device=known.counts.device)
         deviation = self.exploration * known.deviation / known.counts.clamp(min=1e-9).sqrt()
         drawn = known.means + deviation * noise

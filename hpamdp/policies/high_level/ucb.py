@@ -40,9 +40,9 @@ class UCB(Bandit):
         super().__init__(specs, memory, discount, window)
         self.exploration = exploration
 
-    def draw(self, num: int) -> Tensor:
+    def sample(self, num: int) -> Tensor:
         """Return `num` choices made one after another, in random order."""
-        known = self.payoffs
+        known = self.rewards
         pulls = torch.arange(num, device=known.counts.device)
         counts = known.counts.unsqueeze(-1) + pulls
         width = (2.0 * (known.counts.sum() + num).clamp(min=2.0).log() / counts).sqrt()

@@ -60,10 +60,10 @@ class BC(ReplayLearner):
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
         adam = torch.optim.AdamW(self.actor.parameters(), lr=lr, weight_decay=weight_decay, fused=True)
-        self.optimisers = {"actor": adam}
+        self.optimizers = {"actor": adam}
 
-    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Take a step up the likelihood of transitions `[batch_size]`."""
-        of_key, of_parameters = self.actor(sample["state"]).log_prob(sample["key"], sample["unit"])
-        self.descend("actor", -(of_key + of_parameters).mean())
-        return {"key_log_prob": of_key.mean(), "parameter_log_prob": of_parameters.mean()}
+        of_discrete, of_parameters = self.actor(sample["state"]).log_prob(sample["discrete"], sample["unit"])
+        self.optimizer_step("actor", -(of_discrete + of_parameters).mean())
+        return {"discrete_log_prob": of_discrete.mean(), "parameter_log_prob": of_parameters.mean()}

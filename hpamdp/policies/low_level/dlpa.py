@@ -97,44 +97,44 @@ class Planner:
 
     def _plan(self, state: Tensor) -> Plan:
         shape = state.shape[0], self.horizon
-        probability = state.new_full((*shape, self.specs.num_keys), 1.0 / self.specs.num_keys)
+        probability = state.new_full((*shape, self.specs.num_discrete), 1.0 / self.specs.num_discrete)
         mean = state.new_zeros(*shape, self.specs.num_parameters)
         plan = Plan(probability, mean, torch.ones_like(mean))
         for _ in range(self.num_iterations):
-            key, unit = self.sample(plan)
-            plan = self.re_estimate(plan, key, unit, self.returns(state, key, unit))
+            discrete, unit = self.sample(plan)
+            plan = self.re_estimate(plan, discrete, unit, self.returns(state, discrete, unit))
         return plan
 
     def sample(self, plan: Plan) -> tuple[Tensor, Tensor]:
         """Draw keys `[N, S, H]` and parameters `[N, S, H, num_parameters]` in [-1, 1]."""
-        key = plan.probability.flatten(0, 1).multinomial(self.num_samples, replacement=True)
-        key = key.unflatten(0, plan.probability.shape[:2]).transpose(1, 2)
-        noise = torch.randn(*key.shape, self.specs.num_parameters, device=key.device)
-        return key, (plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise).clamp(-1.0, 1.0)
+        discrete = plan.probability.flatten(0, 1).multinomial(self.num_samples, replacement=True)
+        discrete = discrete.unflatten(0, plan.probability.shape[:2]).transpose(1, 2)
+        noise = torch.randn(*discrete.shape, self.specs.num_parameters, device=discrete.device)
+        return discrete, (plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise).clamp(-1.0, 1.0)
 
-    def returns(self, state: Tensor, key: Tensor, unit: Tensor) -> Tensor:
+    def returns(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Return what the model expects of sequences, `[N, S]`, from states `[N, observation_dim]`."""
-        rows = state.repeat_interleave(key.shape[1], 0)
+        rows = state.repeat_interleave(discrete.shape[1], 0)
         total, survival = 0.0, 1.0
-        for h in range(key.shape[2]):
+        for h in range(discrete.shape[2]):
             with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
-                predicted = self.model(rows, key[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
+                predicted = self.model(rows, discrete[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
             ends = predicted.logit.float().sigmoid()
             reward = ends * predicted.terminating + (1.0 - ends) * predicted.continuing
             total = total + self.gamma**h * survival * reward.float()
             survival = survival * (1.0 - ends)
             rows = predicted.next_state
         doubt = self.pessimism * total.std(0, correction=0) if self.pessimism else 0.0
-        return (total.mean(0) - doubt).unflatten(0, key.shape[:2])
+        return (total.mean(0) - doubt).unflatten(0, discrete.shape[:2])
 
-    def re_estimate(self, plan: Plan, key: Tensor, unit: Tensor, returns: Tensor) -> Plan:
+    def re_estimate(self, plan: Plan, discrete: Tensor, unit: Tensor, returns: Tensor) -> Plan:
         """Return the distribution of the elites, each key's parameters from the elites that press it alone.
 
         The parameters of a key that no elite presses stay as they were.
         """
         value, elite = returns.topk(self.num_elites, 1)
-        key, unit = key.take_along_dim(elite[..., None], 1), unit.take_along_dim(elite[..., None, None], 1)
-        pressed = (value / self.temperature).softmax(1)[..., None, None] * F.one_hot(key, self.specs.num_keys)
+        discrete, unit = discrete.take_along_dim(elite[..., None], 1), unit.take_along_dim(elite[..., None, None], 1)
+        pressed = (value / self.temperature).softmax(1)[..., None, None] * F.one_hot(discrete, self.specs.num_discrete)
         weight = pressed @ self.specs.parameter_mask.to(pressed)
         total = weight.sum(1)
         weight = weight / total.clamp(min=1e-8).unsqueeze(1)
@@ -157,7 +157,7 @@ class DLPAPolicy(TensorDictModuleBase):
     def __init__(self, planner: Planner, specs: PAMDPSpecs, epsilon: float) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION, keys.DONE]
-        self.out_keys = [keys.KEY, keys.DURATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.model = planner.model  # whoever copies the policy's weights needs the model's
         self.planner, self.specs, self.epsilon = planner, specs, epsilon
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
@@ -166,7 +166,7 @@ class DLPAPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write key `[*B]` and parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).flatten(0, -2)
-        key = torch.randint(self.specs.num_keys, state.shape[:1], device=state.device)
+        discrete = torch.randint(self.specs.num_discrete, state.shape[:1], device=state.device)
         unit = 2.0 * torch.rand(state.shape[0], self.specs.num_parameters, device=state.device) - 1.0
         is_planned = self.is_trained.expand(state.shape[0])
         over = td.get(keys.DONE, None)
@@ -176,10 +176,10 @@ class DLPAPolicy(TensorDictModuleBase):
         if exploring:
             is_planned = is_planned & (torch.rand(state.shape[0], device=state.device) >= self.epsilon)
         if is_planned.any():
-            key[is_planned], unit[is_planned] = self.press(state[is_planned], exploring)
+            discrete[is_planned], unit[is_planned] = self.press(state[is_planned], exploring)
         shape = td.batch_size
         duration = self.specs.from_unit(unit).reshape(*shape, self.specs.num_parameters)
-        return td.update({keys.ACTION: {"key": key.reshape(shape), "duration": duration}})
+        return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": duration}})
 
     def press(self, state: Tensor, exploring: bool) -> tuple[Tensor, Tensor]:
         """Return the key `[N]` and the parameters `[N, num_parameters]` in [-1, 1] of the plan's first press."""
@@ -234,12 +234,12 @@ class DLPA(Learner):
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.to(device)
-        self.optimiser = torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimiser and the replay buffer."""
-        return {"model": self.optimiser, "buffer": self.buffer}
+        return {"model": self.optimizer, "buffer": self.buffer}
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Store the batch's transitions and, once the warm-up is over, train the model on windows of them."""
@@ -275,8 +275,8 @@ class DLPA(Learner):
         new = TensorDict(
             {
                 "state": rows[keys.OBSERVATION],
-                "key": rows[keys.KEY],
-                "unit": self.specs.to_unit(rows[keys.DURATION]),
+                "discrete": rows[keys.DISCRETE],
+                "unit": self.specs.to_unit(rows[keys.PARAMETERS]),
                 "reward": rows["next", keys.REWARD].squeeze(-1),
                 "next_state": rows["next", keys.OBSERVATION],
                 "terminated": rows["next", keys.TERMINATED].squeeze(-1),
@@ -320,7 +320,7 @@ class DLPA(Learner):
         parts: dict[str, Tensor] = dict.fromkeys(self.weights, torch.zeros((), device=self.frames.device))
         state = windows["state"][:, 0]
         for h, step in enumerate(windows.unbind(1)):
-            predicted = self.model(state, step["key"], step["unit"])
+            predicted = self.model(state, step["discrete"], step["unit"])
             state, terminated = predicted.next_state, step["terminated"]
             change = ((state - step["next_state"]) / self.model.change_scale).square().mean(-1) * ~terminated
             reward = torch.where(terminated, predicted.terminating, predicted.continuing)
@@ -336,9 +336,9 @@ class DLPA(Learner):
 
     def _update(self, losses: dict[str, list[Tensor]]) -> None:
         parts = self.losses(self.windows())
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad(set_to_none=True)
         sum(self.weights[name] * part for name, part in parts.items()).backward()
-        self.optimiser.step()
+        self.optimizer.step()
         self.updates += 1
         for name, part in parts.items():
             losses.setdefault(name, []).append(part.detach())

@@ -27,7 +27,7 @@ class Predictor(nn.Module):
         super().__init__()
         self.form = form
         width = max(specs.parameter_dims)
-        first_dim = specs.observation_dim + specs.num_keys
+        first_dim = specs.observation_dim + specs.num_discrete
         slot_dim = specs.num_parameters if form == "masking" else width
         self.first = nn.Linear(first_dim, hidden_dims[0]) if form == "sequential" else None
         in_dim = hidden_dims[0] if form == "sequential" else first_dim
@@ -37,12 +37,12 @@ class Predictor(nn.Module):
         self.register_buffer("mask", mask.float())
         self.register_buffer("slots", (~mask).to(torch.int8).argsort(dim=-1, stable=True)[:, :width])
 
-    def forward(self, state: Tensor, key: Tensor, unit: Tensor) -> Tensor:
+    def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Apply all members."""
-        own = unit * self.mask[key]
+        own = unit * self.mask[discrete]
         if self.form != "masking":
-            own = own.gather(-1, self.slots[key])
-        x = torch.cat([state, F.one_hot(key, self.mask.shape[0]).to(state.dtype)], -1)
+            own = own.gather(-1, self.slots[discrete])
+        x = torch.cat([state, F.one_hot(discrete, self.mask.shape[0]).to(state.dtype)], -1)
         if self.first is not None:
             x = self.first(x).relu()
         return self.net(torch.cat([x, own], -1))
@@ -75,8 +75,8 @@ class PAMDPModel(nn.Module):
         self.state_scale.copy_(state.std(0).clamp(min=1e-2))
         self.change_scale.copy_((next_state - state).std(0).clamp(min=1e-2))
 
-    def forward(self, state: Tensor, key: Tensor, unit: Tensor) -> Prediction:
+    def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Prediction:
         """Predict one press from states `[B, observation_dim]`, keys `[B]`, parameters `[B, num_parameters]`."""
         scaled = (state - self.state_mean) / self.state_scale
-        change = self.transition(scaled, key, unit)[0] * self.change_scale
-        return Prediction(state + change, *self.outcome(scaled, key, unit).unbind(-1))
+        change = self.transition(scaled, discrete, unit)[0] * self.change_scale
+        return Prediction(state + change, *self.outcome(scaled, discrete, unit).unbind(-1))

@@ -37,7 +37,7 @@ from hpamdp.specs import PAMDPSpecs
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
 # What the ratio needs of a press: the parameters as they were drawn, in units of their bounds, and the log-likelihoods.
-RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB = "raw_parameters", "key_log_prob", "parameter_log_prob"
+RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB = "raw_parameters", "discrete_log_prob", "parameter_log_prob"
 
 
 class HPPOPolicy(TensorDictModuleBase):
@@ -46,18 +46,18 @@ class HPPOPolicy(TensorDictModuleBase):
     def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.KEY, keys.DURATION, RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB]
         self.actor, self.specs = actor, specs
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write key `[*B]`, parameters `[*B, num_parameters]` and what the ratio needs of them."""
         with torch.no_grad():
             distribution = self.actor(td.get(keys.OBSERVATION))
-            key, raw = distribution.mode() if is_greedy() else distribution.sample()
-            key_log_prob, parameter_log_prob = distribution.log_prob(key, raw)
+            discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
+            discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, raw)
             duration = self.specs.from_unit(raw.clamp(-1.0, 1.0))
-        written = {RAW: raw, KEY_LOG_PROB: key_log_prob, PARAMETER_LOG_PROB: parameter_log_prob}
-        return td.update({**written, keys.ACTION: {"key": key, "duration": duration}})
+        written = {RAW: raw, DISCRETE_LOG_PROB: discrete_log_prob, PARAMETER_LOG_PROB: parameter_log_prob}
+        return td.update({**written, keys.ACTION: {"discrete": discrete, "parameters": duration}})
 
 
 class HPPO(OnPolicy, Learner):
@@ -84,7 +84,7 @@ class HPPO(OnPolicy, Learner):
         lr: PositiveFloat,
         lr_final: NonNegativeFloat,
         critic_weight: PositiveFloat,
-        key_entropy: NonNegativeFloat,
+        discrete_entropy: NonNegativeFloat,
         parameter_entropy: NonNegativeFloat,
         entropy_final: Fraction,
         anneal_frames: PositiveInt,
@@ -94,7 +94,11 @@ class HPPO(OnPolicy, Learner):
             raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
         super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
         self.gamma, self.gae_lambda, self.critic_weight = gamma, gae_lambda, critic_weight
-        self.key_entropy, self.parameter_entropy, self.entropy_final = key_entropy, parameter_entropy, entropy_final
+        self.discrete_entropy, self.parameter_entropy, self.entropy_final = (
+            discrete_entropy,
+            parameter_entropy,
+            entropy_final,
+        )
         self.min_scale, self.min_scale_final = min_scale, min_scale_final
         self.lr, self.lr_final, self.anneal_frames = lr, lr_final, anneal_frames
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), initial_scale)
@@ -104,7 +108,7 @@ class HPPO(OnPolicy, Learner):
         self.policy = HPPOPolicy(self.actor, specs)
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.to(device)
-        self.optimiser = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
 
     def value(self, observation: Tensor) -> Tensor:
         """Return V(s), `[B]`."""
@@ -122,7 +126,7 @@ class HPPO(OnPolicy, Learner):
         rows = self.gather(self._rows(batch, mask))
         if rows is None:
             return {}
-        for group in self.optimiser.param_groups:
+        for group in self.optimizer.param_groups:
             group["lr"] = self.lr + progress * (self.lr_final - self.lr)
         entropy_weight = 1.0 + progress * (self.entropy_final - 1.0)
         scalars = self.make_passes(rows, lambda minibatch: self._update(minibatch, entropy_weight))
@@ -148,31 +152,33 @@ class HPPO(OnPolicy, Learner):
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         advantage, target = (each[mask] for each in self.advantages(batch, mask))
-        own = {name: batch.get(name)[mask] for name in (keys.OBSERVATION, RAW, KEY_LOG_PROB, PARAMETER_LOG_PROB)}
-        own |= {"key": batch.get(keys.KEY)[mask], "advantage": advantage, "target": target}
+        own = {name: batch.get(name)[mask] for name in (keys.OBSERVATION, RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB)}
+        own |= {"discrete": batch.get(keys.DISCRETE)[mask], "advantage": advantage, "target": target}
         return TensorDict(own, batch_size=advantage.shape)
 
     def _update(self, rows: TensorDictBase, entropy_weight: float) -> dict[str, Tensor]:
         distribution = self.actor(rows[keys.OBSERVATION])
-        key_log_prob, parameter_log_prob = distribution.log_prob(rows["key"], rows[RAW])
-        key_log_ratio = key_log_prob - rows[KEY_LOG_PROB]
+        discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
+        discrete_log_ratio = discrete_log_prob - rows[DISCRETE_LOG_PROB]
         parameter_log_ratio = parameter_log_prob - rows[PARAMETER_LOG_PROB]
-        gain = self.surrogate(key_log_ratio, rows["advantage"]) + self.surrogate(parameter_log_ratio, rows["advantage"])
-        key_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
-        bonus = self.key_entropy * key_entropy + self.parameter_entropy * parameter_entropy
+        gain = self.surrogate(discrete_log_ratio, rows["advantage"]) + self.surrogate(
+            parameter_log_ratio, rows["advantage"]
+        )
+        discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
+        bonus = self.discrete_entropy * discrete_entropy + self.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(rows[keys.OBSERVATION]).squeeze(-1), rows["target"])
-        self.descend(self.critic_weight * critic_loss - gain.mean() - entropy_weight * bonus)
+        self.optimizer_step(self.critic_weight * critic_loss - gain.mean() - entropy_weight * bonus)
         with torch.no_grad():
             # exp(x) - 1 - x, an estimate of the divergence that is never negative.
-            ratios = (key_log_ratio, parameter_log_ratio)
-            key_kl, parameter_kl = ((ratio.expm1() - ratio).mean() for ratio in ratios)
+            ratios = (discrete_log_ratio, parameter_log_ratio)
+            discrete_kl, parameter_kl = ((ratio.expm1() - ratio).mean() for ratio in ratios)
             clipped = [ratio.expm1().abs() > self.clip for ratio in ratios]
             return {
                 "critic": critic_loss.detach(),
-                "key_entropy": key_entropy.detach(),
+                "discrete_entropy": discrete_entropy.detach(),
                 "scale": distribution.log_scale.mean().exp(),
-                "key_kl": key_kl,
+                "discrete_kl": discrete_kl,
                 "parameter_kl": parameter_kl,
-                "key_clipped": clipped[0].float().mean(),
+                "discrete_clipped": clipped[0].float().mean(),
                 "parameter_clipped": clipped[1].float().mean(),
             }

@@ -34,7 +34,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.networks import KeyCritics, draw_index, mlp, move_towards
+from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, sample_index
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -44,11 +44,11 @@ Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 class HybridDistribution(NamedTuple):
     """Log-probabilities of the keys `[B, num_keys]`; before squashing, mean and deviation `[B, num_parameters]`."""
 
-    key_log_probs: Tensor
+    discrete_log_probs: Tensor
     mean: Tensor
     scale: Tensor
 
-    def draw_parameters(self) -> tuple[Tensor, Tensor]:
+    def sample_parameters(self) -> tuple[Tensor, Tensor]:
         """Draw all keys' parameters in [-1, 1], differentiably, and return them with their log-densities."""
         noise = torch.randn_like(self.mean)
         raw = self.mean + self.scale * noise
@@ -62,7 +62,7 @@ class HybridActor(nn.Module):
 
     def __init__(self, specs: PAMDPSpecs, hidden_dims: list[int], scale_range: tuple[float, float]) -> None:
         super().__init__()
-        self.sizes = [specs.num_keys, specs.num_parameters, specs.num_parameters]
+        self.sizes = [specs.num_discrete, specs.num_parameters, specs.num_parameters]
         self.low, self.high = (math.log(scale) for scale in scale_range)
         self.net = mlp(specs.observation_dim, hidden_dims, sum(self.sizes))
 
@@ -79,7 +79,7 @@ class HSACPolicy(TensorDictModuleBase):
     def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.KEY, keys.DURATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.actor, self.specs = actor, specs
         self.register_buffer("is_random", torch.ones((), dtype=torch.bool))
 
@@ -88,13 +88,13 @@ class HSACPolicy(TensorDictModuleBase):
         """Write key `[*B]` and parameters `[*B, num_parameters]`."""
         distribution = self.actor(td.get(keys.OBSERVATION))
         if is_greedy():
-            key, unit = distribution.key_log_probs.argmax(-1), distribution.mean.tanh()
+            discrete, unit = distribution.discrete_log_probs.argmax(-1), distribution.mean.tanh()
         elif self.is_random:
             unit = 2.0 * torch.rand_like(distribution.mean) - 1.0
-            key = torch.randint(self.specs.num_keys, unit.shape[:-1], device=unit.device)
+            discrete = torch.randint(self.specs.num_discrete, unit.shape[:-1], device=unit.device)
         else:
-            key, unit = draw_index(distribution.key_log_probs), distribution.draw_parameters()[0]
-        return td.update({keys.ACTION: {"key": key, "duration": self.specs.from_unit(unit)}})
+            discrete, unit = sample_index(distribution.discrete_log_probs), distribution.sample_parameters()[0]
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}})
 
 
 class HSAC(ReplayLearner):
@@ -110,11 +110,11 @@ class HSAC(ReplayLearner):
         hidden_dims: list[PositiveInt],
         min_scale: PositiveFloat,
         max_scale: PositiveFloat,
-        key_temperature: PositiveFloat,
+        discrete_temperature: PositiveFloat,
         parameter_temperature: PositiveFloat,
-        tune_key_temperature: bool,
+        tune_discrete_temperature: bool,
         tune_parameter_temperature: bool,
-        key_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0)],
+        discrete_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0)],
         parameter_target_entropy: Annotated[float, Field(lt=math.log(2.0))],
         temperature_lr: PositiveFloat,
         warmup_frames: NonNegativeInt,
@@ -138,23 +138,23 @@ class HSAC(ReplayLearner):
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
         )
-        self.key_target_entropy = key_target_entropy * math.log(specs.num_keys)
+        self.discrete_target_entropy = discrete_target_entropy * math.log(specs.num_discrete)
         self.parameter_target_entropy = parameter_target_entropy
         self.policy_delay, self.tau = policy_delay, tau
 
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale))
-        self.critics = KeyCritics(specs, 2, hidden_dims, is_multipass=True)
+        self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.log_key_temperature = nn.Parameter(
-            torch.tensor(math.log(key_temperature)), requires_grad=tune_key_temperature
+        self.log_discrete_temperature = nn.Parameter(
+            torch.tensor(math.log(discrete_temperature)), requires_grad=tune_discrete_temperature
         )
         self.log_parameter_temperature = nn.Parameter(
             torch.tensor(math.log(parameter_temperature)), requires_grad=tune_parameter_temperature
         )
         self.policy = HSACPolicy(self.actor, specs)
         self.to(device)
-        temperatures = [self.log_key_temperature, self.log_parameter_temperature]
-        self.optimisers = {
+        temperatures = [self.log_discrete_temperature, self.log_parameter_temperature]
+        self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
             "temperatures": torch.optim.Adam(temperatures, lr=temperature_lr, fused=True),
@@ -170,36 +170,36 @@ class HSAC(ReplayLearner):
 
     def temperatures(self) -> tuple[Tensor, Tensor]:
         """Return the weights of the keys' and of the parameters' entropy, which carry no gradient."""
-        return self.log_key_temperature.detach().exp(), self.log_parameter_temperature.detach().exp()
+        return self.log_discrete_temperature.detach().exp(), self.log_parameter_temperature.detach().exp()
 
-    def soft_value(self, critics: KeyCritics, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def soft_value(self, critics: HybridCritics, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the value of states `[B, observation_dim]` and both entropies less their targets, each `[B]`.
 
         V = sum_k pi(k) [min Q(k, x_k) - a log pi(k) - b log pi(x_k)] with drawn x_k: exact over keys, so that only the
         parameters of the key that is executed weigh in the entropy.
         """
-        key_weight, parameter_weight = self.temperatures()
+        discrete_weight, parameter_weight = self.temperatures()
         distribution = self.actor(state)
-        unit, log_density = distribution.draw_parameters()
-        key_log_probs, own_log_density = distribution.key_log_probs, log_density @ critics.mask.T
-        q = critics(state, unit).amin(0) - key_weight * key_log_probs - parameter_weight * own_log_density
-        pi = key_log_probs.exp()
-        key_excess = -(pi * key_log_probs).sum(-1) - self.key_target_entropy
+        unit, log_density = distribution.sample_parameters()
+        discrete_log_probs, own_log_density = distribution.discrete_log_probs, log_density @ critics.mask.T
+        q = critics(state, unit).amin(0) - discrete_weight * discrete_log_probs - parameter_weight * own_log_density
+        pi = discrete_log_probs.exp()
+        discrete_excess = -(pi * discrete_log_probs).sum(-1) - self.discrete_target_entropy
         own_target = self.parameter_target_entropy * critics.mask.sum(-1)
-        return (pi * q).sum(-1), key_excess, -(pi * (own_log_density + own_target)).sum(-1)
+        return (pi * q).sum(-1), discrete_excess, -(pi * (own_log_density + own_target)).sum(-1)
 
-    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics, now and then also actor and temperatures."""
-        q = self.critics.of_key(sample["state"], sample["key"], sample["unit"])
+        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         critic_loss = (q - self._target(sample)).square().mean(-1).sum()
-        self.descend("critics", critic_loss)
-        key_temperature, parameter_temperature = self.temperatures()
+        self.optimizer_step("critics", critic_loss)
+        discrete_temperature, parameter_temperature = self.temperatures()
         scalars = {"critic": critic_loss, "q": q.mean()}
-        scalars |= {"key_temperature": key_temperature, "parameter_temperature": parameter_temperature}
+        scalars |= {"discrete_temperature": discrete_temperature, "parameter_temperature": parameter_temperature}
         if self.updates % self.policy_delay == 0:
             scalars |= self._update_actor(sample["state"])
-            self._update_temperatures(scalars["key_excess"], scalars["parameter_excess"])
-        move_towards(self.target_critics, self.critics, self.tau)
+            self._update_temperatures(scalars["discrete_excess"], scalars["parameter_excess"])
+        polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
 
     def _target(self, batch: TensorDictBase) -> Tensor:
@@ -211,15 +211,15 @@ class HSAC(ReplayLearner):
     def _update_actor(self, state: Tensor) -> dict[str, Tensor]:
         """Let the actor ascend the soft value; return the loss and the mean entropies less their targets."""
         self.critics.requires_grad_(False)
-        value, key_excess, parameter_excess = self.soft_value(self.critics, state)
+        value, discrete_excess, parameter_excess = self.soft_value(self.critics, state)
         loss = -value.mean()
-        self.descend("actor", loss)
+        self.optimizer_step("actor", loss)
         self.critics.requires_grad_(True)
-        return {"actor": loss, "key_excess": key_excess.mean(), "parameter_excess": parameter_excess.mean()}
+        return {"actor": loss, "discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
 
-    def _update_temperatures(self, key_excess: Tensor, parameter_excess: Tensor) -> None:
+    def _update_temperatures(self, discrete_excess: Tensor, parameter_excess: Tensor) -> None:
         """Lower a temperature where its entropy exceeds the target, raise it where it falls short."""
-        loss = self.log_key_temperature * key_excess.detach()
+        loss = self.log_discrete_temperature * discrete_excess.detach()
         loss = loss + self.log_parameter_temperature * parameter_excess.detach()
         if loss.requires_grad:
-            self.descend("temperatures", loss)
+            self.optimizer_step("temperatures", loss)

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
-from hpamdp.policies.shared.networks import KeyCritics, mlp, move_towards
+from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -69,11 +69,11 @@ class IQL(ReplayLearner):
         self.expectile, self.temperature, self.max_weight, self.tau = expectile, temperature, max_weight, tau
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
         self.state_value = mlp(specs.observation_dim, hidden_dims, 1)
-        self.critics = KeyCritics(specs, 2, hidden_dims, is_multipass=True)
+        self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
-        self.optimisers = {
+        self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "state_value": torch.optim.Adam(self.state_value.parameters(), lr=critic_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
@@ -83,22 +83,22 @@ class IQL(ReplayLearner):
         """Return V(s), `[B]`."""
         return self.state_value(observation).squeeze(-1)
 
-    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update V, then Q, then the policy from transitions `[batch_size]`."""
-        state, key, unit = sample["state"], sample["key"], sample["unit"]
+        state, discrete, unit = sample["state"], sample["discrete"], sample["unit"]
         with torch.no_grad():
-            q = self.target_critics.of_key(state, key, unit).amin(0)
+            q = self.target_critics.of_discrete(state, discrete, unit).amin(0)
         excess = q - self.value(state)
         value_loss = (torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile) * excess.square()).mean()
-        self.descend("state_value", value_loss)
+        self.optimizer_step("state_value", value_loss)
         with torch.no_grad():
             advantage = q - self.value(state)
             target = sample["reward"] + sample["discount"] * self.value(sample["next_state"])
-        critics = self.critics.of_key(state, key, unit)
+        critics = self.critics.of_discrete(state, discrete, unit)
         critic_loss = F.mse_loss(critics, target.expand_as(critics))
-        self.descend("critics", critic_loss)
-        move_towards(self.target_critics, self.critics, self.tau)
+        self.optimizer_step("critics", critic_loss)
+        polyak_update(self.target_critics, self.critics, self.tau)
         weight = (self.temperature * advantage).exp().clamp(max=self.max_weight)
-        of_key, of_parameters = self.actor(state).log_prob(key, unit)
-        self.descend("actor", -(weight * (of_key + of_parameters)).mean())
+        of_discrete, of_parameters = self.actor(state).log_prob(discrete, unit)
+        self.optimizer_step("actor", -(weight * (of_discrete + of_parameters)).mean())
         return {"critic": critic_loss, "value": value_loss, "q": q.mean(), "advantage_weight": weight.mean()}

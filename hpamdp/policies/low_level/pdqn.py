@@ -32,8 +32,8 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
-from hpamdp.policies.shared.networks import KeyCritics, mlp, move_towards
-from hpamdp.policies.shared.replay import ReplayLearner, falling_share
+from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
+from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -72,10 +72,10 @@ class ParameterActor(nn.Module):
 class PDQNPolicy(TensorDictModuleBase):
     """The key with the highest Q and its parameters; explores with random presses and noise on the parameters."""
 
-    def __init__(self, actor: ParameterActor, critics: KeyCritics, specs: PAMDPSpecs, noise: float) -> None:
+    def __init__(self, actor: ParameterActor, critics: HybridCritics, specs: PAMDPSpecs, noise: float) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.KEY, keys.DURATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.actor, self.critics, self.specs, self.noise = actor, critics, specs, noise
         self.register_buffer("epsilon", torch.ones(()))
 
@@ -84,14 +84,14 @@ class PDQNPolicy(TensorDictModuleBase):
         """Write key `[*B]` and parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         unit = self.actor(state)
-        key = self.critics(state, unit).amin(0).argmax(-1)
+        discrete = self.critics(state, unit).amin(0).argmax(-1)
         if not is_greedy():
-            is_random = torch.rand(key.shape, device=key.device) < self.epsilon
+            is_random = torch.rand(discrete.shape, device=discrete.device) < self.epsilon
             noisy = (unit + self.noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
             unit = torch.where(is_random.unsqueeze(-1), 2.0 * torch.rand_like(unit) - 1.0, noisy)
-            key = torch.where(is_random, torch.randint_like(key, self.specs.num_keys), key)
-        td.set(keys.KEY, key.reshape(td.batch_size))
-        return td.set(keys.DURATION, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+            discrete = torch.where(is_random, torch.randint_like(discrete, self.specs.num_discrete), discrete)
+        td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
 
 class PDQN(ReplayLearner):
@@ -142,12 +142,12 @@ class PDQN(ReplayLearner):
         self.epsilon_final, self.epsilon_frames = epsilon_final, epsilon_frames
 
         self.actor = ParameterActor(specs, hidden_dims, bounding)
-        self.critics = KeyCritics(specs, 2 if twin_q else 1, hidden_dims, multipass)
+        self.critics = HybridCritics(specs, 2 if twin_q else 1, hidden_dims, multipass)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = PDQNPolicy(self.actor, self.critics, specs, parameter_noise)
         self.to(device)
-        self.optimisers = {
+        self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
@@ -158,7 +158,7 @@ class PDQN(ReplayLearner):
 
     def explore(self, frames: int) -> None:
         """Let the share of random presses fall."""
-        self.policy.epsilon.fill_(falling_share(frames, self.epsilon_frames, self.epsilon_final))
+        self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state after it and the discount of that state's value."""
@@ -171,24 +171,24 @@ class PDQN(ReplayLearner):
         next_state = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
         return rows.update({"reward": reward, "next_state": next_state, "discount": self.gamma**steps * goes_on})
 
-    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics, now and then also the actor and the targets."""
         state = sample["state"]
-        q = self.critics.of_key(state, sample["key"], sample["unit"])
+        q = self.critics.of_discrete(state, sample["discrete"], sample["unit"])
         critic_loss = (q - self._target(sample)).square().mean(-1).sum()
-        self.descend("critics", critic_loss, self.max_grad_norm)
+        self.optimizer_step("critics", critic_loss, self.max_grad_norm)
         scalars = {"critic": critic_loss, "q": q.mean(), "epsilon": self.policy.epsilon}
         if self.updates % self.policy_delay == 0:
             scalars["actor"] = self._update_actor(state)
-            move_towards(self.target_actor, self.actor, self.actor_tau)
-            move_towards(self.target_critics, self.critics, self.critic_tau)
+            polyak_update(self.target_actor, self.actor, self.actor_tau)
+            polyak_update(self.target_critics, self.critics, self.critic_tau)
         return scalars
 
     def _update_actor(self, state: Tensor) -> Tensor:
         """Let the parameters of all keys ascend the sum of their values; return the loss."""
         self.critics.requires_grad_(False)
         loss = -self.critics(state, self.actor(state)).amin(0).sum(-1).mean()
-        self.descend("actor", loss, self.max_grad_norm)
+        self.optimizer_step("actor", loss, self.max_grad_norm)
         self.critics.requires_grad_(True)
         return loss
 

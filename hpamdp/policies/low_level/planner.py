@@ -18,19 +18,19 @@ class PlannerPolicy(TensorDictModuleBase):
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
-        self.in_keys = [keys.ORACLE_KEY, keys.ORACLE_DURATION]
+        self.in_keys = [keys.ORACLE_DISCRETE, keys.ORACLE_PARAMETERS]
         if specs.num_options:
             self.in_keys.append(keys.OPTION)
-        self.out_keys = [keys.KEY, keys.DURATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.specs = specs
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action leaves; the plan's duration stands for every key, of which only the pressed one's counts."""
-        key, duration = td.get(keys.ORACLE_KEY), td.get(keys.ORACLE_DURATION)
-        option = td.get(keys.OPTION) if self.specs.num_options else torch.zeros_like(key[..., 0])
-        key, duration = (plan.gather(-1, option.unsqueeze(-1)).squeeze(-1) for plan in (key, duration))
+        discrete, duration = td.get(keys.ORACLE_DISCRETE), td.get(keys.ORACLE_PARAMETERS)
+        option = td.get(keys.OPTION) if self.specs.num_options else torch.zeros_like(discrete[..., 0])
+        discrete, duration = (plan.gather(-1, option.unsqueeze(-1)).squeeze(-1) for plan in (discrete, duration))
         duration = duration.unsqueeze(-1).expand(*duration.shape, self.specs.num_parameters)
-        return td.update({keys.ACTION: {"key": key, "duration": duration}})
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": duration}})
 
 
 class Planner(Learner):

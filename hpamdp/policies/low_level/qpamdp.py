@@ -31,7 +31,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
-from hpamdp.policies.shared.networks import draw_index
+from hpamdp.policies.shared.networks import sample_index
 from hpamdp.specs import PAMDPSpecs
 
 Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -48,9 +48,9 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
     ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.KEY, keys.DURATION, RAW]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW]
         self.specs, self.phi, self.psi, self.temperature = specs, phi, psi, temperature
-        self.register_buffer("w", torch.zeros(specs.num_keys, 1))
+        self.register_buffer("w", torch.zeros(specs.num_discrete, 1))
         self.register_buffer("theta", torch.full((specs.num_parameters, 1), mean))
         self.register_buffer("sigma", torch.tensor(sigma))
 
@@ -64,12 +64,12 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         observation = td.get(keys.OBSERVATION)
         q, raw = self.phi(observation) @ self.w.T, self.psi(observation) @ self.theta.T
         if is_greedy():
-            key = q.argmax(-1)
+            discrete = q.argmax(-1)
         else:
-            key = draw_index(q / self.temperature)
+            discrete = sample_index(q / self.temperature)
             raw = raw + self.sigma * torch.randn_like(raw)
         duration = self.specs.from_unit(raw.clamp(-1.0, 1.0))
-        return td.update({keys.ACTION: {"key": key, "duration": duration}, RAW: raw})
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": duration}, RAW: raw})
 
 
 class SarsaLambda(SizedByData):
@@ -91,20 +91,20 @@ class SarsaLambda(SizedByData):
         every, errors = torch.arange(num_envs, device=w.device), []
         for t in range(num_steps):
             row = rows[:, t]
-            phi, next_phi, key = row["phi"], row["next_phi"], row["key"]
+            phi, next_phi, discrete = row["phi"], row["next_phi"], row["discrete"]
             weight = row["mask"] / row["mask"].sum().clamp(min=1)
             self.traces *= self.gamma * self.trace_decay
-            self.traces[every, key] += phi
+            self.traces[every, discrete] += phi
             next_q = next_phi @ w.T
             following = (next_q / self.temperature).softmax(-1)
             if t + 1 < num_steps:
-                pressed = F.one_hot(rows["key"][:, t + 1], len(w))
+                pressed = F.one_hot(rows["discrete"][:, t + 1], len(w))
                 following = torch.where(row["done"].unsqueeze(-1), following, pressed)
             following = self.gamma * following * ~row["terminated"].unsqueeze(-1)
-            error = row["reward"] + (following * next_q).sum(-1) - (phi * w[key]).sum(-1)
+            error = row["reward"] + (following * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
             # How far a unit step would move the errors themselves, on average: Dabney and Barto's bound.
             along = torch.einsum("nkf,nf->nk", self.traces, next_phi)
-            change = (following * along).sum(-1) - (self.traces[every, key] * phi).sum(-1)
+            change = (following * along).sum(-1) - (self.traces[every, discrete] * phi).sum(-1)
             step = (1.0 / (change * weight).sum().abs()).clamp(max=self.step_size)
             w = w + step * torch.einsum("n,nkf->kf", error * weight, self.traces)
             self.traces[row["done"]] = 0.0
@@ -261,7 +261,7 @@ class QPAMDP(Learner):
         policy, observation = self.policy, batch[keys.OBSERVATION]
         rows = {
             "phi": policy.phi(observation),
-            "key": batch[keys.KEY],
+            "discrete": batch[keys.DISCRETE],
             "reward": batch["next", keys.REWARD].squeeze(-1),
             "terminated": batch["next", keys.TERMINATED].squeeze(-1),
             "done": batch["next", keys.DONE].squeeze(-1),
@@ -271,7 +271,7 @@ class QPAMDP(Learner):
             rows["next_phi"] = policy.phi(batch["next", keys.OBSERVATION])
         else:
             psi = policy.psi(observation)
-            score = (batch[RAW] - psi @ policy.theta.T) / policy.sigma.square() * self.mask[rows["key"]]
+            score = (batch[RAW] - psi @ policy.theta.T) / policy.sigma.square() * self.mask[rows["discrete"]]
             rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
         return TensorDict(rows, batch_size=mask.shape)
 

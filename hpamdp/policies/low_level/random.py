@@ -17,15 +17,15 @@ class RandomPolicy(TensorDictModuleBase):
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.KEY, keys.DURATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.specs = specs
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action leaves."""
         batch, device = td.batch_size, td.get(keys.OBSERVATION).device
         unit = 2.0 * torch.rand(*batch, self.specs.num_parameters, device=device) - 1.0
-        key = torch.randint(self.specs.num_keys, batch, device=device)
-        return td.update({keys.ACTION: {"key": key, "duration": self.specs.from_unit(unit)}})
+        discrete = torch.randint(self.specs.num_discrete, batch, device=device)
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}})
 
 
 class Random(Learner):

@@ -23,7 +23,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.networks import KeyCritics, mlp, move_towards
+from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -36,16 +36,16 @@ class TD3BCPolicy(TensorDictModuleBase):
     def __init__(
         self,
         actor: nn.Module,
-        critics: KeyCritics,
+        critics: HybridCritics,
         behaviour: nn.Module,
         specs: PAMDPSpecs,
-        key_threshold: float,
+        discrete_threshold: float,
         parameter_noise: float,
     ) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = [keys.OBSERVATION], [keys.KEY, keys.DURATION]
+        self.in_keys, self.out_keys = [keys.OBSERVATION], [keys.DISCRETE, keys.PARAMETERS]
         self.actor, self.critics, self.behaviour, self.specs = actor, critics, behaviour, specs
-        self.log_threshold, self.parameter_noise = torch.tensor(key_threshold).log().item(), parameter_noise
+        self.log_threshold, self.parameter_noise = torch.tensor(discrete_threshold).log().item(), parameter_noise
 
     def is_rare(self, state: Tensor) -> Tensor:
         """Return which keys the data presses too seldom in states `[B, observation_dim]`, bool `[B, num_keys]`."""
@@ -58,11 +58,11 @@ class TD3BCPolicy(TensorDictModuleBase):
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         unit = self.actor(state)
         q = self.critics(state, unit).amin(0)
-        key = q.masked_fill(self.is_rare(state), -torch.inf).argmax(-1)
+        discrete = q.masked_fill(self.is_rare(state), -torch.inf).argmax(-1)
         if not is_greedy():
             unit = (unit + self.parameter_noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
-        td.set(keys.KEY, key.reshape(td.batch_size))
-        return td.set(keys.DURATION, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+        td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
 
 class TD3BC(ReplayLearner):
@@ -77,7 +77,7 @@ class TD3BC(ReplayLearner):
         *,
         hidden_dims: list[PositiveInt],
         behaviour_weight: NonNegativeFloat,
-        key_threshold: Annotated[float, Field(ge=0.0, lt=1.0)],
+        discrete_threshold: Annotated[float, Field(ge=0.0, lt=1.0)],
         target_smoothing: NonNegativeFloat,
         target_smoothing_clip: NonNegativeFloat,
         policy_delay: PositiveInt,
@@ -103,14 +103,14 @@ class TD3BC(ReplayLearner):
         self.behaviour_weight, self.policy_delay, self.tau = behaviour_weight, policy_delay, tau
         self.target_smoothing, self.target_smoothing_clip = target_smoothing, target_smoothing_clip
         self.actor = nn.Sequential(mlp(specs.observation_dim, hidden_dims, specs.num_parameters), nn.Tanh())
-        self.critics = KeyCritics(specs, 2, hidden_dims, is_multipass=True)
-        self.behaviour = mlp(specs.observation_dim, hidden_dims, specs.num_keys)
+        self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
+        self.behaviour = mlp(specs.observation_dim, hidden_dims, specs.num_discrete)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = TD3BCPolicy(self.actor, self.critics, self.behaviour, specs, key_threshold, parameter_noise)
+        self.policy = TD3BCPolicy(self.actor, self.critics, self.behaviour, specs, discrete_threshold, parameter_noise)
         self.register_buffer("parameter_mask", specs.parameter_mask.float())
         self.to(device)
-        self.optimisers = {
+        self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
             "behaviour": torch.optim.Adam(self.behaviour.parameters(), lr=actor_lr, fused=True),
@@ -121,32 +121,32 @@ class TD3BC(ReplayLearner):
         q = self.critics(observation, self.actor(observation)).amin(0)
         return q.masked_fill(self.policy.is_rare(observation), -torch.inf).amax(-1)
 
-    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update critics and keys' frequencies, now and then also the actor and the targets."""
-        state, key, unit = sample["state"], sample["key"], sample["unit"]
-        q = self.critics.of_key(state, key, unit)
+        state, discrete, unit = sample["state"], sample["discrete"], sample["unit"]
+        q = self.critics.of_discrete(state, discrete, unit)
         critic_loss = F.mse_loss(q, self._target(sample).expand_as(q))
-        self.descend("critics", critic_loss)
-        behaviour_loss = F.cross_entropy(self.behaviour(state), key)
-        self.descend("behaviour", behaviour_loss)
+        self.optimizer_step("critics", critic_loss)
+        behaviour_loss = F.cross_entropy(self.behaviour(state), discrete)
+        self.optimizer_step("behaviour", behaviour_loss)
         scalars = {"critic": critic_loss, "q": q.mean(), "behaviour": behaviour_loss}
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(state, key, unit)
-            move_towards(self.target_actor, self.actor, self.tau)
-            move_towards(self.target_critics, self.critics, self.tau)
+            scalars["actor"] = self._update_actor(state, discrete, unit)
+            polyak_update(self.target_actor, self.actor, self.tau)
+            polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
 
-    def _update_actor(self, state: Tensor, key: Tensor, unit: Tensor) -> Tensor:
+    def _update_actor(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Let the parameters ascend the values of the data's keys and stay near the data; return the loss."""
         own = self.actor(state)
         self.critics.requires_grad_(False)
         with torch.no_grad():
             frequency = self.behaviour(state).softmax(-1)
         q = (self.critics(state, own).amin(0) * frequency).sum(-1)
-        distance = ((own - unit).square() * self.parameter_mask[key]).sum(-1)
+        distance = ((own - unit).square() * self.parameter_mask[discrete]).sum(-1)
         # The values in units of their own size, so that the weight means the same whatever the reward's scale.
         loss = (self.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
-        self.descend("actor", loss)
+        self.optimizer_step("actor", loss)
         self.critics.requires_grad_(True)
         return loss
 

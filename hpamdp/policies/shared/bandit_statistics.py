@@ -17,7 +17,7 @@ Memory = Literal["all", "discounted", "sliding_window"]
 Discount = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
-class Payoffs(nn.Module):
+class RewardStatistics(nn.Module):
     """Counts, sums and sums of squares of the options' payoffs.
 
     Source of the forgetting forms: Garivier and Moulines 2011, arXiv 0805.3415, section 2.
@@ -40,7 +40,7 @@ class Payoffs(nn.Module):
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
         size = window if memory == "sliding_window" else 0
         self.register_buffer("recent_options", torch.full((size,), -1, dtype=torch.long))
-        self.register_buffer("recent_payoffs", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("recent_rewards", torch.zeros(size, dtype=torch.float64))
 
     @property
     def means(self) -> Tensor:
@@ -66,24 +66,24 @@ class Payoffs(nn.Module):
         """Return the weights of the last `num` decisions, oldest first, `[num]`."""
         return self.discount ** torch.arange(num - 1, -1, -1, device=self.counts.device).double()
 
-    def add(self, options: Tensor, payoffs: Tensor) -> None:
+    def add(self, options: Tensor, rewards: Tensor) -> None:
         """Take in the payoffs `[N]` of options `[N]`, oldest first."""
         self.num_decisions += len(options)
-        payoffs = payoffs.double()
+        rewards = rewards.double()
         if self.memory == "sliding_window":
             size = len(self.recent_options)
             self.recent_options = torch.cat([self.recent_options, options])[-size:]
-            self.recent_payoffs = torch.cat([self.recent_payoffs, payoffs])[-size:]
+            self.recent_rewards = torch.cat([self.recent_rewards, rewards])[-size:]
             is_filled = self.recent_options >= 0
-            options, payoffs = self.recent_options[is_filled], self.recent_payoffs[is_filled]
+            options, rewards = self.recent_options[is_filled], self.recent_rewards[is_filled]
             for total in (self.counts, self.sums, self.squares):
                 total.zero_()
         weights = self.weights(len(options))
         fade = self.discount ** len(options)
         for total, value in (
             (self.counts, weights),
-            (self.sums, weights * payoffs),
-            (self.squares, weights * payoffs.square()),
+            (self.sums, weights * rewards),
+            (self.squares, weights * rewards.square()),
         ):
             total.mul_(fade).index_add_(0, options, value)
 
@@ -93,15 +93,15 @@ class Bandit(Selector):
 
     def __init__(self, specs: PAMDPSpecs, memory: Memory, discount: float, window: int) -> None:
         super().__init__(specs)
-        self.payoffs = Payoffs(specs.num_options, memory, discount, window)
+        self.rewards = RewardStatistics(specs.num_options, memory, discount, window)
 
-    def draw(self, num: int) -> Tensor:
+    def sample(self, num: int) -> Tensor:
         """Return `num` exploring choices, int64 `[num]`, for decisions that are due at once."""
         raise NotImplementedError
 
     def best(self) -> int:
         """Return the greedy choice."""
-        return self.payoffs.best()
+        return self.rewards.best()
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the choices `[*B]`: the best option where the policy is greedy, else `draw`s."""
@@ -109,10 +109,10 @@ class Bandit(Selector):
         if is_greedy():
             return torch.full_like(is_decision, self.best(), dtype=torch.long)
         choices = torch.zeros_like(is_decision, dtype=torch.long)
-        choices[is_decision] = self.draw(int(is_decision.sum()))
+        choices[is_decision] = self.sample(int(is_decision.sum()))
         return choices
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Take in the finished decisions' payoffs, oldest first; return each option's mean."""
-        self.payoffs.add(decisions.get(keys.OPTION), decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1))
-        return {f"payoff_{name}": self.payoffs.means[i].item() for i, name in enumerate(self.specs.option_names)}
+        self.rewards.add(decisions.get(keys.OPTION), decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1))
+        return {f"reward_{name}": self.rewards.means[i].item() for i, name in enumerate(self.specs.option_names)}

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.bandit_statistics import Discount, Memory, Payoffs
+from hpamdp.policies.shared.bandit_statistics import Discount, Memory, RewardStatistics
 from hpamdp.specs import PAMDPSpecs
 
 Features = Literal["polynomial", "random_fourier"]
@@ -92,11 +92,11 @@ class LinearBandit(Selector):
         super().__init__(specs)
         self.features = ContextFeatures(specs, inputs, features, degree)
         self.exploration, self.ridge = exploration, ridge
-        self.payoffs = Payoffs(specs.num_options, memory, discount, window)
+        self.rewards = RewardStatistics(specs.num_options, memory, discount, window)
         num, dim = specs.num_options, self.features.num_features
         self.register_buffer("gram", torch.zeros(num, dim, dim, dtype=torch.float64))
         self.register_buffer("moment", torch.zeros(num, dim, dtype=torch.float64))
-        size = len(self.payoffs.recent_options)
+        size = len(self.rewards.recent_options)
         self.register_buffer("recent_features", torch.zeros(size, dim, dtype=torch.float64))
 
     def predict(self, observation: Tensor) -> tuple[Tensor, Tensor]:
@@ -111,12 +111,12 @@ class LinearBandit(Selector):
         theta = torch.cholesky_solve((self.moment / size).unsqueeze(-1), factor).squeeze(-1) / size
         # x' A^-1 x is the squared length of L^-1 x.
         spread = torch.linalg.solve_triangular(factor, (x / size.unsqueeze(1)).mT, upper=False)
-        total = self.payoffs.counts.sum().clamp(min=1.0)
+        total = self.rewards.counts.sum().clamp(min=1.0)
         explained = (theta * self.moment).sum() / total
-        noise = (self.payoffs.squares.sum() / total - explained).clamp(min=1e-12).sqrt()
+        noise = (self.rewards.squares.sum() / total - explained).clamp(min=1e-12).sqrt()
         return x @ theta.T, noise * spread.square().sum(1).sqrt().T
 
-    def draw(self, mean: Tensor, deviation: Tensor) -> Tensor:
+    def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return what exploring choices go by, `[B, num_options]`, of which the highest is chosen."""
         raise NotImplementedError
 
@@ -126,27 +126,27 @@ class LinearBandit(Selector):
         mean, deviation = self.predict(observation.flatten(0, -2))
         if not is_greedy():
             # Options never chosen come first, in random order.
-            mean = torch.where(self.payoffs.is_untried, 1e9 + torch.rand_like(mean), self.draw(mean, deviation))
+            mean = torch.where(self.rewards.is_untried, 1e9 + torch.rand_like(mean), self.sample(mean, deviation))
         return mean.argmax(-1).reshape(observation.shape[:-1])
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Take in the finished decisions, oldest first; return each option's mean payoff among them."""
         options = decisions.get(keys.OPTION)
-        payoffs = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
+        rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
         x = self.features(decisions.get(("next", keys.DECISION_OBSERVATION)))
         named = enumerate(self.specs.option_names)
-        scalars = {f"payoff_{n}": payoffs[options == i].mean().item() for i, n in named if (options == i).any()}
-        self._add(options, payoffs, x)
+        scalars = {f"reward_{n}": rewards[options == i].mean().item() for i, n in named if (options == i).any()}
+        self._add(options, rewards, x)
         return scalars
 
-    def _add(self, options: Tensor, payoffs: Tensor, x: Tensor) -> None:
-        known = self.payoffs
-        known.add(options, payoffs)
+    def _add(self, options: Tensor, rewards: Tensor, x: Tensor) -> None:
+        known = self.rewards
+        known.add(options, rewards)
         fade = known.discount ** len(options)
         if known.memory == "sliding_window":
             self.recent_features = torch.cat([self.recent_features, x])[-len(known.recent_options) :]
             is_filled, fade = known.recent_options >= 0, 0.0
-            options, payoffs = known.recent_options[is_filled], known.recent_payoffs[is_filled]
+            options, rewards = known.recent_options[is_filled], known.recent_rewards[is_filled]
             x = self.recent_features[is_filled]
         weights = known.weights(len(options))
         self.gram *= fade
@@ -154,4 +154,4 @@ class LinearBandit(Selector):
         for i in range(self.specs.num_options):
             weighted = x * (weights * (options == i)).unsqueeze(-1)
             self.gram[i] += weighted.T @ x
-            self.moment[i] += weighted.T @ payoffs
+            self.moment[i] += weighted.T @ rewards

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.networks import draw_index
+from hpamdp.policies.shared.networks import sample_index
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -24,32 +24,32 @@ class HybridDistribution(NamedTuple):
     each key's own parameters `[num_keys, num_parameters]`.
     """
 
-    key_log_probs: Tensor
+    discrete_log_probs: Tensor
     mean: Tensor
     log_scale: Tensor
     parameter_mask: Tensor
 
     def sample(self) -> tuple[Tensor, Tensor]:
         """Draw keys `[*B]` and unbounded parameters `[*B, num_parameters]`, those of the other keys too."""
-        return draw_index(self.key_log_probs), self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
+        return sample_index(self.discrete_log_probs), self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
 
     def mode(self) -> tuple[Tensor, Tensor]:
         """Return the likeliest key `[*B]` and the mean parameters `[*B, num_parameters]`."""
-        return self.key_log_probs.argmax(-1), self.mean
+        return self.discrete_log_probs.argmax(-1), self.mean
 
-    def log_prob(self, key: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
+    def log_prob(self, discrete: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
         """Return the log-likelihoods `[*B]` of the key and of its own parameters, 0 where it has none."""
         normal = (
             -0.5 * ((raw - self.mean) / self.log_scale.exp()).square() - self.log_scale - 0.5 * math.log(2 * math.pi)
         )
-        of_key = self.key_log_probs.gather(-1, key.unsqueeze(-1)).squeeze(-1)
-        return of_key, (normal * self.parameter_mask[key]).sum(-1)
+        of_discrete = self.discrete_log_probs.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
+        return of_discrete, (normal * self.parameter_mask[discrete]).sum(-1)
 
     def entropy(self) -> tuple[Tensor, Tensor]:
         """Return the entropies `[*B]` of the key and, in the mean over keys, of a key's own parameters."""
-        probability = self.key_log_probs.exp()
+        probability = self.discrete_log_probs.exp()
         normal = self.log_scale + 0.5 * math.log(2 * math.pi * math.e)
-        return -(probability * self.key_log_probs).sum(-1), ((probability @ self.parameter_mask) * normal).sum(-1)
+        return -(probability * self.discrete_log_probs).sum(-1), ((probability @ self.parameter_mask) * normal).sum(-1)
 
 
 class HybridActor(nn.Module):
@@ -60,7 +60,7 @@ class HybridActor(nn.Module):
     ) -> None:
         super().__init__()
         self.encoder = encoder(specs.observation_dim, hidden_dims)
-        self.key_head = nn.Linear(hidden_dims[-1], specs.num_keys)
+        self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete)
         self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters)
         low, high = (math.log(scale) for scale in scale_range)
         self.register_buffer("log_min_scale", torch.tensor(low))
@@ -68,7 +68,7 @@ class HybridActor(nn.Module):
         share = (math.log(initial_scale) - low) / (high - low)
         with torch.no_grad():
             # Near-uniform keys and mid-range means to begin with.
-            for head in (self.key_head, self.parameter_head):
+            for head in (self.discrete_head, self.parameter_head):
                 head.weight.mul_(0.01)
                 head.bias.zero_()
             self.parameter_head.bias[specs.num_parameters :] = math.log(share / (1.0 - share))
@@ -79,7 +79,7 @@ class HybridActor(nn.Module):
         hidden = self.encoder(observation)
         mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
-        return HybridDistribution(self.key_head(hidden).log_softmax(-1), mean, log_scale, self.parameter_mask)
+        return HybridDistribution(self.discrete_head(hidden).log_softmax(-1), mean, log_scale, self.parameter_mask)
 
     def set_min_scale(self, min_scale: float) -> None:
         """Move the lower end of the range in which the Gaussian's deviation is learned."""
@@ -91,15 +91,17 @@ class HybridPolicy(TensorDictModuleBase):
 
     def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = [keys.OBSERVATION], [keys.KEY, keys.DURATION]
+        self.in_keys, self.out_keys = [keys.OBSERVATION], [keys.DISCRETE, keys.PARAMETERS]
         self.actor, self.specs = actor, specs
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write key `[*B]` and parameters `[*B, num_parameters]`."""
         distribution = self.actor(td.get(keys.OBSERVATION))
-        key, raw = distribution.mode() if is_greedy() else distribution.sample()
-        return td.update({keys.ACTION: {"key": key, "duration": self.specs.from_unit(raw.clamp(-1.0, 1.0))}})
+        discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
+        return td.update(
+            {keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(raw.clamp(-1.0, 1.0))}}
+        )
 
 
 def encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:

@@ -55,19 +55,19 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim))
 
 
-def draw_index(logits: Tensor) -> Tensor:
+def sample_index(logits: Tensor) -> Tensor:
     """Draw from the softmax of logits `[*B, K]`, int64 `[*B]`."""
     # The largest of logit + Gumbel noise is a draw: faster than torch.multinomial, and for any `[*B]`.
     return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
 
 
-def move_towards(target: nn.Module, source: nn.Module, tau: float) -> None:
+def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move a target network's parameters the share `tau` of the way to those of the learned one."""
     for t, s in zip(target.parameters(), source.parameters(), strict=True):
         t.lerp_(s.detach(), tau)
 
 
-class KeyCritics(nn.Module):
+class HybridCritics(nn.Module):
     """`num_members` independent Q(s, k, x) of every key k.
 
     With `is_multipass`, key k's value comes from a pass that sees only x_k, the other parameters being 0.
@@ -78,21 +78,21 @@ class KeyCritics(nn.Module):
         super().__init__()
         self.is_multipass = is_multipass
         input_dim = specs.observation_dim + specs.num_parameters
-        self.net = EnsembleMLP(num_members, input_dim, hidden_dims, specs.num_keys)
+        self.net = EnsembleMLP(num_members, input_dim, hidden_dims, specs.num_discrete)
         self.register_buffer("mask", specs.parameter_mask.float())
 
     def forward(self, state: Tensor, unit: Tensor) -> Tensor:
         """Return the values of all keys, `[E, B, num_keys]`."""
         if not self.is_multipass:
             return self.net(torch.cat([state, unit], -1))
-        num, num_keys = state.shape[0], self.mask.shape[0]
+        num, num_discrete = state.shape[0], self.mask.shape[0]
         own = unit.unsqueeze(1) * self.mask
-        passes = torch.cat([state.unsqueeze(1).expand(-1, num_keys, -1), own], -1)
+        passes = torch.cat([state.unsqueeze(1).expand(-1, num_discrete, -1), own], -1)
         q = self.net(passes.flatten(0, 1))
-        return q.unflatten(1, (num, num_keys)).diagonal(dim1=-2, dim2=-1)
+        return q.unflatten(1, (num, num_discrete)).diagonal(dim1=-2, dim2=-1)
 
-    def of_key(self, state: Tensor, key: Tensor, unit: Tensor) -> Tensor:
+    def of_discrete(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Return the values `[E, B]` of the keys `[B]`."""
-        own = unit * self.mask[key] if self.is_multipass else unit
+        own = unit * self.mask[discrete] if self.is_multipass else unit
         q = self.net(torch.cat([state, own], -1))
-        return q.gather(-1, key.expand(q.shape[0], -1).unsqueeze(-1)).squeeze(-1)
+        return q.gather(-1, discrete.expand(q.shape[0], -1).unsqueeze(-1)).squeeze(-1)

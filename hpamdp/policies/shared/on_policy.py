@@ -24,7 +24,7 @@ class OnPolicy:
         max_grad_norm: of the steps.
     """
 
-    optimiser: torch.optim.Optimizer
+    optimizer: torch.optim.Optimizer
 
     def __init__(
         self, specs: PAMDPSpecs, *, epochs: int, minibatch_size: int, clip: float, max_grad_norm: float
@@ -35,7 +35,7 @@ class OnPolicy:
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimiser."""
-        return {"optimiser": self.optimiser}
+        return {"optimiser": self.optimizer}
 
     def get_extra_state(self) -> list[dict[str, Tensor]]:
         """Return the rows that wait for the next update, for the state dict."""
@@ -71,9 +71,9 @@ class OnPolicy:
         ratio = log_ratio.exp()
         return torch.minimum(ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage)
 
-    def descend(self, loss: Tensor) -> None:
+    def optimizer_step(self, loss: Tensor) -> None:
         """Take a step of the optimiser."""
-        self.optimiser.zero_grad(set_to_none=True)
+        self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
-        self.optimiser.step()
+        self.optimizer.step()

@@ -22,7 +22,7 @@ class ReplayLearner(Learner):
 
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
 
-    optimisers: dict[str, torch.optim.Optimizer]
+    optimizers: dict[str, torch.optim.Optimizer]
 
     def __init__(
         self,
@@ -44,7 +44,7 @@ class ReplayLearner(Learner):
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimisers and the replay buffer."""
-        return {**self.optimisers, "buffer": self.buffer}
+        return {**self.optimizers, "buffer": self.buffer}
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Store the batch's transitions; once the warm-up is over, make the updates that are due."""
@@ -61,11 +61,11 @@ class ReplayLearner(Learner):
         self.explore(frames - self.warmup_frames)
         return self._updates(int(frames * self.updates_per_frame) - int(before * self.updates_per_frame))
 
-    def remember(self, batch: TensorDictBase, mask: Tensor) -> None:
+    def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Store the transitions in `mask`."""
         self.buffer.extend(self.transitions(batch)[mask])
 
-    def practise(self, num_updates: int) -> dict[str, float]:
+    def update(self, num_updates: int) -> dict[str, float]:
         """Make updates from what is stored."""
         if int(self.frames) == int(self.updates) == 0:
             self.start()
@@ -77,7 +77,7 @@ class ReplayLearner(Learner):
             # One draw for all updates: the buffer's own overhead is as long as a forward pass.
             for sample in self.buffer.sample(num_updates * self.batch_size).split(self.batch_size):
                 self.updates += 1
-                for name, value in self.update(sample).items():
+                for name, value in self.train_step(sample).items():
                     losses.setdefault(name, []).append(value.detach())
         scalars = {name: torch.stack(values).mean().item() for name, values in losses.items()}
         return {**scalars, "updates": self.updates.item()}
@@ -87,8 +87,8 @@ class ReplayLearner(Learner):
         return TensorDict(
             {
                 "state": batch[keys.OBSERVATION],
-                "key": batch[keys.KEY],
-                "unit": self.specs.to_unit(batch[keys.DURATION]),
+                "discrete": batch[keys.DISCRETE],
+                "unit": self.specs.to_unit(batch[keys.PARAMETERS]),
                 "reward": batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
                 "discount": self.gamma * ~batch["next", keys.TERMINATED].squeeze(-1),
@@ -102,21 +102,21 @@ class ReplayLearner(Learner):
     def explore(self, frames: int) -> None:
         """Set the policy's exploration, `frames` presses after the warm-up."""
 
-    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Make one update from transitions `[batch_size]`; return scalars to log."""
         raise NotImplementedError
 
-    def descend(self, name: str, loss: Tensor, max_grad_norm: float | None = None) -> None:
+    def optimizer_step(self, name: str, loss: Tensor, max_grad_norm: float | None = None) -> None:
         """Take a step of an optimiser, with gradients scaled down to a norm where one is given."""
-        optimiser = self.optimisers[name]
-        optimiser.zero_grad(set_to_none=True)
+        optimizer = self.optimizers[name]
+        optimizer.zero_grad(set_to_none=True)
         loss.backward()
         if max_grad_norm is not None:
-            parameters = (parameter for group in optimiser.param_groups for parameter in group["params"])
+            parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
             nn.utils.clip_grad_norm_(parameters, max_grad_norm)
-        optimiser.step()
+        optimizer.step()
 
 
-def falling_share(time: int, over: int, final: float) -> float:
+def linear_schedule(time: int, over: int, final: float) -> float:
     """Return a share that falls in a line from 1 to `final` within a time `over`, in frames or decisions."""
     return 1.0 + (final - 1.0) * min(1.0, time / max(1, over))

@@ -23,7 +23,7 @@ class Collection:
         """Collect a batch `[num_envs, steps_per_batch]`."""
         raise NotImplementedError
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return where the environments stand, as their own `state_columns` do."""
         raise NotImplementedError
 

@@ -12,7 +12,7 @@ from torchrl.collectors import MultiSyncCollector
 
 from hpamdp.config import RunConfig
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.worker import Share
+from hpamdp.run.collection.worker import EnvShard
 from hpamdp.run.collection.workers import WorkerCollection, children_without
 
 
@@ -24,7 +24,7 @@ class MultiCollection(WorkerCollection):
     ) -> None:
         super().__init__(cfg, settings, parts, frames, num_workers)
 
-    def _start(self, shares: Sequence[Share], settings: RunConfig) -> MultiSyncCollector:
+    def _start(self, shares: Sequence[EnvShard], settings: RunConfig) -> MultiSyncCollector:
         # multiprocessing unblocks the signals when it starts this helper of its own.
         resource_tracker.ensure_running()
         # A terminal sends its Ctrl-C, and a cluster its stop, to every process of a run.

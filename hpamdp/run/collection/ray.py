@@ -16,7 +16,7 @@ from torchrl.collectors.distributed import RayCollector
 
 from hpamdp.config import RunConfig
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.worker import Share
+from hpamdp.run.collection.worker import EnvShard
 from hpamdp.run.collection.workers import WorkerCollection, children_without
 
 
@@ -38,7 +38,7 @@ class RayCollection(WorkerCollection):
         self.address = address
         super().__init__(cfg, settings, parts, frames, num_workers)
 
-    def _start(self, shares: Sequence[Share], settings: RunConfig) -> RayCollector:
+    def _start(self, shares: Sequence[EnvShard], settings: RunConfig) -> RayCollector:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
         own = {"address": "local", "num_cpus": len(shares), "include_dashboard": False}

@@ -29,9 +29,9 @@ class SingleCollection(Collection):
         """Collect a batch."""
         return next(self._batches)
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return the environment's."""
-        return self.env.state_columns()
+        return self.env.env_state()
 
     def close(self) -> None:
         """Let go of the environment, which stays open."""

@@ -54,7 +54,7 @@ class PolicyCopy(TensorDictModuleBase):
 
 
 @dataclass(frozen=True)
-class Share:
+class EnvShard:
     """A worker's environments and all it takes to build them elsewhere.
 
     Attributes:
@@ -83,7 +83,7 @@ class Share:
             unpack(agent.router, self.low)
         env = make_env(cfg, self.num_envs, _CPU, settings.seed, self.first_env)
         if self.columns:
-            env.set_state_columns(self.columns)
+            env.set_env_state(self.columns)
         return acting(env, agent, settings)[0]
 
     def make_policy(self) -> PolicyCopy:

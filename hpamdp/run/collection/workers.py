@@ -16,7 +16,7 @@ from torch import Tensor
 from hpamdp.config import RunConfig
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection
-from hpamdp.run.collection.worker import Share, packed
+from hpamdp.run.collection.worker import EnvShard, packed
 
 
 class WorkerCollection(Collection):
@@ -29,12 +29,12 @@ class WorkerCollection(Collection):
 
     def __init__(self, cfg: DictConfig, settings: RunConfig, parts: Parts, frames: int, num_workers: int) -> None:
         self._policy, self._device = parts.policy, parts.device
-        self._columns = parts.env.state_columns()
+        self._columns = parts.env.env_state()
         self._collector: Any = None
         self._is_idle = False
         size = settings.num_envs // num_workers
         shares = [
-            Share(
+            EnvShard(
                 OmegaConf.to_container(cfg, resolve=True),
                 parts.agent.specs,
                 first,
@@ -55,7 +55,7 @@ class WorkerCollection(Collection):
         self._batches = iter(self._collector)
         self._is_idle = True
 
-    def _start(self, shares: Sequence[Share], settings: RunConfig) -> Any:
+    def _start(self, shares: Sequence[EnvShard], settings: RunConfig) -> Any:
         """Start a worker for each share, and return TorchRL's collector of them."""
         raise NotImplementedError
 
@@ -76,11 +76,11 @@ class WorkerCollection(Collection):
         """Return what a method of each worker's collector returns."""
         return self._collector.map_fn(method, [arguments] * self._collector.num_workers)
 
-    def state_columns(self) -> dict[str, Tensor]:
+    def env_state(self) -> dict[str, Tensor]:
         """Return the environments' columns, as they were last known if a worker failed."""
         if self._is_idle:
             with uninterrupted():
-                columns = self._call("env.state_columns")
+                columns = self._call("env.env_state")
                 self._columns = {name: torch.cat([share[name] for share in columns]) for name in columns[0]}
         return self._columns
 
