@@ -113,7 +113,9 @@ def compare(
         course = courses[i]
         reward, outcome = course.act(discrete[i], parameter[i][discrete[i]], [noise * number for number in numbers[i]])
         expected = (course.x, course.speed, *course.enemy, COURSE * reward)
-        assert (*state[i], COURSE * rewards[i]) == pytest.approx(expected, abs=0.01), f"environment {i}, discrete {discrete[i]}"
+        assert (*state[i], COURSE * rewards[i]) == pytest.approx(expected, abs=0.01), (
+            f"environment {i}, discrete {discrete[i]}"
+        )
         assert got_outcomes[i] == outcome
         outcomes.append(outcome)
     return reading[keys.OBSERVATION], outcomes

@@ -10,15 +10,15 @@ option's return, bootstrapped where its episode goes on, less a learned value of
 from __future__ import annotations
 
 import math
-from typing import Annotated
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.policies.shared.networks import mlp, sample_index
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
@@ -45,7 +45,7 @@ class Actor(OnPolicy, Selector):
         device: torch.device,
         *,
         hidden_dims: list[PositiveInt],
-        gamma: Annotated[float, Field(gt=0.0, le=1.0)],
+        gamma: PositiveFraction,
         epochs: PositiveInt,
         minibatch_size: PositiveInt,
         clip: PositiveFloat,

@@ -6,13 +6,12 @@ Auer, Cesa-Bianchi and Fischer 2002, figure 3. Forgetting forms: see `Payoffs`.
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import torch
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
+from hpamdp.policies.shared.fractions import Fraction
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -31,7 +30,7 @@ class EpsilonGreedy(Bandit):
         specs: PAMDPSpecs,
         *,
         epsilon_scale: PositiveFloat,
-        epsilon_final: Annotated[float, Field(ge=0.0, le=1.0)],
+        epsilon_final: Fraction,
         memory: Memory,
         discount: Discount,
         window: PositiveInt,

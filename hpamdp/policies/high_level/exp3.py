@@ -10,15 +10,14 @@ Differs from the source:
 
 from __future__ import annotations
 
-from typing import Annotated
-
 import torch
-from pydantic import Field, PositiveInt
+from pydantic import PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, RewardStatistics
+from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 PROBABILITY = "option_probability"  # of the held option when it was chosen
@@ -37,7 +36,7 @@ class Exp3(Bandit):
         self,
         specs: PAMDPSpecs,
         *,
-        exploration: Annotated[float, Field(gt=0.0, le=1.0)],
+        exploration: PositiveFraction,
         memory: Memory,
         discount: Discount,
         window: PositiveInt,

@@ -10,21 +10,20 @@ state, which also tells of the options that were not chosen.
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.replay import linear_schedule
 from hpamdp.specs import PAMDPSpecs
-
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class MetaCritic(Selector):
@@ -51,18 +50,18 @@ class MetaCritic(Selector):
         hidden_dims: list[PositiveInt],
         num_members: PositiveInt,
         exploration: Literal["epsilon", "ucb"],
-        epsilon_final: Share,
+        epsilon_final: Fraction,
         epsilon_decisions: NonNegativeInt,
         ucb_width: NonNegativeFloat,
-        gamma: Annotated[float, Field(gt=0.0, le=1.0)],
-        bootstrap: Share,
+        gamma: PositiveFraction,
+        bootstrap: Fraction,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_decision: PositiveFloat,
         max_updates: PositiveInt,
         warmup_decisions: NonNegativeInt,
         lr: PositiveFloat,
-        tau: Annotated[float, Field(gt=0.0, le=1.0)],
+        tau: PositiveFraction,
     ) -> None:
         super().__init__(specs)
         self.needs_values = bootstrap > 0.0
@@ -83,7 +82,7 @@ class MetaCritic(Selector):
 
     @property
     def epsilon(self) -> float:
-        """Share of random options."""
+        """Fraction of random options."""
         after = int(self.num_decisions) - self.warmup_decisions
         if after < 0:
             return 1.0

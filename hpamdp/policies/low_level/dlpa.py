@@ -33,9 +33,9 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel
+from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
-Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 Form = Literal["parallel", "masking", "sequential"]
 
@@ -205,13 +205,13 @@ class DLPA(Learner):
         state_weight: PositiveFloat,
         reward_weight: PositiveFloat,
         termination_weight: PositiveFloat,
-        rho: Fraction,
+        rho: PositiveFraction,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
         warmup_frames: PositiveInt,
         epsilon: Share,
-        gamma: Fraction,
+        gamma: PositiveFraction,
         horizon: PositiveInt,
         num_samples: PositiveInt,
         num_elites: PositiveInt,

@@ -30,11 +30,10 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
+from hpamdp.policies.shared.fractions import Fraction
 from hpamdp.policies.shared.hybrid_actor import HybridActor, encoder
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
-
-Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 
 # What the ratio needs of a press: the parameters as they were drawn, in units of their bounds, and the log-likelihoods.
 RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB = "raw_parameters", "discrete_log_prob", "parameter_log_prob"

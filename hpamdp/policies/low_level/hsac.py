@@ -34,11 +34,10 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
+from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, sample_index
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
-
-Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class HybridDistribution(NamedTuple):
@@ -122,8 +121,8 @@ class HSAC(ReplayLearner):
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
         policy_delay: PositiveInt,
-        gamma: Fraction,
-        tau: Fraction,
+        gamma: PositiveFraction,
+        tau: PositiveFraction,
         actor_lr: PositiveFloat,
         critic_lr: PositiveFloat,
     ) -> None:

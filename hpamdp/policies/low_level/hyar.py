@@ -18,10 +18,10 @@ Differs from the source:
 from __future__ import annotations
 
 import copy
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -29,11 +29,10 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
+from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
-
-Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the press was random
 
@@ -148,20 +147,20 @@ class HyAR(ReplayLearner):
         codec_lr: PositiveFloat,
         kl_weight: NonNegativeFloat,
         dynamics_weight: NonNegativeFloat,
-        latent_coverage: Fraction,
+        latent_coverage: PositiveFraction,
         correction_threshold: NonNegativeFloat,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
-        gamma: Fraction,
-        tau: Fraction,
+        gamma: PositiveFraction,
+        tau: PositiveFraction,
         actor_lr: PositiveFloat,
         critic_lr: PositiveFloat,
         policy_delay: PositiveInt,
         target_noise: NonNegativeFloat,
         target_noise_clip: NonNegativeFloat,
         exploration_noise: NonNegativeFloat,
-        epsilon_final: Annotated[float, Field(ge=0.0, le=1.0)],
+        epsilon_final: Fraction,
         epsilon_frames: NonNegativeInt,
     ) -> None:
         super().__init__(

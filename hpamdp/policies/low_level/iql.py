@@ -22,12 +22,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
-
-Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class IQL(ReplayLearner):
@@ -46,8 +45,8 @@ class IQL(ReplayLearner):
         expectile: Annotated[float, Field(ge=0.5, lt=1.0)],
         temperature: PositiveFloat,
         max_weight: PositiveFloat,
-        gamma: Fraction,
-        tau: Fraction,
+        gamma: PositiveFraction,
+        tau: PositiveFraction,
         actor_lr: PositiveFloat,
         critic_lr: PositiveFloat,
         warmup_frames: NonNegativeInt,

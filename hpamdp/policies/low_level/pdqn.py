@@ -22,21 +22,20 @@ target here are functions of parameters that another network, with a target and 
 from __future__ import annotations
 
 import copy
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
+from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
-
-Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class InvertingGradients(torch.autograd.Function):
@@ -117,14 +116,14 @@ class PDQN(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
-        gamma: Fraction,
+        gamma: PositiveFraction,
         actor_lr: PositiveFloat,
         critic_lr: PositiveFloat,
-        actor_tau: Fraction,
-        critic_tau: Fraction,
+        actor_tau: PositiveFraction,
+        critic_tau: PositiveFraction,
         max_grad_norm: PositiveFloat | None,
         parameter_noise: NonNegativeFloat,
-        epsilon_final: Annotated[float, Field(ge=0.0, le=1.0)],
+        epsilon_final: Fraction,
         epsilon_frames: NonNegativeInt,
     ) -> None:
         super().__init__(

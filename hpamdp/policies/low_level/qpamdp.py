@@ -31,10 +31,9 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
+from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import sample_index
 from hpamdp.specs import PAMDPSpecs
-
-Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 RAW = "raw_parameters"  # the parameters as they were drawn, in units of their bounds: [-1, 1] before clipping
 SARSA, PARAMETERS = 0, 1  # the phases
@@ -182,8 +181,8 @@ class QPAMDP(Learner):
         warmup_frames: PositiveInt,
         initial_episodes: PositiveInt,
         relearning_episodes: PositiveInt,
-        gamma: Fraction,
-        trace_decay: Annotated[float, Field(ge=0.0, le=1.0)],
+        gamma: PositiveFraction,
+        trace_decay: Fraction,
         step_size: PositiveFloat,
         temperature: PositiveFloat,
         parameter_updates: PositiveInt | None,
@@ -195,7 +194,7 @@ class QPAMDP(Learner):
         initial_mean: Annotated[float, Field(ge=-1.0, le=1.0)],
         sigma: PositiveFloat,
         sigma_final: PositiveFloat,
-        sigma_decay: Fraction,
+        sigma_decay: PositiveFraction,
     ) -> None:
         super().__init__(specs)
         if features is not None and not all(i < specs.observation_dim for i in features):

@@ -23,11 +23,10 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
+from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
-
-Fraction = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
 class TD3BCPolicy(TensorDictModuleBase):
@@ -82,8 +81,8 @@ class TD3BC(ReplayLearner):
         target_smoothing_clip: NonNegativeFloat,
         policy_delay: PositiveInt,
         parameter_noise: NonNegativeFloat,
-        gamma: Fraction,
-        tau: Fraction,
+        gamma: PositiveFraction,
+        tau: PositiveFraction,
         actor_lr: PositiveFloat,
         critic_lr: PositiveFloat,
         warmup_frames: NonNegativeInt,
