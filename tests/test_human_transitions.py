@@ -20,6 +20,7 @@ from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
 from hpamdp.data.human.transitions import TRAJECTORY, transitions
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.episode import FUEL
 from hpamdp.env.decisions import with_decisions
 
 REAL = os.environ.get(PATH_VARIABLE)
@@ -116,9 +117,9 @@ def test_fuel_counts_logged_presses_until_the_recorded_tank_says_what_was_left(d
             assert data.episodes["presses"][number] == 0
             continue
         spent = rows[keys.PARAMETERS].sum(1).cumsum(0)
-        torch.testing.assert_close(rows["next", keys.FUEL][:-1, 0], 1 - spent[:-1] / physics.TANK, atol=1e-5, rtol=0)
-        assert rows[keys.FUEL][0] == 1.0
-        assert rows["next", keys.FUEL][-1, 0] == pytest.approx(data.episodes["tank"][number].item() / 360)
+        torch.testing.assert_close(rows["next", FUEL][:-1, 0], 1 - spent[:-1] / physics.TANK, atol=1e-5, rtol=0)
+        assert rows[FUEL][0] == 1.0
+        assert rows["next", FUEL][-1, 0] == pytest.approx(data.episodes["tank"][number].item() / 360)
 
 
 def test_only_one_frame_and_known_forms_are_taken(path, data):

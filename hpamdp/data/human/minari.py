@@ -16,7 +16,7 @@ from hpamdp import keys
 from hpamdp.data.human.errors import HumanDataError
 from hpamdp.data.human.transitions import TRAJECTORY
 from hpamdp.env.boatdock import physics
-from hpamdp.env.boatdock.episode import SCALED_NAMES
+from hpamdp.env.boatdock.episode import FUEL, SCALED_NAMES
 from hpamdp.env.registration import BOAT_DOCK_ID
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def _episode(rows: TensorDict, has_choice: bool) -> dict[str, Any]:
         "rewards": rows["next", keys.REWARD].squeeze(-1).numpy(),
         "terminations": rows["next", keys.TERMINATED].squeeze(-1).numpy(),
         "truncations": rows["next", keys.TRUNCATED].squeeze(-1).numpy(),
-        "infos": {keys.OUTCOME: with_last(keys.OUTCOME), keys.FUEL: with_last(keys.FUEL)},
+        "infos": {keys.OUTCOME: with_last(keys.OUTCOME), FUEL: with_last(FUEL)},
     }
 
 
@@ -111,7 +111,7 @@ def _rows(episode: minari.EpisodeData, number: int) -> TensorDict:
     num = len(episode.rewards)
     column = {name: torch.as_tensor(value) for name, value in episode.infos.items()}
     column[keys.OBSERVATION] = torch.as_tensor(episode.observations)
-    now = {name: column[name][:-1] for name in (keys.OBSERVATION, keys.OUTCOME, keys.FUEL)}
+    now = {name: column[name][:-1] for name in (keys.OBSERVATION, keys.OUTCOME, FUEL)}
     then = {name: column[name][1:] for name in now}
     terminated, truncated = (torch.as_tensor(end)[:, None] for end in (episode.terminations, episode.truncations))
     ends = {keys.TERMINATED: terminated, keys.TRUNCATED: truncated, keys.DONE: terminated | truncated}

@@ -7,7 +7,7 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -18,13 +18,17 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.episode import BoatState, Rules
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
+from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.columns import where
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
@@ -68,7 +72,28 @@ class BoatDockEnv(PAMDPEnv):
     can_change_option: ClassVar[bool] = False
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
-    result_keys: ClassVar[tuple[str, ...]] = (keys.OUTCOME, keys.FUEL)
+    result_keys: ClassVar[tuple[str, ...]] = (keys.OUTCOME, episode.FUEL)
+    choice_setting: ClassVar[str] = "env.controller=choose"
+    no_choice_setting: ClassVar[str] = "env.controller=congruent, incongruent, random"
+    table_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "score"),
+        Metric("human_normalised", "random 0, people 1"),
+        Metric("success", "success", "share"),
+        Metric("too_fast", "too fast", "share"),
+        Metric("out_of_bounds", "out of bounds", "share"),
+        Metric("out_of_fuel", "out of fuel", "share"),
+        Metric("time_limit", "time limit", "share"),
+        Metric("steps", "presses an episode", "count"),
+        Metric("option_congruent", "congruent boat", "share"),
+        Metric("oracle_agreement", "oracle's choice", "share"),
+        Metric("optimality_gap", "gap to the ceiling"),
+    )
+    curve_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "Score"),
+        Metric("success", "Episodes that succeed", "share"),
+        Metric("oracle_agreement", "Better boat chosen", "share"),
+        Metric("option_congruent", "Congruent boat chosen", "share"),
+    )
 
     def __init__(
         self,
@@ -138,7 +163,7 @@ class BoatDockEnv(PAMDPEnv):
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `outcome`, `fuel` (fraction), `score` and `success` `[M]` of finished (or abandoned) episodes."""
-        outcome, fuel = last.get(keys.OUTCOME), last.get(keys.FUEL).squeeze(-1)
+        outcome, fuel = last.get(keys.OUTCOME), last.get(episode.FUEL).squeeze(-1)
         score = harbour.score(outcome, fuel)
         return {"outcome": outcome, "fuel": fuel, "score": score, "success": outcome == physics.SUCCESS}
 
@@ -160,7 +185,31 @@ class BoatDockEnv(PAMDPEnv):
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of `measure_boats`."""
-        return measure_boats(played)
+        return measure_boats(played, self._controller_of_run)
+
+    @property
+    def _controller_of_run(self) -> str:
+        """`chosen`, where the agent chooses, else as set."""
+        return "chosen" if self.has_choice else self.rules.controller
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return the figures of people, of the best of them and of the ceiling on the same layouts."""
+        ceiling = {**super().references(measured)["ceiling"], "success": 1.0}
+        ceiling["human_normalised"] = human_normalised(ceiling["score"], self._controller_of_run)
+        if self.has_choice:
+            ceiling["oracle_agreement"] = 1.0
+        return {**human_references(self._controller_of_run), "ceiling": ceiling}
+
+    def summary_entries(self) -> dict[str, str]:
+        """Return which `controller` the boats have, `chosen` where the agent chooses."""
+        return {"controller": self._controller_of_run}
+
+    @classmethod
+    def draw_figures(cls, evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
+        """Return `trajectories.png` and, where the agent chose its boat, `choices.png`."""
+        from hpamdp.env.boatdock import figures  # matplotlib takes long to import
+
+        return figures.draw(evaluation, summary)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns."""
