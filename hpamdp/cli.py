@@ -70,6 +70,9 @@ def main() -> None:
 
     Exits with 0, 1 (a bug, with its traceback), 2 (a user's mistake, told in one line) or 130 (interrupted).
     """
+    # Classes of one's own may lie in the working directory, as with `python -m`.
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
     # Hydra then raises what it would print, in several lines, itself.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # TorchRL logs every replay buffer that it fills.
@@ -270,3 +273,7 @@ def _no_such_key(cfg: DictConfig, path: list[str], name: str, node: dict[str, An
         file = f"conf/{path[0]}/{cfg.hydra.runtime.choices[path[0]]}.yaml"
         return no_such_option(node, name, file)
     return no_such(f"value of {'.'.join(path)}", name, node)
+
+
+if __name__ == "__main__":
+    main()
