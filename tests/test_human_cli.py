@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 from hpamdp.data.human import cli as human
 from hpamdp.data.human.download import download
-from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import PATH_VARIABLE, read
 from hpamdp.data.human.transitions import transitions
 
@@ -192,7 +192,7 @@ def address(server: Server) -> str:
 def test_an_interrupted_download_goes_on_where_it_stopped(server, tmp_path, honours_range):
     server.breaks_after, server.honours_range = 100_000, honours_range
     target, checksum = tmp_path / "cache" / "people.mat", hashlib.sha256(server.body).hexdigest()
-    with pytest.raises(HumanDataError, match=r"broke after 100000 of 300000 bytes.*; 100000 bytes are kept"):
+    with pytest.raises(DataError, match=r"broke after 100000 of 300000 bytes.*; 100000 bytes are kept"):
         download(address(server), target, checksum=checksum)
     assert not target.exists()
     assert download(address(server), target, checksum=checksum) == target
@@ -203,7 +203,7 @@ def test_an_interrupted_download_goes_on_where_it_stopped(server, tmp_path, hono
 
 
 def test_a_download_of_another_file_is_thrown_away(server, tmp_path):
-    with pytest.raises(HumanDataError, match="truncated, altered or another file"):
+    with pytest.raises(DataError, match="truncated, altered or another file"):
         download(address(server), tmp_path / "people.mat")
     assert not list(tmp_path.iterdir())
 

@@ -8,7 +8,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
-from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import SHA256, check_sum, default_path, load_bytes
 
 _CHUNK = 1 << 16
@@ -24,7 +24,7 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
     What arrived of an interrupted download stays beside the target as `.part`, and the next call goes on from there.
 
     Raises:
-        HumanDataError: it cannot be had, or is not the released file.
+        DataError: it cannot be had, or is not the released file.
     """
     target = default_path() if target is None else target
     if target.exists():
@@ -38,15 +38,15 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
     except OSError as error:  # urllib's errors are OSErrors, too
         reason = getattr(error, "reason", None) or error.strerror or error
         kept = part.stat().st_size if part.exists() else 0
-        raise HumanDataError(
+        raise DataError(
             f"{url}: cannot be fetched ({reason}); {kept} bytes are kept in {part}. Without a network, put the file at "
             f"{target} by hand"
         ) from error
     except (http.client.HTTPException, ValueError) as error:
-        raise HumanDataError(f"{url}: cannot be fetched ({error})") from error
+        raise DataError(f"{url}: cannot be fetched ({error})") from error
     try:
         check_sum(data, checksum, part)
-    except HumanDataError:
+    except DataError:
         part.unlink()  # it would be gone on with for ever
         raise
     part.replace(target)
