@@ -46,7 +46,7 @@ wheel: $(SLOW)/.installed
 	$(SLOW)/bin/python -m build --outdir $(SLOW)/wheel .
 	$(SLOW)/bin/python -m pip install --quiet --no-deps --target $(SLOW)/wheel/site $(SLOW)/wheel/*.whl
 	cd $(SLOW)/wheel && PYTHONPATH=site ../bin/python -c 'import hpamdp; assert "wheel/site" in hpamdp.__file__'
-	cd $(SLOW)/wheel && PYTHONPATH=site ../bin/python -m hpamdp.main \
+	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp \
 	    high=ucb low=hyar total_frames=1024 num_envs=32 eval.layouts=10 eval.every=0
 
 # The quick tests with the lowest versions that pyproject.toml allows.
