@@ -110,8 +110,8 @@ def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
             sys.exit(sweep.report(start, error))
         if isinstance(error, RuntimeError) and "srun" in str(error):  # which submitit looks for
             raise ConfigError(f"hydra/launcher=submitit_slurm: {error}") from error
-        is_about_words = isinstance(error, HydraException | OmegaConfBaseException | yaml.YAMLError | OSError)
-        if is_about_words and not has_started:
+        # Once a job has started, such errors are not about the command line.
+        if not has_started and isinstance(error, HydraException | OmegaConfBaseException | yaml.YAMLError | OSError):
             raise ConfigError(_explain(error, conf, arguments)) from error
         raise
     if sweep.has_begun(start):
@@ -144,7 +144,7 @@ def _parse() -> argparse.Namespace:
         raise ConfigError(f"{message}; see --help")
 
     parser = get_args_parser()
-    parser.error = refuse
+    parser.error = refuse  # type: ignore[method-assign]  # Hydra makes the parser, and its own prints two lines
     arguments = parser.parse_args()
     flags = ("run", "multirun", "cfg", "info", "shell_completion")
     given = [f"--{flag.replace('_', '-')}" for flag in flags if getattr(arguments, flag)]
@@ -181,7 +181,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
 
     output_dir = Path(job.runtime.output_dir)
     try:
-        code = train.run(cfg, output_dir, OmegaConf.to_container(job.overrides.task))
+        code = train.run(cfg, output_dir, list(job.overrides.task))
     except ConfigError as error:
         # Not raised any further: Hydra would announce it in a line of its own.
         with suppress(OSError):

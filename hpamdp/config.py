@@ -13,7 +13,7 @@ import json
 import linecache
 import re
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
@@ -188,7 +188,7 @@ class Component:
         """
         if self.cls is None:
             return None
-        accepted = inspect.signature(self.cls.__init__).parameters
+        accepted = constructor_arguments(self.cls)
         supplied = {name: value for name, value in context.items() if name in accepted}
         try:
             return self.cls(**supplied, **self.options)
@@ -244,7 +244,7 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     for group in GROUPS:
         if cfg.get(group) is None or _TARGET not in cfg[group]:
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
-    plain = _plain(OmegaConf.masked_copy(cfg, [key for key in cfg if key != "hydra"]))
+    plain = _plain(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]))
     values = {name: value for name, value in plain.items() if name not in GROUPS}
     values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
@@ -306,7 +306,7 @@ def compose_saved(saved: Mapping[str, Any]) -> tuple[DictConfig, dict[str, str]]
     values = dict(saved)
     for group in GROUPS:
         options = {name: value for name, value in saved[group].items() if name != "name"}
-        values[group] = {**OmegaConf.to_container(today[group]), **options}
+        values[group] = {**{str(key): value for key, value in today[group].items()}, **options}
     return OmegaConf.create(values), choices
 
 
@@ -323,6 +323,12 @@ def _compose(overrides: list[str]) -> DictConfig:
         raise ConfigError(
             f"the saved run chose {error.missing_cfg_file}, which is not there; is a --config-dir missing?"
         ) from error
+
+
+def constructor_arguments(cls: type) -> dict[str, inspect.Parameter]:
+    """Return the arguments of a class's constructor, without `self`."""
+    constructor: Callable[..., None] = cls.__init__  # type: ignore[misc]  # a subclass's may differ, but this is `cls`
+    return dict(list(inspect.signature(constructor).parameters.items())[1:])
 
 
 def load_class(dotted: str) -> type:
@@ -384,9 +390,9 @@ def _plain(node: Any, where: str = "the config") -> dict[str, Any]:
 
 def _schema(cls: type, supplied: Iterable[str]) -> type[BaseModel]:
     """Return a model with a field for each argument of the constructor that the program does not supply."""
-    hints = get_type_hints(cls.__init__, include_extras=True)
+    hints = get_type_hints(cls.__init__, include_extras=True)  # type: ignore[misc]  # as in `constructor_arguments`
     fields: dict[str, Any] = {}
-    for name, argument in list(inspect.signature(cls.__init__).parameters.items())[1:]:
+    for name, argument in constructor_arguments(cls).items():
         if name in supplied or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
             continue
         default = ... if argument.default is argument.empty else argument.default

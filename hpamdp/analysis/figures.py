@@ -33,7 +33,7 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
     summary = _read_summary(output_dir / "summary.json")
     rows = read_rows(output_dir / "metrics.csv")
     evaluation = _read_evaluation(output_dir / "evaluation.npz")
-    with mpl.rc_context(dict(STYLE)):
+    with mpl.rc_context(STYLE):
         curves = _learning_curves(rows, summary, env.curve_metrics)
         figures = {} if curves is None else {"learning_curves.png": curves}
         figures |= env.draw_figures(evaluation, summary)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -18,7 +17,7 @@ REFERENCES = {
     "ceiling": ("ceiling", "#2b2b2b", "-"),
 }
 
-STYLE: Mapping[str, Any] = {
+STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 10,
     "axes.titlelocation": "left",
@@ -43,8 +42,15 @@ def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1
     labels = sorted(labels)
     heights = [(height - low) / (high - low) for height, _, _ in labels]
     for height, place, (_, text, colour) in zip(heights, _apart(heights, 0.064), labels, strict=True):
-        leader = {"color": colour, "linewidth": 0.7, "clip_on": False, "transform": axes.transAxes}
-        axes.plot([ends, 1.03], [height, place], alpha=0.7, **leader)
+        axes.plot(
+            [ends, 1.03],
+            [height, place],
+            color=colour,
+            linewidth=0.7,
+            alpha=0.7,
+            clip_on=False,
+            transform=axes.transAxes,
+        )
         axes.annotate(text, (1.04, place), xycoords="axes fraction", color=colour, va="center", fontsize=8.5)
 
 

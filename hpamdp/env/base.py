@@ -172,16 +172,20 @@ class PAMDPEnv(EnvBase):
         Raises:
             ValueError: a leaf is missing, or has another shape or type.
         """
-        n = self.batch_size
-        shapes = {keys.DISCRETE: n, keys.PARAMETERS: (*n, sum(self.parameter_dims))}
-        for name, shape in ({**shapes, keys.OPTION: n} if self.has_choice else shapes).items():
+        shapes: dict[str | tuple[str, str], tuple[int, ...]] = {
+            keys.DISCRETE: tuple(self.batch_size),
+            keys.PARAMETERS: (*self.batch_size, sum(self.parameter_dims)),
+        }
+        if self.has_choice:
+            shapes[keys.OPTION] = tuple(self.batch_size)
+        for name, shape in shapes.items():
             value = tensordict.get(name)
             if value is None or value.shape != shape:
-                given = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
+                given_shape = None if value is None else list(value.shape)
+                raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
             if name != keys.PARAMETERS and (value.is_floating_point() or value.dtype == torch.bool):
-                given = str(value.dtype).removeprefix("torch.")
-                raise ValueError(f"step: {name} has type {given}, but must be integer")
+                given_type = str(value.dtype).removeprefix("torch.")
+                raise ValueError(f"step: {name} has type {given_type}, but must be integer")
 
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import inspect
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from hpamdp.config import Config, ConfigError
+from hpamdp.config import Config, ConfigError, constructor_arguments
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
@@ -79,7 +78,7 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
         ConfigError: an option that the constructor refuses, or something that this environment does not have.
     """
     assert config.env.cls is not None
-    arguments = inspect.signature(config.env.cls.__init__).parameters
+    arguments = constructor_arguments(config.env.cls)
     needs = {}
     for level in (config.high, config.low):
         for name in getattr(level.cls, "needs", ()):

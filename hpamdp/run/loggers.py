@@ -9,10 +9,20 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 from urllib.parse import urlsplit
 
-from hpamdp.messages import warn
+from hpamdp.messages import first_line, warn
 
 # Seconds that an online wandb run may keep the training waiting, at its start and at its end.
 _WANDB_START, _WANDB_FINISH = 20.0, 60.0
+
+WandbMode = Literal["offline", "online", "disabled"]
+# What WANDB_MODE may say; two names are wandb's older ones.
+_WANDB_MODES: dict[str, WandbMode] = {
+    "online": "online",
+    "offline": "offline",
+    "disabled": "disabled",
+    "run": "online",
+    "dryrun": "offline",
+}
 
 
 class Logger(Protocol):
@@ -117,27 +127,36 @@ class WandbLogger:
         import wandb
 
         output_dir.mkdir(parents=True, exist_ok=True)  # wandb goes to a temporary folder where this one is missing
-        settings = wandb.Settings(
+        wandb_settings = wandb.Settings(
             silent=True,
             console="off",
             init_timeout=_WANDB_START,
             login_timeout=_WANDB_START,
             finish_timeout=_WANDB_FINISH,
         )
-        where = {"project": project, "entity": entity, "group": group, "name": name, "dir": str(output_dir)}
-        # Told to `setup` too: that silences the login and keeps an offline run from reporting its use over the network.
-        settings.mode = _wandb_mode(mode, wandb.setup(settings).settings.base_url)
-        wandb.setup(settings)
+
+        def start(chosen: WandbMode) -> wandb.Run:
+            # `setup` needs the mode, too: it silences the login, and keeps an offline run from reporting its use.
+            wandb_settings.mode = chosen
+            wandb.setup(wandb_settings)
+            return wandb.init(
+                project=project,
+                entity=entity,
+                group=group,
+                name=name,
+                dir=str(output_dir),
+                config=config,
+                settings=wandb_settings,
+            )
+
+        chosen = _wandb_mode(mode, wandb.setup(wandb_settings).settings.base_url)
         try:
-            self._run = wandb.init(**where, config=config, settings=settings)
+            self._run = start(chosen)
         except wandb.errors.Error as error:
-            if settings.mode != "online":
+            if chosen != "online":
                 raise
-            reason, _, _ = str(error).partition("\n")
-            warn(f"wandb could not start online, the run is logged offline: {reason}")
-            settings.mode = "offline"
-            wandb.setup(settings)
-            self._run = wandb.init(**where, config=config, settings=settings)
+            warn(f"wandb could not start online, the run is logged offline: {first_line(error)}")
+            self._run = start("offline")
         self._image = wandb.Image
         self._step = 0
 
@@ -164,13 +183,17 @@ class WandbLogger:
         self._run.finish()
 
 
-def _wandb_mode(mode: str, server: str) -> str:
+def _wandb_mode(mode: str, server: str) -> WandbMode:
+    given = mode
     if mode == "auto":
-        mode = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
-    if mode == "online" and not _has_wandb_key(server):
+        given = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
+    if given not in _WANDB_MODES:
+        raise ValueError(f"WANDB_MODE={given}: must be one of {', '.join(_WANDB_MODES)}")
+    chosen = _WANDB_MODES[given]
+    if chosen == "online" and not _has_wandb_key(server):
         warn("wandb has no API key (WANDB_API_KEY or netrc), the run is logged offline")
         return "offline"
-    return mode
+    return chosen
 
 
 def _has_wandb_key(server: str) -> bool:

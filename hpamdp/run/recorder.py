@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.analysis import figures
@@ -71,7 +71,8 @@ class Recorder:
     def finish(self, frames: int, wall_s: float, cpu_s: float, is_finished: bool) -> str:
         """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
         played = self._play()
-        np.savez_compressed(self.output_dir / "evaluation.npz", **played)
+        arrays: dict[str, Any] = dict(played)
+        np.savez_compressed(self.output_dir / "evaluation.npz", **arrays)
         measured = self.parts.evaluation.measure(played)
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
@@ -100,7 +101,7 @@ class Recorder:
         """Return the means over the exploring episodes that ended since the last row."""
         if not sum(len(ended) for ended in self._ended):
             return {}
-        ended = torch.cat(self._ended)
+        ended: TensorDictBase = TensorDict.cat(self._ended)
         results = {"score": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
         scores = {
             f"train/{name}": results[name].float().mean().item() for name in ("score", "success") if name in results

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import yaml
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -158,9 +159,9 @@ def _final_score(folder: Path) -> float | None:
 
 def _check_same(wanted: Config, file: Path) -> None:
     """Refuse to touch the results of another config."""
-    saved = _flat(OmegaConf.to_container(OmegaConf.load(file))) if file.is_file() else {}
+    saved = _flat(yaml.safe_load(file.read_text())) if file.is_file() else {}
     # Written and read as the saved one was.
-    own = _flat(OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(OmegaConf.create(wanted.to_dict())))))
+    own = _flat(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.create(wanted.to_dict()))))
     keys = [key for key in {**own, **saved} if own.get(key) != saved.get(key)]
     if keys:
         there, here = (json.dumps(values.get(keys[0]), default=str) for values in (saved, own))
@@ -249,10 +250,10 @@ def report(start: str, error: BaseException | None = None) -> int:
 def _print_tally(jobs: list[Job]) -> None:
     counts = Counter(job.state for job in jobs)
     print(f"{len(jobs)} jobs: {'; '.join(f'{count} {state}' for state, count in counts.items())}")
-    scored = [job for job in jobs if job.score is not None]
+    scored = [(job.score, job) for job in jobs if job.score is not None]
     if len(scored) > 1:
-        best = max(scored, key=lambda job: job.score)
-        print(f"Best score {best.score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
+        score, best = max(scored, key=lambda entry: entry[0])
+        print(f"Best score {score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
 
 
 def _shown(path: Path) -> Path:

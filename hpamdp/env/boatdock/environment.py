@@ -38,10 +38,12 @@ _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 class BoatDockEnv(PAMDPEnv):
     """Dock boats in `num_envs` harbours at once.
 
-    Action leaves: `("action", "discrete")` int64 `[N]` in {0, 1, 2}; `("action", "parameters")` float32 `[N, 3]`, seconds in
-    [0, 2], one for each key, of which only the pressed key's counts (values outside are clipped, NaN and infinite ones
-    refused); with `controller="choose"` also `option` int64 `[N]` (0 incongruent, 1 congruent), read at an episode's
-    first press and held until its end.
+    Action leaves:
+    - `("action", "discrete")` int64 `[N]` in {0, 1, 2}: the key to press;
+    - `("action", "parameters")` float32 `[N, 3]`: how long to press each key, seconds in [0, 2], of which only the
+      pressed key's counts; values outside are clipped, NaN and infinite ones refused;
+    - with `controller="choose"`, `option` int64 `[N]` (0 incongruent, 1 congruent): read at an episode's first press
+      and held until its end.
 
     Args:
         num_envs: how many boats.
@@ -113,18 +115,23 @@ class BoatDockEnv(PAMDPEnv):
         seed: int = 0,
         first_env: int = 0,
     ) -> None:
-        each = (motor_noise, motor_noise) if isinstance(motor_noise, int | float) else tuple(motor_noise)
-        rules = Rules(controller, keymap, reward, observation, each, sensor_noise, slip)
+        motor_noises = [motor_noise, motor_noise] if isinstance(motor_noise, int | float) else motor_noise
+        if len(motor_noises) != 2:
+            raise ValueError(f"BoatDockEnv: motor_noise={motor_noises}, but must be one number or two")
+        incongruent, congruent = motor_noises
+        rules = Rules(controller, keymap, reward, observation, (incongruent, congruent), sensor_noise, slip)
         _check_arguments(num_envs, rules)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
-        self._pure_step, self._pure_reset, self._pure_read = episode.step, episode.reset, episode.read
+        self._pure_step = episode.step
+        self._pure_reset = episode.reset
+        self._pure_read = episode.read
         if compile_physics:
-            self._pure_step, self._pure_reset, self._pure_read = (
-                torch.compile(function, **episode.COMPILE_ARGUMENTS)
-                for function in (episode.step, episode.reset, episode.read)
-            )
+            arguments: Any = episode.COMPILE_ARGUMENTS
+            self._pure_step = torch.compile(episode.step, **arguments)
+            self._pure_reset = torch.compile(episode.reset, **arguments)
+            self._pure_read = torch.compile(episode.read, **arguments)
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
         self._has_human, self._oracle = human, None
@@ -241,7 +248,8 @@ class BoatDockEnv(PAMDPEnv):
         self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
         floats = torch.zeros(self.num_envs, device=self.device)
         integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
-        self._state = BoatState(*[floats] * 9, *[integers] * 4, episode=integers - 1)
+        columns = [floats] * 9 + [integers] * 4 + [integers - 1]
+        self._state = BoatState(*columns)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask, given = None, None
@@ -335,8 +343,6 @@ def _check_arguments(num_envs: int, rules: Rules) -> None:
         raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
     if not 0.0 <= rules.slip <= 1.0:
         raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
-    if len(rules.motor_noise) != 2:
-        raise ValueError(f"BoatDockEnv: motor_noise={list(rules.motor_noise)}, but must be one number or two")
     for name, values in (("motor_noise", rules.motor_noise), ("sensor_noise", (rules.sensor_noise,))):
         for value in values:
             if not 0.0 <= value < float("inf"):
