@@ -5,7 +5,8 @@ import pytest
 from PIL import Image
 
 from hpamdp.analysis import style
-from hpamdp.analysis.figures import draw_all
+from hpamdp.analysis.figures import _learning_curves, draw_all
+from hpamdp.env.base import Metric
 from hpamdp.env.boatdock import figures as boats
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.platform.environment import PlatformEnv
@@ -47,7 +48,7 @@ def names(folder):
     paths = draw_all(folder, BoatDockEnv)
     for path in paths:
         with Image.open(path) as image:
-            assert min(image.size) > 300 and len(np.unique(np.asarray(image))) > 10
+            image.verify()
     return [path.name for path in paths]
 
 
@@ -58,6 +59,47 @@ def test_all_figures_come_from_complete_files(tmp_path):
         json.dumps({"references": {"random": {"score": -0.9}, "ceiling": {"score": 3.6}}})
     )
     assert names(tmp_path) == ALL
+
+
+def test_learning_curves_show_the_logged_values_between_the_references(tmp_path):
+    rows = [{"frames": 10.0 * i, "eval/score": 0.5 * i, "train/score": 0.1 * i} for i in range(4)]
+    summary = {"references": {"random": {"score": -0.9}, "human": {"success": 0.9}, "ceiling": {"score": 3.6}}}
+    figure = _learning_curves(rows, summary, (Metric("score", "Score"), Metric("success", "Success", "share")))
+    (axes,) = [axes for axes in figure.axes if axes.axison]
+    assert axes.get_title(loc="left") == "Score"
+    lines = {tuple(line.get_ydata()) for line in axes.lines}
+    assert {(0.0, 0.5, 1.0, 1.5), (-0.9, -0.9), (3.6, 3.6)} <= lines
+    written = {text.get_text() for text in axes.texts}
+    assert written == {"random -0.90", "ceiling 3.60", "this agent 1.50", "exploring 0.30"}
+
+
+def arrays_of(folder):
+    with np.load(folder / "evaluation.npz") as file:
+        return dict(file)
+
+
+def test_trajectories_show_the_paths_and_scores_from_the_best_to_the_worst(tmp_path):
+    write_evaluation(tmp_path, num=6)
+    evaluation = arrays_of(tmp_path)
+    panels = boats.draw(evaluation, {})["trajectories.png"].axes
+    order = np.lexsort((evaluation["outcome"], -evaluation["score"]))
+    assert [float(axes.get_title().split()[0]) for axes in panels] == pytest.approx(
+        evaluation["score"][order], abs=5e-3
+    )
+    for axes, episode in zip(panels, order, strict=True):
+        path = evaluation["path"][episode]
+        np.testing.assert_array_equal(axes.lines[0].get_xydata(), path[np.isfinite(path).all(1)])
+
+
+def test_choices_show_the_share_of_the_congruent_boat_in_each_bin_with_its_interval(tmp_path):
+    offset = np.repeat([5.0, 15.0, 25.0, 35.0, 45.0, 55.0], 10)
+    option = np.tile(np.arange(10) < 7, 6).astype(int)
+    write_evaluation(tmp_path, num=60, option=option, controller=option, bearing_offset=offset)
+    axes = boats.draw(arrays_of(tmp_path), {})["choices.png"].axes[0]
+    (bars,) = axes.containers
+    assert bars.lines[0].get_ydata() == pytest.approx([0.7] * 6)
+    segments = np.array(bars.lines[2][0].get_segments())[:, :, 1]
+    assert segments == pytest.approx(np.tile([0.3968, 0.8922], (6, 1)), abs=1e-3)  # Wilson's, of 7 in 10
 
 
 def test_an_empty_folder_gives_no_figure(tmp_path):

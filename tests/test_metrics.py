@@ -1,6 +1,5 @@
 import csv
 import io
-import time
 
 import pytest
 import wandb
@@ -134,11 +133,9 @@ def test_every_logger_takes_a_run(tmp_path, without_login):
 
 
 def test_wandb_auto_without_login_makes_an_offline_run_under_the_output_folder(tmp_path, without_login, capfd):
-    began = time.monotonic()
     logger = wandb_logger(tmp_path, "auto")
     assert logger.is_offline
     log_a_run(logger, tmp_path)
-    assert time.monotonic() - began < 30
     assert list(tmp_path.glob("wandb/offline-run-*/*.wandb"))
     assert capfd.readouterr() == ("", "")
 
@@ -166,12 +163,17 @@ def test_wandb_finds_a_key_in_netrc_and_goes_offline_when_nobody_answers(tmp_pat
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
     monkeypatch.setattr("hpamdp.run.loggers._WANDB_START", 2.0)
-    began = time.monotonic()
     logger = wandb_logger(tmp_path, "auto")
-    assert logger.is_offline and time.monotonic() - began < 20
+    assert logger.is_offline
     (warning,) = capsys.readouterr().err.splitlines()
     assert "could not start online" in warning and "Timed out" in warning
     logger.close()
+
+
+def test_an_unknown_wandb_mode_is_refused_by_its_name(tmp_path, without_login, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "foo")
+    with pytest.raises(ValueError, match="WANDB_MODE=foo: must be one of online, offline, disabled"):
+        wandb_logger(tmp_path, "auto")
 
 
 def test_the_closing_table_sets_this_agent_beside_the_references_in_their_order():

@@ -5,7 +5,6 @@ import itertools
 import json
 import os
 import signal
-import threading
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ from hpamdp.env.boatdock.reference import human_normalised
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
@@ -96,13 +96,19 @@ def test_training_ends_at_the_first_evaluation_that_reaches_the_stop_score(tmp_p
         assert json.loads((tmp_path / name / "summary.json").read_text())["frames"] == frames
 
 
-def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys):
-    timer = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
+def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys, monkeypatch):
+    take, batches = Recorder.take, itertools.count(1)
+
+    def interrupted(self, batch, scalars):
+        take(self, batch, scalars)
+        if next(batches) == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Recorder, "take", interrupted)
     assert start(tmp_path / "stopped", "low=random", "total_frames=100_000_000", "eval.every=0") == 130
     assert f"resume={tmp_path / 'stopped'}" in capsys.readouterr().out
     stopped = json.loads((tmp_path / "stopped" / "summary.json").read_text())
-    assert 0 < stopped["frames"] < 100_000_000 and not stopped["finished"]
+    assert 0 < stopped["frames"] <= 5 * 128 and not stopped["finished"]
     total = stopped["frames"] + 2048
     more = [f"resume={tmp_path / 'stopped'}", f"total_frames={total}"]
     assert run(compose_config(more), tmp_path / "resumed", more) == 0
