@@ -1,4 +1,4 @@
-"""What a run tells while it goes on and when it ends: rows of metrics, evaluations, the summary, the pictures."""
+"""What a run writes while it trains and when it ends: metrics, evaluations, the summary, figures."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ class Recorder:
         self.metrics = MetricsFile(output_dir / "metrics.csv")
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
-        # The last evaluation, as long as the agent has not learned since.
+        # The last evaluation; None once the agent has learned since.
         self._played: dict[str, np.ndarray] | None = None
         self._held: dict[str, float] = {}  # scores with each option held, at the last evaluation
         random = random_agent(parts.agent.specs, parts.device)
         self._random = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
     def resume_from(self, folder: Path, frames: int) -> None:
-        """Start the metrics with those that the run in `folder` had written by then."""
+        """Begin the metrics with the rows of the run in `folder`, up to `frames`."""
         self.metrics = MetricsFile(self.metrics.path, folder / "metrics.csv", frames)
 
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
@@ -58,7 +58,7 @@ class Recorder:
         self._ended.append(ended)
 
     def log(self, frames: int, wall_s: float, is_evaluated: bool) -> dict[str, float]:
-        """Write a row, with an evaluation if asked for, and return it."""
+        """Write a row of metrics, with an evaluation if `is_evaluated`, and return it."""
         row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
         if is_evaluated:
             measured = self.parts.evaluation.measure(self._play())
@@ -69,7 +69,7 @@ class Recorder:
         return row
 
     def finish(self, frames: int, wall_s: float, cpu_s: float, is_finished: bool) -> str:
-        """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
+        """Evaluate, write the summary and the figures, close the logger; return the closing table."""
         played = self._play()
         arrays: dict[str, Any] = dict(played)
         np.savez_compressed(self.output_dir / "evaluation.npz", **arrays)
@@ -90,7 +90,7 @@ class Recorder:
         return self._played
 
     def _drift(self, measured: dict[str, float]) -> dict[str, float]:
-        """Return how far the score with each option held has moved since the evaluation before."""
+        """Return the change of the score with each option held since the last evaluation."""
         held = {name: value for name, value in measured.items() if name.startswith("score_")}
         before, self._held = self._held, held
         return {

@@ -1,4 +1,4 @@
-"""A sweep: its jobs go on where they stopped, none takes the others down, the end tells what became of each."""
+"""Sweeps: finished jobs are skipped, stopped ones resumed; a failing job stops no other; a report closes the sweep."""
 
 from __future__ import annotations
 
@@ -28,24 +28,24 @@ from hpamdp.messages import one_line
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
-# What can become of a job; the first until it has ended.
+# States of a job; the first one until it has ended.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
 
 
 class SweepDir(Callback):
-    """Tells the process that starts a sweep where the results go, which Hydra tells callbacks alone."""
+    """Remembers the sweep's folder, which Hydra passes to callbacks only."""
 
     path: ClassVar[Path | None] = None
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Take note of the sweep's folder."""
+        """Remember the sweep's folder."""
         SweepDir.path = Path(config.hydra.sweep.dir).absolute()
 
 
 @dataclass
 class Job:
-    """What is known of a job."""
+    """State of one job."""
 
     number: int
     overrides: str
@@ -56,7 +56,7 @@ class Job:
 
 
 class Records:
-    """The jobs of one start of a sweep, a file each: they may run in other processes or on other machines.
+    """The states of a sweep's jobs, one file each, because jobs may run in other processes or on other machines.
 
     Args:
         sweep_dir: the sweep's folder.
@@ -67,7 +67,7 @@ class Records:
         self._folder = sweep_dir / ".sweep" / start
 
     def write(self, job: Job) -> None:
-        """Keep what is known of a job."""
+        """Save the state of a job."""
         self._folder.mkdir(parents=True, exist_ok=True)
         draft = self._folder / f"{job.number}.draft"
         draft.write_text(json.dumps(asdict(job)))
@@ -79,7 +79,7 @@ class Records:
         return sorted(jobs, key=lambda job: job.number)
 
     def remove(self) -> None:
-        """Leave no trace, unless another start is under way."""
+        """Remove the files, and their folder unless another start of the sweep uses it."""
         for file in self._folder.glob("*"):
             file.unlink(missing_ok=True)
         with suppress(OSError):
@@ -88,7 +88,7 @@ class Records:
 
 
 def run_job(cfg: DictConfig, start: str) -> float | None:
-    """Run the job that Hydra is at, or what is left of it; return its score, None where it failed.
+    """Run Hydra's current job, or what is left of it; return its score, or None if it failed.
 
     Args:
         cfg: the job's config.
@@ -127,7 +127,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
 
 
 def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None]:
-    """Run what is not done yet in a job's folder; return what became of it, and its score."""
+    """Run what is not done yet in a job's folder; return the job's state and its score."""
     from hpamdp.run import checkpoint, train  # takes seconds, which --help need not wait for
     from hpamdp.run.resume import resolve
 
@@ -158,7 +158,7 @@ def _final_score(folder: Path) -> float | None:
 
 
 def _check_same(wanted: Config, file: Path) -> None:
-    """Refuse to touch the results of another config."""
+    """Refuse to continue in a folder with the results of another config."""
     saved = _flat(yaml.safe_load(file.read_text())) if file.is_file() else {}
     # Written and read as the saved one was.
     own = _flat(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.create(wanted.to_dict()))))
@@ -181,7 +181,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @functools.cache  # once a process, which may run several jobs
 def _stop_with_parent() -> None:
-    """See to it that this process saves and stops when the one that started it is killed, which joblib does not."""
+    """Save and stop this process when the one that started it is killed, which joblib does not do."""
     parent = os.getppid()
 
     def watch() -> None:
@@ -195,7 +195,7 @@ def _stop_with_parent() -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out; wait for those that are about to stop, the workers of a sweep that was killed."""
+    """Lock a job's folder; wait for the workers of a killed sweep, which are about to stop."""
     file = folder / ".lock"
     lock = FileLock(file, timeout=_PATIENCE_S)
     try:
@@ -215,7 +215,7 @@ def has_begun(start: str) -> bool:
 
 
 def report(start: str, error: BaseException | None = None) -> int:
-    """Tell what became of the jobs, a line on stderr for each that failed; return the exit code.
+    """Print a tally of the jobs and, on stderr, a line for each that failed; return the exit code.
 
     Args:
         start: names this start of the sweep.

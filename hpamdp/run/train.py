@@ -1,4 +1,4 @@
-"""One run: build everything, then the loop: next batch, learn, log, evaluate if due, save if due."""
+"""One run: build its parts, then loop: collect a batch, learn, log, evaluate and save when due."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Trainer:
         self.recorder.resume_from(source.parent, self.frames)
 
     def train(self) -> bool:
-        """Run until `num_frames` or `eval.stop_score`, save the agent; return whether the user stopped it before."""
+        """Train until `num_frames` or `eval.stop_score` and save the agent; return whether the user interrupted it."""
         collection = self.config.collector.build(config=self.config, parts=self.parts, frames=self.frames)
         total = self.config.run.num_frames
         bar = tqdm(total=total, initial=self.frames, unit=self.unit, unit_scale=True, mininterval=1.0)
@@ -108,7 +108,7 @@ class Trainer:
         except KeyboardInterrupt:
             return True
         finally:
-            # Nothing may cut the saving short.
+            # Saving must not be interrupted.
             handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
             bar.close()
             self.save(collection)
@@ -136,7 +136,7 @@ class Trainer:
                 self.save(collection)
 
     def _learn(self, collection: Collection) -> int:
-        """Let the agent learn, from steps or from the data set; return how many frames that took."""
+        """Let the agent learn from a batch of steps or from the data set; return the number of frames."""
         if self.config.run.mode == "offline":
             num = min(_UPDATES_A_TURN, self.config.run.num_frames - self.frames)
             self.recorder.take(None, self.parts.agent.update(num))
@@ -169,5 +169,5 @@ class Trainer:
 
 
 def _is_due(before: int, now: int, every: int) -> bool:
-    """Return whether a multiple of `every` was passed; never where it is 0."""
+    """Return whether a multiple of `every` was passed; never if it is 0."""
     return every > 0 and now // every > before // every

@@ -12,7 +12,7 @@ from hpamdp.run.collection.base import Collection
 
 
 class SingleCollection(Collection):
-    """Steps the run's environments here, between two calls of the learner."""
+    """Steps the environments in the learner's own process, between two updates."""
 
     def __init__(self, config: Config, parts: Parts) -> None:
         self.env = parts.env
@@ -34,5 +34,5 @@ class SingleCollection(Collection):
         return self.env.env_state()
 
     def close(self) -> None:
-        """Let go of the environment, which stays open."""
+        """Stop collecting; the environment stays open."""
         self._collector.shutdown(close_env=False)

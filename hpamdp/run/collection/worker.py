@@ -1,4 +1,4 @@
-"""What a worker process builds: its share of the run's environments, and a copy of the policy."""
+"""What a worker process builds: its shard of the run's environments, and a copy of the policy."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _CPU = torch.device("cpu")
 
 
 def packed(module: nn.Module) -> bytes:
-    """Return a module's state as bytes: unlike tensors, they share no memory with it in another process."""
+    """Return a module's state as bytes, which unlike tensors share no memory between processes."""
     file = io.BytesIO()
     torch.save(module.state_dict(), file)
     return file.getvalue()
 
 
 def unpack(module: nn.Module, state: bytes) -> None:
-    """Put a module on the CPU into the state that another one was in, wherever that is."""
+    """Load a `packed` state into a module on the CPU, whatever device it was packed on."""
     module.load_state_dict(torch.load(io.BytesIO(state), map_location=_CPU))
 
 
@@ -37,7 +37,8 @@ class PolicyCopy(TensorDictModuleBase):
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
+        self.in_keys = list(policy.in_keys)
+        self.out_keys = list(policy.out_keys)
         self.policy = policy
         self._cpu_before = time.process_time()
 
@@ -46,14 +47,14 @@ class PolicyCopy(TensorDictModuleBase):
         return self.policy(td)
 
     def receive(self, state: bytes) -> float:
-        """Take over the `packed` state of the learner's policy; return this process's CPU seconds so far."""
+        """Load the `packed` state of the learner's policy; return this process's CPU seconds so far."""
         unpack(self.policy, state)
         return time.process_time() - self._cpu_before
 
 
 @dataclass(frozen=True)
 class EnvShard:
-    """A worker's environments and all it takes to build them elsewhere.
+    """The environments of one worker, with everything needed to build them in its process.
 
     Attributes:
         config: of the run.

@@ -1,4 +1,4 @@
-"""What collection in several processes has in common, whoever starts them."""
+"""What collections in several processes share."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from hpamdp.run.collection.worker import EnvShard, packed
 
 
 class WorkerCollection(Collection):
-    """Has each of `num_workers` processes step an equal share of the environments, on the CPU with one thread.
+    """Steps an equal shard of the environments in each of `num_workers` processes, on the CPU with one thread.
 
-    Environment `i` has the layouts that it has in a single process: only the exploration draws from other random
-    numbers, a stream for each worker. Before each batch all workers get the policy's weights and buffers; they wait for
-    one another and for the learner. A subclass starts TorchRL's collector in `_start`.
+    Environment `i` has the same episodes as in a single process; only exploration uses other random numbers, one
+    stream for each worker. Before each batch, all workers get the policy's weights and buffers; they wait for one
+    another and for the learner. A subclass starts TorchRL's collector in `_start`.
     """
 
     has_workers: ClassVar[bool] = True
@@ -79,7 +79,7 @@ class WorkerCollection(Collection):
         return self._collector.map_fn(method, [arguments] * self._collector.num_workers)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the environments' columns, as they were last known if a worker failed."""
+        """Return the environments' state; if a worker failed, the last one that is known."""
         if self._is_idle:
             with uninterrupted():
                 columns = self._call("env.env_state")
@@ -95,7 +95,7 @@ class WorkerCollection(Collection):
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let a Ctrl-C wait for the block's end, as half a message would confuse the workers; a second one doesn't."""
+    """Delay a Ctrl-C to the end of the block, because half a message would confuse the workers; a second one interrupts."""
     is_asked = False
 
     def note(*_: Any) -> None:
@@ -119,7 +119,7 @@ def uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def children_without(*numbers: signal.Signals) -> Iterator[None]:
-    """Have processes that are started within the block never see these signals."""
+    """Block these signals in all processes that are started within the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
