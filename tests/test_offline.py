@@ -64,7 +64,7 @@ def test_a_selector_learns_from_the_decisions_in_the_data(high, path, tmp_path):
     num_episodes = int((parts.data["next", keys.DONE]).sum())
     selector = parts.agent.selector
     if high == "ucb" or high == "linucb":
-        assert selector.rewards.num_decisions == num_episodes
+        assert selector.statistics.num_decisions == num_episodes
     else:
         assert len(selector.buffer) == num_episodes
 

@@ -26,5 +26,5 @@ class Softmax(Bandit):
 
     def sample(self, num: int) -> Tensor:
         """Return `num` exploring choices, int64 `[num]`."""
-        probabilities = (self.rewards.means / self.temperature).softmax(0)
+        probabilities = (self.statistics.means / self.temperature).softmax(0)
         return probabilities.multinomial(num, replacement=True) if num else probabilities.new_zeros(0).long()

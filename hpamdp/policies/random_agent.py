@@ -1,4 +1,4 @@
-"""The uniformly random agent: the reference `random` of every table and figure."""
+"""The uniformly random agent."""
 
 from __future__ import annotations
 
@@ -11,6 +11,13 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def random_agent(specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:
-    """Return an agent whose options, discrete actions and parameters are uniformly random."""
-    selector = Uniform(specs) if specs.num_options else None
+    """Return the uniformly random agent, the reference "random" of every table and figure.
+
+    Options, discrete actions and parameters are uniform and independent of the observation.
+
+    Args:
+        specs: of the problem; if it has no options, the agent has no selector.
+        device: where the agent acts.
+    """
+    selector = Uniform(specs) if specs.num_options > 0 else None
     return HierarchicalAgent(selector, [Random(specs)], specs).to(device)
