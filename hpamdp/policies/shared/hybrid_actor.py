@@ -61,7 +61,7 @@ class HybridDistribution(NamedTuple):
         squashed = raw.tanh()
         # log(1 - tanh(raw)^2), without loss of precision for large |raw|.
         log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
-        # The density of the rounded scale that the sample was taken with.
+        # scale.log(), not log_scale: the density of the scale as it was rounded for the sample.
         return squashed, gaussian_log_density(noise, scale.log()) - log_slope
 
     def log_prob(self, discrete: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
