@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 from hpamdp import keys
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import SCALED_NAMES
+from hpamdp.env.boatdock.episode import FUEL, SCALED_NAMES
 
 CENTRE = torch.tensor(harbour.CENTRE)
 NOISE = {"motor_noise": 0.2, "sensor_noise": 3.0, "slip": 0.3}
@@ -123,7 +123,7 @@ def test_a_partial_reset_leaves_the_other_boats_alone():
     assert env.state.episode.tolist() == [0, 1, 0, 1]
     assert (env.state.presses[fresh] == 0).all()
     assert not torch.isclose(env.state.start_x, before[0])[fresh].any()
-    assert (reading[keys.FUEL][fresh] == 1.0).all()
+    assert (reading[FUEL][fresh] == 1.0).all()
 
 
 def test_the_option_is_read_at_the_first_press_and_held():

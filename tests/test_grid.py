@@ -5,10 +5,9 @@ import json
 
 import pytest
 import torch
-from conftest import TRAINED, choices, compose_config
+from conftest import TRAINED, choices, compose_config, make_config
 from tensordict import TensorDict
 
-from hpamdp.config import run_config
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
@@ -36,14 +35,13 @@ def words(high: str, low: str) -> list[str]:
 
 
 def make(high: str, low: str, tmp_path):
-    cfg = compose_config(words(high, low))
     torch.manual_seed(0)
-    return assemble(cfg, run_config(cfg), tmp_path)
+    return assemble(make_config(words(high, low)), tmp_path)
 
 
 @pytest.mark.parametrize(("high", "low"), list(itertools.product(choices("high"), TRAINED)))
 def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0
     assert (tmp_path / "summary.json").is_file()
 
@@ -71,7 +69,7 @@ def test_every_learner_works_on_other_problems(low, env, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])
 def test_learners_work_for_each_option_and_shared(sharing, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
     assert run(compose_config([*words("ucb", "hyar"), f"agent.sharing={sharing}"]), tmp_path) == 0
 
 

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 from toy_environments import ALL, FORMS, native_action
 
-from hpamdp.config import ConfigError, build
+from hpamdp.config import ConfigError, component
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.specs import PAMDPSpecs
@@ -266,7 +266,7 @@ def test_the_time_limit_of_a_four_value_environment_is_a_truncation():
 def mistake_in(**options) -> str:
     node = OmegaConf.create({"_target_": "hpamdp.env.gymnasium.environment.GymnasiumEnv", **options})
     with pytest.raises(ConfigError) as raised:
-        build("env", node, num_envs=2, device="cpu", seed=0)
+        component("env", "gymnasium", node).build(num_envs=2, device="cpu", seed=0)
     assert "\n" not in str(raised.value) and "GymnasiumEnv" in str(raised.value)
     return str(raised.value)
 

@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_bandits import SPECS, against_sign, by_sign, constant, due, ended, play
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, build
+from hpamdp.config import ConfigError, component
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
 from hpamdp.policies.shared.context import ContextFeatures, LinearBandit
@@ -87,7 +87,7 @@ def test_only_the_inputs_are_seen():
 def test_features_that_cannot_be_are_refused_in_one_line(changes, complaint):
     target = {"_target_": "hpamdp.policies.high_level.linucb.LinUCB"}
     with pytest.raises(ConfigError) as error:
-        build("high", target | OPTIONS | changes, specs=SPECS)
+        component("high", "linucb", target | OPTIONS | changes).build(specs=SPECS)
     assert complaint in str(error.value) and "\n" not in str(error.value)
 
 

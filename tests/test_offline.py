@@ -5,12 +5,12 @@ import json
 import pytest
 import synthetic_human
 import torch
-from conftest import compose_config
+from conftest import compose_config, make_config
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, run_config
+from hpamdp.config import ConfigError
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.released_file import read
 from hpamdp.data.human.rest_to_rest import TAP, to_rest_to_rest
@@ -40,7 +40,7 @@ def presses(path: str, rest_to_rest: bool = False, **env):
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
 
 
 def words(path: str, low: str, high: str = "human") -> list[str]:
@@ -59,8 +59,7 @@ def test_a_learner_trains_on_a_data_set_without_a_press(low, path, tmp_path, no_
 
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])
 def test_a_selector_learns_from_the_decisions_in_the_data(high, path, tmp_path):
-    cfg = compose_config(words(path, "iql", high))
-    parts = assemble(cfg, run_config(cfg), tmp_path)
+    parts = assemble(make_config(words(path, "iql", high)), tmp_path)
     parts.agent.add_demonstrations(parts.data)
     num_episodes = int((parts.data["next", keys.DONE]).sum())
     selector = parts.agent.selector
@@ -133,12 +132,12 @@ def test_an_episode_whose_final_press_is_gone_is_cut_and_not_over(path):
 
 
 REFUSED = [
-    (["low=bc"], "low=bc learns from data sets only; use mode=offline data=human"),
-    (["low=hppo", "mode=offline", "data=human"], "low=hppo learns from its own presses only; use data=none"),
-    (["low=iql", "mode=offline"], "mode=offline: data=none leaves nothing to learn from; use data=human"),
+    (["low=bc"], "low=bc learns from data sets only; use mode=offline and a data set"),
+    (["low=hppo", "mode=offline", "data=human"], "low=hppo learns from its own steps only; use data=none"),
+    (["low=iql", "mode=offline"], "mode=offline: data=none leaves nothing to learn from; choose a data set"),
     (["low=iql", "mode=offline", "data=human", "data.path=/nowhere.mat"], "/nowhere.mat: there is no such file"),
     (["low=iql", "high=none", "env=platform", "mode=offline", "data=human"], "people docked boats; use env=boatdock"),
-    (["low=iql", "data=human", "mode=offline", "collector=multi"], "mode=offline presses nothing"),
+    (["low=iql", "data=human", "mode=offline", "collector=multi"], "mode=offline takes no steps"),
     (["low=iql", "data=human", "mode=offline", "low.freeze=true"], "mode=offline trains the learners"),
 ]
 
@@ -147,9 +146,9 @@ REFUSED = [
     ("given", "line"), REFUSED, ids=lambda value: " ".join(value) if isinstance(value, list) else ""
 )
 def test_what_cannot_be_is_refused_in_one_line(given, line, tmp_path):
-    cfg = compose_config([*given, "eval.layouts=4", "num_envs=4"])
+    config = make_config([*given, "eval.layouts=4", "num_envs=4"])
     with pytest.raises(ConfigError, match=line) as refusal:
-        assemble(cfg, run_config(cfg), tmp_path)
+        assemble(config, tmp_path)
     assert "\n" not in str(refusal.value)
 
 
@@ -168,8 +167,7 @@ def test_an_offline_run_goes_on_and_is_fine_tuned(path, tmp_path, no_pictures):
 
 def test_demonstrations_lie_in_the_replay_beside_own_presses(path, tmp_path):
     given = ["low=pdqn", "data=human", "data.checksum=null", f"data.path={path}", "eval.layouts=4", "num_envs=4"]
-    cfg = compose_config(given)
-    parts = assemble(cfg, run_config(cfg), tmp_path)
+    parts = assemble(make_config(given), tmp_path)
     parts.agent.add_demonstrations(parts.data)
     assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.numel()
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from conftest import choices, compose_config
+from conftest import choices, make_config
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -10,7 +10,6 @@ from toy_bandits import CPU, SPECS, due
 from toy_options import Stepper, Toll
 
 from hpamdp import keys
-from hpamdp.config import run_config
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.env.decisions import with_decisions
@@ -152,8 +151,8 @@ def test_human_chooses_the_congruent_boat_as_often_as_people_do_at_each_bearing(
 )
 def test_options_are_uniform_until_practice_is_over_and_greedy_choices_never(high, tmp_path):
     words = [f"high={high}", "low=random", "num_envs=400", "eval.layouts=4", "agent.uniform_option_frames=800"]
-    cfg = compose_config([*words, *(["high.warmup_decisions=0"] if high == "meta_critic" else [])])
-    parts = assemble(cfg, run_config(cfg), tmp_path)
+    words += ["high.warmup_decisions=0"] if high == "meta_critic" else []
+    parts = assemble(make_config(words), tmp_path)
     torch.manual_seed(0)
     agent = parts.agent
     for _ in range(2):

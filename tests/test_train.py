@@ -10,12 +10,13 @@ import threading
 import numpy as np
 import pytest
 import torch
-from conftest import compose_config
+from conftest import compose_config, make_config
 
 from hpamdp.config import ConfigError
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import human_normalised
 from hpamdp.run import checkpoint
+from hpamdp.run.assemble import assemble
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.train import run
 
@@ -37,7 +38,7 @@ def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys):
     assert start(tmp_path, "high=uniform", "low=random") == 0
     assert {file.name for file in tmp_path.iterdir()} >= FILES | PICTURES
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert {"score", "success", "too_fast", "presses", "option_congruent", "oracle_agreement", "optimality_gap"} <= {
+    assert {"score", "success", "too_fast", "steps", "option_congruent", "oracle_agreement", "optimality_gap"} <= {
         *summary
     }
     assert {"frames", "wall_s", "seed", "versions", "ceiling"} <= {*summary}
@@ -72,11 +73,7 @@ def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
     states = []
     for name in ("often", "seldom"):
         file = checkpoint.find(tmp_path / name, "resume")
-        cfg = compose_config([*SMALL, "low=random"])
-        from hpamdp.config import run_config
-        from hpamdp.run.assemble import assemble
-
-        parts = assemble(cfg, run_config(cfg), tmp_path)
+        parts = assemble(make_config([*SMALL, "low=random"]), tmp_path)
         states.append(checkpoint.load(file, parts.agent, torch.device("cpu"), with_training=True))
     assert all(torch.equal(states[0][column], states[1][column]) for column in states[0])
 

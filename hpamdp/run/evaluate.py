@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.policies.agent import HierarchicalAgent
 
 # Keeps the randomness of the evaluation apart from that of a training run with the same seed.
@@ -28,10 +29,16 @@ class Evaluation:
     """
 
     def __init__(self, env: TransformedEnv, seed: int) -> None:
-        self.env, self.seed = env, seed
+        self.env = env
+        self.seed = seed
         self.episodes = env.fixed_episodes(seed)
         self._reset()
         self.known = env.describe()
+
+    @property
+    def problem(self) -> PAMDPEnv:
+        """The environment itself, without what tracks its decisions."""
+        return self.env.base_env
 
     def _reset(self) -> TensorDictBase:
         self.env.set_seed(self.seed ^ _APART)  # the noise, too, is the same at every evaluation
@@ -40,16 +47,16 @@ class Evaluation:
     def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
         """Play every episode greedily; return one array an attribute, first dimension the episode.
 
-        `return`, `presses` and `score` (the return, where the environment has no score of its own); `option`, the first
-        one, where the agent chooses; `path` `[N, P + 1, 2]` (NaN past the end), where there are positions; beside them
+        `return`, `steps` and `score` (the return, where the environment has no score of its own); `option`, the first
+        one, where the agent chooses; `path` `[N, T + 1, 2]` (NaN past the end), where there are positions; beside them
         what the environment `describe`s and gives as `results`.
         """
         device = self.env.device
         td = self._reset()
         total = torch.zeros(td.batch_size, device=device)
-        presses = torch.zeros(td.batch_size, dtype=torch.long, device=device)
+        steps = torch.zeros(td.batch_size, dtype=torch.long, device=device)
         over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]
-        # A policy that draws even when greedy (random presses) must not move the run's generators.
+        # A policy that samples even when greedy (a random one) must not move the run's generators.
         with (
             torch.random.fork_rng(devices=[device] if device.type == "cuda" else []),
             set_exploration_type(ExplorationType.DETERMINISTIC),
@@ -59,14 +66,14 @@ class Evaluation:
             for _ in range(self.env.max_steps):
                 td = self.env.step(policy(td))
                 total += td.get(("next", keys.REWARD)).squeeze(-1)
-                presses += ~over
+                steps += ~over
                 options.append(td.get(keys.OPTION, None))
                 path.append(_unless(over, self.env.position))
                 td = self.env.step_mdp(td)
                 over = td.get(keys.DONE).squeeze(-1)
                 if over.all():
                     break
-        played: dict[str, Tensor] = {"return": total, "presses": presses, "score": total, **self.known}
+        played: dict[str, Tensor] = {"return": total, "steps": steps, "score": total, **self.known}
         if options[0] is not None:
             played["option"] = options[0]
         if path[0] is not None:
@@ -86,14 +93,14 @@ class Evaluation:
         return played
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return the means of an evaluation: score, return, presses, success, and what else the environment tells.
+        """Return the means of an evaluation: score, return, steps, success, and what else the environment tells.
 
         `optimality_gap` is what is missing to the environment's `ceiling`. Of choices: `regret`, what the better option
         of each episode would have scored with the agent's own low level less what was scored; `score_NAME`, the score
         with the option NAME held; `choice_gain`, the score less that of the best option held; `choice_entropy` of the
         options' shares (nats).
         """
-        names = [name for name in ("score", "success", "return", "presses") if name in played]
+        names = [name for name in ("score", "success", "return", "steps") if name in played]
         means = {name: float(played[name].mean()) for name in names} | self.env.measure(played)
         if "ceiling" in means:
             means["optimality_gap"] = means["ceiling"] - means["score"]

@@ -17,12 +17,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import yaml
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config import ConfigError
+from hpamdp.config import Config, ConfigError
+from hpamdp.messages import one_line
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
@@ -109,11 +111,11 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         with _locked(folder):
             job.state, job.score = _go_on(cfg, overrides, folder)
     except ConfigError as error:
-        job.state, job.reason = _REFUSED, _one_line(str(error))
+        job.state, job.reason = _REFUSED, one_line(str(error))
         with suppress(OSError):
             folder.rmdir()  # Hydra made it; it stays if there is something in it
     except Exception as error:
-        job.state, job.reason = _FAILED, _one_line("".join(traceback.format_exception_only(error)))
+        job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
         with suppress(OSError):
             (folder / "error.txt").write_text(traceback.format_exc())
     records.write(job)
@@ -127,13 +129,13 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
 def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None]:
     """Run what is not done yet in a job's folder; return what became of it, and its score."""
     from hpamdp.run import checkpoint, train  # takes seconds, which --help need not wait for
-    from hpamdp.run.assemble import resolve
+    from hpamdp.run.resume import resolve
 
-    wanted, _, _ = resolve(cfg, overrides)
+    wanted, _ = resolve(cfg, overrides)
     source = folder / checkpoint.FILE_NAME
     if source.exists() or (folder / "summary.json").exists():
         _check_same(wanted, folder / "config.yaml")
-    score = _final_score(wanted, folder)
+    score = _final_score(folder)
     if score is not None:
         return _SKIPPED, score
     (folder / "error.txt").unlink(missing_ok=True)
@@ -143,29 +145,23 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
     code = train.run(cfg, folder, overrides, source if is_resumed else None)
     if code:
         return _STOPPED, None
-    return (_RESUMED if is_resumed else _FINISHED), _final_score(wanted, folder)
+    return (_RESUMED if is_resumed else _FINISHED), _final_score(folder)
 
 
-def _final_score(wanted: DictConfig, folder: Path) -> float | None:
-    """Return the score of a run that came to its end; None where there is none. A stopped run has a summary, too."""
+def _final_score(folder: Path) -> float | None:
+    """Return the score of a run that reached its end; None where there is none. A stopped run has a summary, too."""
     try:
         summary = json.loads((folder / "summary.json").read_text())
     except (OSError, ValueError):  # not there, or cut off in the middle
         return None
-    if "finished" in summary:
-        is_finished = summary["finished"]
-    else:  # an early run
-        num_frames = wanted.offline.updates if wanted.mode == "offline" else wanted.total_frames
-        is_finished = wanted.mode == "eval" or summary["frames"] >= num_frames
-    return summary["score"] if is_finished else None
+    return summary["score"] if summary["finished"] else None
 
 
-def _check_same(wanted: DictConfig, file: Path) -> None:
+def _check_same(wanted: Config, file: Path) -> None:
     """Refuse to touch the results of another config."""
-    saved = _flat(OmegaConf.to_container(OmegaConf.load(file))) if file.is_file() else {}
+    saved = _flat(yaml.safe_load(file.read_text())) if file.is_file() else {}
     # Written and read as the saved one was.
-    own = _flat(OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(wanted, resolve=True))))
-    # An older config may lack what is null now.
+    own = _flat(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.create(wanted.to_dict()))))
     keys = [key for key in {**own, **saved} if own.get(key) != saved.get(key)]
     if keys:
         there, here = (json.dumps(values.get(keys[0]), default=str) for values in (saved, own))
@@ -242,7 +238,7 @@ def report(start: str, error: BaseException | None = None) -> int:
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if not is_stopped:
             (sweep_dir / "error.txt").write_text("".join(traceback.format_exception(error)))
-            reason = _one_line("".join(traceback.format_exception_only(error)))
+            reason = one_line("".join(traceback.format_exception_only(error)))
             print(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})", file=sys.stderr)
         print(f"To go on: the same command with hydra.sweep.dir={_shown(sweep_dir)}")
         return _INTERRUPTED if is_stopped else 1
@@ -254,15 +250,11 @@ def report(start: str, error: BaseException | None = None) -> int:
 def _print_tally(jobs: list[Job]) -> None:
     counts = Counter(job.state for job in jobs)
     print(f"{len(jobs)} jobs: {'; '.join(f'{count} {state}' for state, count in counts.items())}")
-    scored = [job for job in jobs if job.score is not None]
+    scored = [(job.score, job) for job in jobs if job.score is not None]
     if len(scored) > 1:
-        best = max(scored, key=lambda job: job.score)
-        print(f"Best score {best.score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
+        score, best = max(scored, key=lambda entry: entry[0])
+        print(f"Best score {score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
 
 
 def _shown(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())

@@ -21,6 +21,8 @@ SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
 # The scaled observation divides by these, so that entries lie in about [-1, 1].
 _SPEED_SCALE = float(physics.speed(torch.tensor(physics.MAX_DURATION)))
 
+FUEL = "fuel"  # the tensordict entry: the fraction of the tank that is left
+
 OBSERVATION_NAMES = (
     "start_x",
     "start_y",

@@ -5,16 +5,14 @@ from __future__ import annotations
 import io
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
-from hpamdp.config import run_config
+from hpamdp.config import Config
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import acting, make_agent, make_env
 from hpamdp.specs import PAMDPSpecs
@@ -58,15 +56,15 @@ class EnvShard:
     """A worker's environments and all it takes to build them elsewhere.
 
     Attributes:
-        cfg: the resolved config.
+        config: of the run.
         specs: of the problem.
         first_env, num_envs: which of the run's environments.
         exploration_seed: of the worker's global generator.
         columns: where the environments stand; empty: at the beginning.
-        low: the `packed` presser of a run with `low.freeze`, whose environments play whole episodes with it.
+        low: the `packed` low level of a run with `low.freeze`, whose environments play whole episodes with it.
     """
 
-    cfg: dict[str, Any]
+    config: Config
     specs: PAMDPSpecs
     first_env: int
     num_envs: int
@@ -77,14 +75,13 @@ class EnvShard:
     def make_env(self) -> TransformedEnv:
         """Build the environments, with their decisions tracked."""
         torch.set_num_threads(1)
-        cfg = OmegaConf.create(self.cfg)
-        settings, agent = run_config(cfg), self._make_agent()
+        agent = self._make_agent()
         if self.low is not None:
             unpack(agent.router, self.low)
-        env = make_env(cfg, self.num_envs, _CPU, settings.seed, self.first_env)
+        env = make_env(self.config, self.num_envs, _CPU, self.config.run.seed, self.first_env)
         if self.columns:
             env.set_env_state(self.columns)
-        return acting(env, agent, settings)[0]
+        return acting(env, agent, self.config)[0]
 
     def make_policy(self) -> PolicyCopy:
         """Build the policy; its weights are yet to come."""
@@ -93,5 +90,4 @@ class EnvShard:
         return PolicyCopy(agent.policy if self.low is None else agent.selector)
 
     def _make_agent(self) -> HierarchicalAgent:
-        cfg = OmegaConf.create(self.cfg)
-        return make_agent(cfg, run_config(cfg), self.specs, _CPU)
+        return make_agent(self.config, self.specs, _CPU)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.config import RunConfig
+from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection
 from hpamdp.run.collection.worker import EnvShard, packed
@@ -27,35 +26,38 @@ class WorkerCollection(Collection):
     one another and for the learner. A subclass starts TorchRL's collector in `_start`.
     """
 
-    def __init__(self, cfg: DictConfig, settings: RunConfig, parts: Parts, frames: int, num_workers: int) -> None:
-        self._policy, self._device = parts.policy, parts.device
+    has_workers: ClassVar[bool] = True
+
+    def __init__(self, config: Config, parts: Parts, frames: int, num_workers: int) -> None:
+        self._policy = parts.policy
+        self._device = parts.device
         self._columns = parts.env.env_state()
         self._collector: Any = None
         self._is_idle = False
-        size = settings.num_envs // num_workers
+        size = config.run.num_envs // num_workers
         shares = [
             EnvShard(
-                OmegaConf.to_container(cfg, resolve=True),
+                config,
                 parts.agent.specs,
                 first,
                 size,
                 # Other numbers than before where a run goes on.
-                int(np.random.SeedSequence((settings.seed, first, frames)).generate_state(1)[0]),
+                int(np.random.SeedSequence((config.run.seed, first, frames)).generate_state(1)[0]),
                 {name: column[first : first + size].cpu() for name, column in self._columns.items()},
-                packed(parts.agent.router) if settings.low.freeze else None,
+                packed(parts.agent.router) if config.run.low.freeze else None,
             )
-            for first in range(0, settings.num_envs, size)
+            for first in range(0, config.run.num_envs, size)
         ]
         try:
             with uninterrupted():
-                self._collector = self._start(shares, settings)
+                self._collector = self._start(shares, config)
         except BaseException:
             self.close()
             raise
         self._batches = iter(self._collector)
         self._is_idle = True
 
-    def _start(self, shares: Sequence[EnvShard], settings: RunConfig) -> Any:
+    def _start(self, shares: Sequence[EnvShard], config: Config) -> Any:
         """Start a worker for each share, and return TorchRL's collector of them."""
         raise NotImplementedError
 

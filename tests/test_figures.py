@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hpamdp.analysis import figures as plots
+from hpamdp.analysis import style
 from hpamdp.analysis.figures import draw_all
+from hpamdp.env.boatdock import figures as boats
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.platform.environment import PlatformEnv
 
 ALL = ["learning_curves.png", "trajectories.png", "choices.png"]
 
@@ -25,7 +28,7 @@ def write_evaluation(folder, num=30, without=(), **changed):
         "outcome": outcome,
         "fuel": rng.uniform(0, 1, num),
         "score": np.where(outcome == 1, rng.uniform(0, 4, num), -1.0),
-        "presses": np.ones(num, dtype=int),
+        "steps": np.ones(num, dtype=int),
         "path": path,
         "optimum": rng.uniform(2, 4, (num, 2)),
         "bearing_offset": rng.uniform(0, 60, num),
@@ -41,7 +44,7 @@ def write_metrics(folder, columns=("eval/score", "eval/success", "train/score"),
 
 
 def names(folder):
-    paths = draw_all(folder)
+    paths = draw_all(folder, BoatDockEnv)
     for path in paths:
         with Image.open(path) as image:
             assert min(image.size) > 300 and len(np.unique(np.asarray(image))) > 10
@@ -51,12 +54,14 @@ def names(folder):
 def test_all_figures_come_from_complete_files(tmp_path):
     write_evaluation(tmp_path)
     write_metrics(tmp_path, ("eval/score", "eval/success", "train/option_congruent", "eval/oracle_agreement"))
-    (tmp_path / "summary.json").write_text(json.dumps({"references": {"random": -0.9, "ceiling": 3.6}}))
+    (tmp_path / "summary.json").write_text(
+        json.dumps({"references": {"random": {"score": -0.9}, "ceiling": {"score": 3.6}}})
+    )
     assert names(tmp_path) == ALL
 
 
 def test_an_empty_folder_gives_no_figure(tmp_path):
-    assert draw_all(tmp_path) == []
+    assert draw_all(tmp_path, BoatDockEnv) == []
 
 
 @pytest.mark.parametrize(
@@ -83,7 +88,7 @@ def test_a_truncated_metrics_file_with_holes_gives_a_figure(tmp_path):
 
 def test_a_metrics_file_of_nothing_but_nan_gives_a_figure(tmp_path):
     (tmp_path / "metrics.csv").write_text("frames,eval/score,eval/success\n1,nan,nan\n")
-    (tmp_path / "summary.json").write_text(json.dumps({"references": {"human": None, "ceiling": None}}))
+    (tmp_path / "summary.json").write_text(json.dumps({"references": {}}))
     assert names(tmp_path) == ["learning_curves.png"]
 
 
@@ -104,7 +109,7 @@ def test_few_episodes_make_a_smaller_sheet(tmp_path, num):
 
 
 def test_missing_arrays_leave_out_only_what_needs_them(tmp_path):
-    write_evaluation(tmp_path, without=("optimum", "controller", "fuel", "presses", "start"))
+    write_evaluation(tmp_path, without=("optimum", "controller", "fuel", "steps", "start"))
     assert names(tmp_path) == ALL[1:]
     write_evaluation(tmp_path, without=("path",))
     assert names(tmp_path) == ["choices.png"]
@@ -122,19 +127,19 @@ def test_broken_files_leave_their_figures_out_with_a_warning(tmp_path, capsys):
 
 def test_labels_stand_apart_near_their_lines_and_in_order():
     heights = [0.1, 0.9, 0.95, 0.96, 0.97, 1.0]
-    placed = plots._apart(heights, 0.06)
+    placed = style._apart(heights, 0.06)
     assert np.diff(placed).min() > 0.06 - 1e-9
     assert placed[0] == 0.1 and placed[-1] <= 1.02
-    assert plots._apart([0.3, 0.5], 0.06) == [0.3, 0.5]
+    assert style._apart([0.3, 0.5], 0.06) == [0.3, 0.5]
 
 
 def test_the_best_possible_score_is_of_both_boats_only_where_the_agent_chose():
     evaluation = {"score": np.array([2.0]), "controller": np.array([1]), "optimum": np.array([[3.5, 3.0]])}
-    assert plots._episode_title({**evaluation, "option": np.array([1])}, 0) == "2.00 / 3.50  C"
-    assert plots._episode_title({**evaluation, "option": np.array([-1])}, 0) == "2.00 / 3.00  C"
+    assert boats._episode_title({**evaluation, "option": np.array([1])}, 0) == "2.00 / 3.50  C"
+    assert boats._episode_title({**evaluation, "option": np.array([-1])}, 0) == "2.00 / 3.00  C"
 
 
-def test_error_bars_stay_within_zero_and_one():
-    share, num = np.array([0.0, 0.3, 1.0]), np.array([5, 10, 5])
-    below, above = plots._wilson(share, num)
-    assert (share - below > -1e-9).all() and (share + above < 1 + 1e-9).all() and (below + above > 0.2).all()
+def test_a_problem_that_draws_nothing_gets_its_learning_curves(tmp_path):
+    write_metrics(tmp_path)
+    write_evaluation(tmp_path)
+    assert [path.name for path in draw_all(tmp_path, PlatformEnv)] == ["learning_curves.png"]
