@@ -25,7 +25,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env.boatdock.reference import references
 from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
 from hpamdp.env.boatdock_released.rules import OUT_OF_FUEL, SUCCESS, TIME_LIMIT, WALL
 
@@ -169,5 +168,6 @@ def test_results_are_the_outcomes_without_a_score_of_their_own():
 
 
 def test_no_human_references_and_no_ceiling_are_shown_beside_it():
-    given = {"random": {"score": 0.1}}
-    assert list(references({"env": "boatdock_released", "controller": "congruent", "references": given})) == ["random"]
+    env = ReleasedBoatDockEnv(5)
+    measured = env.measure({"outcome": np.array([SUCCESS, WALL])})
+    assert env.references(measured) == {}
