@@ -1,4 +1,4 @@
-"""The closed forms of a press, held against a simulation in small time steps and against the task's own symmetries."""
+"""The closed forms of a press agree with a simulation in small time steps and have the symmetries of the task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EACH = settings(deadline=None, max_examples=50, derandomize=True)
 
 
 class Case(NamedTuple):
-    """One press to be; px from the harbour's centre, seconds, radians."""
+    """A press to make; px from the harbour's centre, seconds, radians."""
 
     x: float
     y: float
@@ -31,7 +31,7 @@ class Case(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """What small time steps make of a case; `margin` is how far (px, px/s) the outcome is from another one."""
+    """The result of a simulation; `margin` is the distance (px, px/s) from another outcome."""
 
     outcome: int
     travelled: float
@@ -41,7 +41,7 @@ class Simulated(NamedTuple):
 
 @st.composite
 def cases(sample):
-    """Boats anywhere in the harbour with a dock in any direction, about half of them steering towards it."""
+    """Sample boats anywhere in the harbour with a dock in any direction, about half of them heading for it."""
     radius, angle = sample(st.floats(0, 118)), sample(st.floats(0, 2 * math.pi))
     x, y = radius * math.cos(angle), radius * math.sin(angle)
     distance, bearing = sample(st.floats(15.6, 200)), sample(st.floats(0, 2 * math.pi))
@@ -57,9 +57,9 @@ def press(batch: list[Case], function=physics.press) -> physics.Press:
 
 
 def simulate(case: Case) -> Simulated:
-    """Run one press in small time steps from its acceleration alone (numpy, float64)."""
+    """Simulate one press in small time steps, given only its acceleration (NumPy, float64)."""
     pressed_for = min(case.duration, case.fuel)
-    # The glide runs the speed back down the same curve, GLIDE times as long.
+    # In the glide the speed falls along the same curve, in GLIDE times the time.
     dt = pressed_for / NUM_STEPS
     middle = (np.arange(NUM_STEPS) + 0.5) * dt
     rising = 100.0 * middle**2 - 20.0 / 3.0 * middle**3
@@ -82,7 +82,7 @@ def simulate(case: Case) -> Simulated:
     return Simulated(outcome, way[-1], burnt, min(to_dock.min(), to_rim.min(), abs(case.fuel - case.duration)))
 
 
-def agrees(case: Case, expected: Simulated) -> None:
+def assert_agrees(case: Case, expected: Simulated) -> None:
     after = press([case])
     assert after.outcome.item() == expected.outcome
     travelled = math.hypot(after.x.item() - case.x, after.y.item() - case.y)
@@ -92,13 +92,13 @@ def agrees(case: Case, expected: Simulated) -> None:
 
 @EACH
 @given(cases())
-def test_the_first_event_is_the_one_that_small_time_steps_meet_first(case):
+def test_a_press_ends_at_the_event_that_small_time_steps_meet_first(case):
     expected = simulate(case)
     assume(expected.margin > 0.1)
-    agrees(case, expected)
+    assert_agrees(case, expected)
 
 
-def test_small_time_steps_agree_where_every_outcome_is_met():
+def test_small_time_steps_agree_on_many_presses_of_every_outcome():
     rng = np.random.default_rng(0)
     met = dict.fromkeys((SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL), 0)
     for _ in range(300):
@@ -109,7 +109,7 @@ def test_small_time_steps_agree_where_every_outcome_is_met():
         case = Case(x, y, goal_x, goal_y, heading, rng.uniform(0.3, 1.6), rng.uniform(0.3, 4.0))
         expected = simulate(case)
         if expected.margin > 0.1:
-            agrees(case, expected)
+            assert_agrees(case, expected)
             met[expected.outcome] += 1
     assert min(met.values()) >= 10, met
 
@@ -130,7 +130,7 @@ def test_the_boat_stops_on_the_circle_that_it_met(batch):
 
 @EACH
 @given(st.lists(cases(), min_size=20, max_size=20))
-def test_fuel_never_rises_nor_falls_below_zero_nor_by_more_than_the_press(batch):
+def test_fuel_never_rises_and_falls_by_at_most_the_duration_and_never_below_zero(batch):
     after = press(batch)
     fuel, duration = (torch.tensor([getattr(case, name) for case in batch]) for name in ("fuel", "duration"))
     assert (after.fuel >= 0.0).all()
@@ -179,10 +179,10 @@ def test_the_distance_is_the_integral_of_the_measured_speed():
 
 @EACH
 @given(st.lists(cases(), min_size=20, max_size=20))
-def test_turning_the_world_by_half_and_swapping_the_controller_turns_the_result(batch):
+def test_turning_the_world_by_180_degrees_and_swapping_the_controller_turns_the_result(batch):
     x, y, goal_x, goal_y, _, duration, fuel = torch.tensor(batch).unbind(-1)
     key = torch.arange(len(batch)) % 3
-    # The congruent boat's keys by the incongruent boat's, with key map 1 and 2.
+    # For each key of the incongruent boat, with key map 1 and 2, the opposite key of the congruent boat.
     opposite = torch.tensor([[0, 2, 1], [1, 0, 2]])
     for keymap in (1, 2):
         maps = torch.full_like(key, keymap)
@@ -197,7 +197,7 @@ def test_turning_the_world_by_half_and_swapping_the_controller_turns_the_result(
 
 @EACH
 @given(st.lists(cases(), min_size=5, max_size=20))
-def test_a_batch_does_what_its_boats_do_alone(batch):
+def test_a_boat_moves_in_a_batch_as_it_does_alone(batch):
     together = press(batch)
     for row, case in enumerate(batch):
         for one, many in zip(press([case]), together, strict=True):
@@ -227,7 +227,7 @@ def press_and_step(columns: tuple[torch.Tensor, ...], arguments: tuple) -> tuple
 
 @pytest.fixture(scope="module")
 def compiled():
-    """Compile both functions without graph breaks, in one go because each costs a run of the C++ compiler."""
+    """Compile both functions without graph breaks, together because each call costs a run of the C++ compiler."""
     return torch.compile(press_and_step, fullgraph=True, dynamic=False)
 
 
@@ -245,7 +245,7 @@ def test_compiled_and_eager_agree(compiled):
     columns = (state.x, state.y, state.fuel, state.goal_x, state.goal_y, *direction, durations[:, 0])
     arguments = (state, options, keys, durations, seed, rows, rules)
     eager, fast = flat(press_and_step(columns, arguments)), flat(compiled(columns, arguments))
-    # A rounding error may tip a boat that all but touches a circle; the rest has to agree.
+    # Rounding may change the outcome of a boat that nearly touches a circle; the others must agree.
     same = torch.stack([(a.float() - b.float()).abs() < 1e-4 for a, b in zip(eager, fast, strict=True)])
     assert same.all(0).float().mean() > 0.999
 

@@ -1,4 +1,4 @@
-"""Actions in PlatformEnv come out as by the published rules, written down here for one agent, tick by tick."""
+"""Actions in PlatformEnv follow the published rules, which are written down here for one agent, tick by tick."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.platform.environment import ARRIVED, FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, PlatformEnv
+from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.env.platform.rules import ARRIVED, FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN
 
-NUMBERS = 512  # random numbers that an action may take
+NUMBERS = 512  # random numbers of each action
 
 
 class ScalarCourse:
@@ -22,7 +23,10 @@ class ScalarCourse:
     TOP, WIDTH, HEIGHT, TICK = 40.0, 20.0, 30.0, 0.05
 
     def __init__(self, x: float, speed: float, enemy_x: float, enemy_speed: float) -> None:
-        self.x, self.y, self.speed, self.rise = x, self.TOP, speed, 0.0
+        self.x = x
+        self.y = self.TOP
+        self.speed = speed
+        self.rise = 0.0
         self.enemies = [[230.0, -30.0], [730.0, -30.0]]
         self.enemies[x > 475.0] = [enemy_x, enemy_speed]
 
@@ -34,7 +38,10 @@ class ScalarCourse:
         return self.y == self.TOP and any(left - self.WIDTH <= self.x <= right for left, right in self.PLATFORMS)
 
     def act(self, discrete: int, parameter: float, numbers: list[float]) -> tuple[float, int]:
-        """Return reward and outcome; `numbers` are normal: two for a jump, then the agent's and the enemy's a tick."""
+        """Return reward and outcome.
+
+        `numbers` are normal: two for a jump, then one for the agent and one for the enemy each tick.
+        """
         start, tick, time_left = self.x, 0, 1.0
         while True:
             self._choose(discrete, parameter, numbers, tick)
@@ -89,18 +96,21 @@ class ScalarCourse:
 
 
 def numbers_of_next_action(env: PlatformEnv, seed: int) -> list[list[float]]:
-    """Return what the random numbers of every environment's next action are, `[N, NUMBERS]`."""
+    """Return the random numbers of every environment's next action, `[N, NUMBERS]`."""
     state = env.env_state()
     environment = torch.arange(env.num_envs, dtype=torch.int32)
     rng = counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.NOISE, environment, state["episode"])
-    sample = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
-    return counter_rng.normal(rng.unsqueeze(-1), sample).tolist()
+    index = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
+    return counter_rng.normal(rng.unsqueeze(-1), index).tolist()
 
 
 def compare(
     env: PlatformEnv, courses: list[ScalarCourse], actions: TensorDict, seed: int, noise: float
 ) -> tuple[Tensor, list[int]]:
-    """Do one action in every unfinished environment and by the published rules; return observation and outcomes."""
+    """Take one action in the environments and by the published rules, and compare the results where no episode is over.
+
+    Return the observation and the outcomes of the compared environments.
+    """
     over = env.env_state()["outcome"] != ON_THE_WAY
     numbers = numbers_of_next_action(env, seed)
     reading = env.step(actions.clone())["next"]
@@ -129,16 +139,17 @@ def test_actions_from_anywhere_follow_the_published_rules(noise):
     state = env.env_state()
     columns = (state[name].tolist() for name in ("x", "speed", "enemy_x", "enemy_speed"))
     courses = [ScalarCourse(*column) for column in zip(*columns, strict=True)]
-    outcomes = [
-        outcome for _ in range(3) for outcome in compare(env, courses, random_action(env, generator), seed, noise)[1]
-    ]
+    outcomes = []
+    for _ in range(3):
+        outcomes += compare(env, courses, random_action(env, generator), seed, noise)[1]
     assert min(outcomes.count(outcome) for outcome in (ON_THE_WAY, ARRIVED, FELL, MET_ENEMY)) > 50
 
 
 def test_episodes_from_start_to_end_follow_the_published_rules():
     num, seed, generator = 100, 2**40 + 7, torch.Generator().manual_seed(2)
     env = PlatformEnv(num, seed=seed)
-    observation, courses = env.reset()[keys.OBSERVATION], [ScalarCourse(0.0, 0.0, 230.0, -30.0) for _ in range(num)]
+    observation = env.reset()[keys.OBSERVATION]
+    courses = [ScalarCourse(0.0, 0.0, 230.0, -30.0) for _ in range(num)]
     ends = []
     for _ in range(12):
         careless = torch.rand(num, 1, generator=generator) < 0.1
@@ -152,11 +163,11 @@ def test_episodes_from_start_to_end_follow_the_published_rules():
 
 
 @pytest.mark.parametrize(("edge", "inwards"), [(250.0, -1.0), (455.0, 1.0)])
-def test_who_comes_down_at_an_edge_is_thrown_out_on_the_shorter_way(edge, inwards):
+def test_an_agent_that_comes_down_at_an_edge_is_pushed_out_on_the_shorter_way(edge, inwards):
     env = PlatformEnv(3, noise=0.0)
     place(env, x=200.0, speed=70.0, enemy_x=0.0)
     act(env, [LEAP] * 3, [430.0] * 3)
-    flight = env.env_state()["x"] - 200.0  # which ends in the gap, 1.2 px below the top
+    flight = env.env_state()["x"] - 200.0  # it ends in the gap, 1.2 px below the top
     aims = edge + inwards * torch.tensor([-0.5, 0.6, 1.8])
     env.reset()
     place(env, x=aims - flight, speed=70.0, enemy_x=0.0)
