@@ -95,7 +95,7 @@ class WorkerCollection(Collection):
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Delay a Ctrl-C to the end of the block, because half a message would confuse the workers; a second one interrupts."""
+    """Delay a Ctrl-C to the end of the block: half a message would confuse the workers. A second one interrupts."""
     is_asked = False
 
     def note(*_: Any) -> None:
