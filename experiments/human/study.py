@@ -271,7 +271,7 @@ def draw_singles(axes: Axes) -> None:
     axes.plot(x, way, color=INK, linewidth=1, linestyle="--")
     axes.annotate("74 px/s", (93, 1.95 * 93 - 0.95 * slow), xytext=(4, -10), textcoords="offset points")
     axes.set(xlabel="px covered while the key is down", ylabel="px to the dock", xlim=(0, 118), ylim=(0, 200))
-    axes.set_title("Single presses (ringed: told wrong)")
+    axes.set_title("Single presses (ringed: predicted wrong)")
     axes.legend(frameon=False, loc="upper left")
 
 
@@ -303,8 +303,8 @@ def draw_agreement(axes: Axes) -> None:
     glides, speeds = np.unique(rows["glide"]), np.unique(rows["docking_speed"])
     share = rows["agreement"].reshape(len(glides), len(speeds))
     image = axes.pcolormesh(speeds, glides, share, cmap="viridis", vmin=0.7, shading="nearest", rasterized=True)
-    axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, decimals=0), label="outcomes told right")
-    for name, colour, label in (("likely", "white", "most likely"), ("agreeing", TOO_FAST, "most told right")):
+    axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, decimals=0), label="outcomes predicted right")
+    for name, colour, label in (("likely", "white", "most likely"), ("agreeing", TOO_FAST, "most predicted right")):
         glide, glide_errors = _fitted(f"{name}_glide")
         speed, speed_errors = _fitted(f"{name}_speed")
         axes.errorbar(
