@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from hpamdp import keys
 from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
-from hpamdp.config import run_config
+from hpamdp.config import conf_dir, read
 from hpamdp.run.assemble import acting, assemble, make_env
 
 HERE = Path(__file__).resolve().parent
@@ -49,16 +49,15 @@ def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, floa
         "steps_per_batch=1",
         "eval.layouts=1",
     ]
-    with initialize_config_dir(str(HERE.parents[1] / "conf"), version_base="1.3"):
-        phases = [
-            compose("config", [*overrides, f"env.motor_noise=[{incongruent},{congruent}]"])
-            for incongruent, congruent in NOISE
-        ]
-    settings = run_config(phases[0])
+    phases = []
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        for incongruent, congruent in NOISE:
+            noise = f"env.motor_noise=[{incongruent},{congruent}]"
+            phases.append(read(compose("config", [*overrides, noise], return_hydra_config=True)))
     torch.manual_seed(seed)
-    agent = assemble(phases[0], settings, Path(tempfile.gettempdir())).agent
-    for phase, cfg in enumerate(phases):
-        env, policy = acting(make_env(cfg, NUM_ENVS, torch.device("cpu"), seed), agent, settings)
+    agent = assemble(phases[0], Path(tempfile.gettempdir())).agent
+    for phase, config in enumerate(phases):
+        env, policy = acting(make_env(config, NUM_ENVS, torch.device("cpu"), seed), agent, config)
         options: list[torch.Tensor] = []
         rewards: list[torch.Tensor] = []
         td = env.reset()

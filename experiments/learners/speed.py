@@ -15,8 +15,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from torchrl.collectors import Collector
 
-from hpamdp.cli import conf_dir
-from hpamdp.config import run_config
+from hpamdp.config import conf_dir, read
 from hpamdp.run.assemble import Parts, assemble
 
 HERE = Path(__file__).resolve().parent
@@ -89,10 +88,10 @@ def run_case(case: Case) -> tuple[float, float | None]:
 def build(overrides: list[str], folder: Path) -> tuple[Parts, int]:
     """Return the parts of a run on the congruent boat, and the presses of a batch."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose("config", ["high=none", "env.controller=congruent", "eval.layouts=10", *overrides])
-        settings = run_config(cfg)
-        torch.manual_seed(0)
-        return assemble(cfg, settings, folder), settings.num_envs * settings.steps_per_batch
+        words = ["high=none", "env.controller=congruent", "eval.layouts=10", *overrides]
+        config = read(compose("config", words, return_hydra_config=True))
+    torch.manual_seed(0)
+    return assemble(config, folder), config.run.num_envs * config.run.steps_per_batch
 
 
 def _updates(parts: Parts) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,15 @@ import torch
 from hydra import compose, initialize_config_dir
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from hpamdp.analysis.study import Rows, Run, finished, groups, read_csv, spread, write_tables
+from hpamdp.config import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
-from hpamdp.env.decisions import with_decisions
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import make_agent, make_env, resolve
+from hpamdp.run.assemble import make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.resume import resolve
 from hpamdp.specs import PAMDPSpecs
 
 HERE = Path(__file__).resolve().parent
@@ -50,32 +51,31 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
 
     Args:
         run: a finished run.
-        evaluations: those made so far, by the config of their environment, to which new ones are added: planning their
+        evaluations: those made so far, by the options of their environment, to which new ones are added: planning their
             layouts takes longer than playing them.
     """
     device = torch.device("cpu")
-    with initialize_config_dir(str(HERE.parents[1] / "conf"), version_base="1.3"):
-        overrides = ["mode=eval", f"checkpoint={run.folder}"]
-        cfg, settings, source = resolve(compose("config", overrides), overrides)
-    agent = make_agent(cfg, settings, PAMDPSpecs.from_env(make_env(cfg, 1, device, 0)), device)
+    overrides = ["mode=eval", f"checkpoint={run.folder}"]
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config, source = resolve(compose("config", overrides, return_hydra_config=True), overrides)
+    env = make_env(config, 1, device, 0)
+    agent = make_agent(config, PAMDPSpecs.from_env(env), device)
     checkpoint.load(source, agent, device, with_training=False)
     high, low = run.summary["high"], run.summary["low"]
-    trained_with = [f"{noise} {cfg.env[noise]}" for noise in LEVELS if cfg.env[noise]]
+    options = config.env.options
+    trained_with = [f"{noise} {options[noise]:g}" for noise in LEVELS if options[noise]]
     name = {
         "agent": low if high == "none" else f"{high} x {low}",
         "boat": run.summary["controller"],
         "trained_with": PLUS.join(trained_with) or NO_NOISE,
-        "seed": cfg.seed,
+        "seed": config.run.seed,
     }
     for noise, levels in LEVELS.items():
         for level in levels:
-            for other in LEVELS:
-                cfg.env[other] = 0.0
-            cfg.env[noise] = level
-            key = OmegaConf.to_yaml(cfg.env)
+            noisy = {**options, **dict.fromkeys(LEVELS, 0.0), noise: level}
+            key = str(noisy)
             if key not in evaluations:
-                env = with_decisions(make_env(cfg, settings.eval.layouts, device, 0))
-                evaluations[key] = Evaluation(env, settings.eval.seed)
+                evaluations[key] = make_evaluation(replace(config, env=replace(config.env, options=noisy)), env)
             evaluation = evaluations[key]
             measured = evaluation.measure(evaluation.run(agent.policy))
             figures = {figure: round(measured[figure], 4) for figure in FIGURES}
