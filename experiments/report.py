@@ -1,9 +1,10 @@
 """Draw and tabulate every study again from its csv files, and put all pages into one report.
 
-python experiments/report.py    runs main([]) of every study.py, renews the tables between `<!-- table -->` and
-                                `<!-- /table -->` in the pages, and that between `<!-- table of STUDY -->` and
-                                `<!-- /table -->` in the project's README, writes report/report.html and every figure
-                                as SVG
+python experiments/report.py    runs `main([])` of every study.py; renews the tables in the Markdown pages; writes
+                                report/report.html, and every figure as SVG
+
+In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables. In the project's README and in
+docs/, `<!-- table 2 of STUDY -->` and `<!-- /table -->` enclose the second table of that study.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import io
 import mimetypes
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from unittest import mock
@@ -24,8 +25,10 @@ import markdown
 from matplotlib.figure import Figure
 
 HERE = Path(__file__).resolve().parent
-TABLE = re.compile(r"(<!-- table(?: of (\w+))? -->\n).*?(<!-- /table -->)", re.DOTALL)
-# The pages that a reader wants first; the others follow by name.
+TABLE = re.compile(
+    r"(?P<opening><!-- table(?: (?P<number>\d+) of (?P<study>\w+))? -->\n).*?(?P<closing><!-- /table -->)", re.DOTALL
+)
+# The pages to begin with; the others follow by name.
 FIRST = ("table1", "learners", "hierarchy", "quickstart", "human")
 STYLE = """
 body { font: 16px/1.5 sans-serif; max-width: 62em; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -37,43 +40,67 @@ section { border-top: 3px solid #222 }
 
 
 def report(experiments: Path, target: Path) -> list[str]:
-    """Renew figures, tables and the report; return a line for everything that failed."""
-    failures, pages, tables = [], [], {}
+    """Renew figures, tables and the report.
+
+    Args:
+        experiments: the folder of the studies. README.md and docs/ beside it get their tables renewed, too.
+        target: the folder of the report.
+
+    Returns:
+        A line for each failure.
+    """
+    failures: list[str] = []
+    tables: dict[str, str] = {}
+    pages: list[tuple[str, str]] = []
     target.mkdir(parents=True, exist_ok=True)
-    folders = [folder for folder in experiments.iterdir() if folder.is_dir()]
-    for folder in sorted(folders, key=lambda folder: (folder.name not in FIRST, _place(folder.name), folder.name)):
+    for folder in sorted(filter(Path.is_dir, experiments.iterdir()), key=_order):
         if (folder / "study.py").exists():
             try:
                 tables[folder.name] = tables_in(run(folder / "study.py", target / folder.name))
-            except (Exception, SystemExit) as error:  # whatever a study does must not lose the others
+            except (Exception, SystemExit) as error:  # one failing study must not stop the others
                 failures.append(f"{folder.name}: {type(error).__name__}: {error}")
-        page = folder / "README.md"
-        if page.exists():
-            if folder.name in tables:
-                renew(page, {None: tables[folder.name]})
-            text = page.read_text(encoding="utf-8")
-        elif (folder / "study.py").exists():
-            figures = [f"![{file.stem}]({file.name})" for file in sorted(folder.glob("*.png"))]
-            parts = [f"# {folder.name}", "There is no page of this study yet.", tables.get(folder.name, ""), *figures]
-            text = "\n\n".join(parts)
-        else:
+        text = page_of(folder, tables.get(folder.name))
+        if text is None:
             continue
         body, missing = to_html(text, folder)
         failures += [f"{folder.name}: no image {name}" for name in missing]
         pages.append((folder.name, body))
-    front = experiments.parent / "README.md"
-    if front.exists():
-        renew(front, {name: table.split("\n\n")[0] for name, table in tables.items()})
+    root = experiments.parent
+    for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
+        if page.exists():
+            failures += renew_numbered(page, tables)
     (target / "report.html").write_text(bind(pages), encoding="utf-8")
     return failures
 
 
-def _place(name: str) -> int:
-    return FIRST.index(name) if name in FIRST else len(FIRST)
+def _order(folder: Path) -> tuple[int, str]:
+    place = FIRST.index(folder.name) if folder.name in FIRST else len(FIRST)
+    return place, folder.name
+
+
+def page_of(folder: Path, tables: str | None) -> str | None:
+    """Return the text of a study's page, its tables renewed; a page made up of tables and figures if it has none.
+
+    Args:
+        folder: of the study.
+        tables: what its study.py printed; None if there is no study.py or it failed.
+
+    Returns:
+        None if there is neither a page nor a study.
+    """
+    page = folder / "README.md"
+    if page.exists():
+        if tables is not None:
+            renew(page, lambda found: tables if found["study"] is None else None)
+        return page.read_text(encoding="utf-8")
+    if not (folder / "study.py").exists():
+        return None
+    figures = [f"![{file.stem}]({file.name})" for file in sorted(folder.glob("*.png"))]
+    return "\n\n".join([f"# {folder.name}", "There is no page of this study yet.", tables or "", *figures])
 
 
 def run(script: Path, figures: Path) -> str:
-    """Run `main([])` of a study and return what it prints; its figures are saved as SVG, too."""
+    """Run `main([])` of a study and return what it prints; save its figures as SVG, too."""
     spec = importlib.util.spec_from_file_location(f"study_{script.parent.name}", script)
     module = importlib.util.module_from_spec(spec)
     with redirect_stdout(io.StringIO()) as printed, saved_as_svg_too(figures):
@@ -84,7 +111,7 @@ def run(script: Path, figures: Path) -> str:
 
 @contextmanager
 def saved_as_svg_too(folder: Path) -> Iterator[None]:
-    """Have every figure that is saved inside saved in this folder as SVG, so that no study has to see to it."""
+    """Within this context, save every figure also as SVG in this folder."""
     folder.mkdir(parents=True, exist_ok=True)
     save = Figure.savefig
 
@@ -97,23 +124,29 @@ def saved_as_svg_too(folder: Path) -> Iterator[None]:
 
 
 def tables_in(printed: str) -> str:
-    """Return what was printed from a table's first line to the last table's last.
+    """Return the printed lines from the first of the first table to the last of the last table.
 
     Raises:
         ValueError: there is no table.
     """
     lines = printed.splitlines()
-    rows = [i for i, line in enumerate(lines) if line.startswith("|")]
+    rows = [number for number, line in enumerate(lines) if line.startswith("|")]
     if not rows:
         raise ValueError("it prints no table")
     return "\n".join(lines[rows[0] : rows[-1] + 1])
 
 
-def renew(page: Path, tables: Mapping[str | None, str]) -> None:
-    """Put tables between the markers of a page, by the study that each names; without one, what is there stays."""
+def renew(page: Path, table_for: Callable[[re.Match[str]], str | None]) -> None:
+    """Put tables between the markers of a page.
+
+    Args:
+        page: a Markdown file, which is written only if something changes.
+        table_for: returns the table for a match of `TABLE`; None leaves what is there.
+    """
 
     def replace(found: re.Match[str]) -> str:
-        return f"{found[1]}{tables[found[2]]}\n{found[3]}" if found[2] in tables else found[0]
+        table = table_for(found)
+        return found[0] if table is None else f"{found['opening']}{table}\n{found['closing']}"
 
     text = page.read_text(encoding="utf-8")
     renewed = TABLE.sub(replace, text)
@@ -121,8 +154,30 @@ def renew(page: Path, tables: Mapping[str | None, str]) -> None:
         page.write_text(renewed, encoding="utf-8")
 
 
+def renew_numbered(page: Path, tables: Mapping[str, str]) -> list[str]:
+    """Put the tables of studies, which are separated by empty lines, into a page that names them by number.
+
+    Returns:
+        A line for each table that the study does not have; what is there then stays, as it does if the study failed.
+    """
+    missing = []
+
+    def table_for(found: re.Match[str]) -> str | None:
+        if found["study"] not in tables:
+            return None
+        of_study = tables[found["study"]].split("\n\n")
+        number = int(found["number"])
+        if 1 <= number <= len(of_study):
+            return of_study[number - 1]
+        missing.append(f"{page.name}: no table {number} of {found['study']}")
+        return None
+
+    renew(page, table_for)
+    return missing
+
+
 def to_html(text: str, folder: Path) -> tuple[str, list[str]]:
-    """Return a page as HTML that needs no other file, and the images that it lacks."""
+    """Return a page as HTML with its images in it, and the names of missing images."""
     missing = []
 
     def inline(found: re.Match[str]) -> str:
@@ -135,11 +190,11 @@ def to_html(text: str, folder: Path) -> tuple[str, list[str]]:
 
     body = markdown.markdown(text, extensions=["tables", "fenced_code", "sane_lists"])
     body = re.sub(r'src="(?!data:|https?:)([^"]+)"', inline, body)
-    return re.sub(r'href="\.\./([^/"]+)/README\.md"', r'href="#\1"', body), missing
+    return re.sub(r'href="\.\./([^/"]+)/README\.md(?:#[^"]*)?"', r'href="#\1"', body), missing
 
 
 def bind(pages: list[tuple[str, str]]) -> str:
-    """Return all pages as one document with a list of contents."""
+    """Return all pages as one document with a table of contents."""
     contents = " · ".join(f'<a href="#{name}">{name}</a>' for name, _ in pages)
     sections = "\n".join(f'<section id="{name}">\n{body}\n</section>' for name, body in pages)
     head = f'<meta charset="utf-8"><title>hpamdp: experiments</title><style>{STYLE}</style>'
@@ -149,7 +204,7 @@ def bind(pages: list[tuple[str, str]]) -> str:
 
 
 def main() -> int:
-    """Make the report of this folder; return the exit code."""
+    """Make the report of this folder; return 1 if anything failed, else 0."""
     target = HERE.parent / "report"
     failures = report(HERE, target)
     print(f"Everything is in {target / 'report.html'}")

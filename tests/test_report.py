@@ -1,4 +1,4 @@
-"""The report of all studies: renewed tables, one page that needs no other file, and failures that lose nothing else."""
+"""The report of all studies: renewed tables, one page that needs no other file, failures that stop nothing else."""
 
 import importlib.util
 import sys
@@ -15,11 +15,13 @@ def main(folders):
     figure = Figure()
     figure.subplots().plot([1, 2])
     figure.savefig(Path(__file__).parent / "line.png", dpi=20)
-    print("From somewhere\\n\\n| a | b |\\n|---|---|\\n| 1 \\\\ 2 | 0.5 |\\n\\ndone")
+    print("From somewhere\\n")
+    print("| a | b |\\n|---|---|\\n| 1 \\\\ 2 | 0.5 |\\n")
+    print("| c |\\n|---|\\n| 3 |\\n\\ndone")
 """
 PAGE = """# Fine
 
-See [the other](../sad/README.md).
+See [the other](../sad/README.md) and [a part of it](../sad/README.md#part).
 
 before
 <!-- table -->
@@ -29,6 +31,10 @@ after
 
 ![line](line.png)
 """
+
+
+FIRST_TABLE = "| a | b |\n|---|---|\n| 1 \\ 2 | 0.5 |"
+SECOND_TABLE = "| c |\n|---|\n| 3 |"
 
 
 @pytest.fixture(scope="module")
@@ -43,26 +49,28 @@ def module():
 
 @pytest.fixture
 def experiments(tmp_path):
-    for name, page, script in (
-        ("fine", PAGE, STUDY),
-        ("pageless", None, STUDY.replace("0.5", "0.7")),
-        (
-            "sad",
-            "# Sad\n\n<!-- table -->\n| kept |\n<!-- /table -->\n",
-            "def main(folders):\n    open('nowhere.csv')\n",
-        ),
-        ("told", "# Told\n", None),
-    ):
-        folder = tmp_path / "experiments" / name
-        folder.mkdir(parents=True)
-        if page:
-            (folder / "README.md").write_text(page)
-        if script:
-            (folder / "study.py").write_text(script)
-    return tmp_path / "experiments"
+    """Make a folder of studies: one that works, one without a page, one that fails, and a page without a study."""
+    pages = {
+        "fine": PAGE,
+        "sad": "# Sad\n\n<!-- table -->\n| kept |\n<!-- /table -->\n",
+        "told": "# Told\n",
+    }
+    scripts = {
+        "fine": STUDY,
+        "pageless": STUDY.replace("0.5", "0.7"),
+        "sad": "def main(folders):\n    open('nowhere.csv')\n",
+    }
+    root = tmp_path / "experiments"
+    for name in (*pages, "pageless"):
+        (root / name).mkdir(parents=True)
+    for name, page in pages.items():
+        (root / name / "README.md").write_text(page)
+    for name, script in scripts.items():
+        (root / name / "study.py").write_text(script)
+    return root
 
 
-def test_a_failing_study_is_named_and_loses_neither_the_others_nor_its_page(module, experiments, tmp_path):
+def test_a_failing_study_is_named_and_stops_neither_the_others_nor_its_own_page(module, experiments, tmp_path):
     (failure,) = module.report(experiments, tmp_path / "report")
     assert failure.startswith("sad: FileNotFoundError") and "nowhere.csv" in failure
     assert "| kept |" in (experiments / "sad/README.md").read_text()
@@ -71,23 +79,40 @@ def test_a_failing_study_is_named_and_loses_neither_the_others_nor_its_page(modu
     assert "<td>0.7</td>" in text and "Told</h1>" in text
 
 
-def test_a_table_is_renewed_between_its_markers_and_nothing_else_of_the_page(module, experiments, tmp_path):
+def test_all_tables_are_renewed_between_the_markers_and_nothing_else_of_the_page(module, experiments, tmp_path):
     module.report(experiments, tmp_path / "report")
-    renewed = "<!-- table -->\n| a | b |\n|---|---|\n| 1 \\ 2 | 0.5 |\n<!-- /table -->"
+    renewed = f"<!-- table -->\n{FIRST_TABLE}\n\n{SECOND_TABLE}\n<!-- /table -->"
     old = "<!-- table -->\n| old |\n<!-- /table -->"
     assert (experiments / "fine/README.md").read_text() == PAGE.replace(old, renewed)
+
+
+def test_a_page_in_which_nothing_changes_is_not_written(module, experiments, tmp_path):
+    module.report(experiments, tmp_path / "report")
     before = (experiments / "fine/README.md").stat().st_mtime_ns
     module.report(experiments, tmp_path / "report")
     assert (experiments / "fine/README.md").stat().st_mtime_ns == before
 
 
-def test_the_front_page_gets_the_first_table_of_the_study_that_it_names(module, experiments, tmp_path):
-    front = tmp_path / "README.md"
-    kept = "<!-- table of sad -->\n| kept |\n<!-- /table -->\n"
-    old = f"Good:\n\n<!-- table of fine -->\n| old |\n<!-- /table -->\n\n{kept}"
-    front.write_text(old)
+@pytest.mark.parametrize("name", ["README.md", "docs/results.md"])
+def test_the_front_page_and_the_documentation_get_the_tables_that_they_number(module, experiments, tmp_path, name):
+    page = tmp_path / name
+    page.parent.mkdir(exist_ok=True)
+    first = "Good:\n\n<!-- table 1 of fine -->\n| old |\n<!-- /table -->\n\n"
+    second = "<!-- table 2 of fine -->\n| older |\n<!-- /table -->\n\n"
+    of_failed_study = "<!-- table 1 of sad -->\n| kept |\n<!-- /table -->\n"
+    page.write_text(first + second + of_failed_study)
     module.report(experiments, tmp_path / "report")
-    assert front.read_text() == old.replace("| old |", "| a | b |\n|---|---|\n| 1 \\ 2 | 0.5 |")
+    renewed = first.replace("| old |", FIRST_TABLE) + second.replace("| older |", SECOND_TABLE)
+    assert page.read_text() == renewed + of_failed_study
+
+
+@pytest.mark.parametrize("number", [0, 3])
+def test_a_table_that_a_study_does_not_have_is_named_and_what_is_there_stays(module, experiments, tmp_path, number):
+    front = tmp_path / "README.md"
+    text = f"<!-- table {number} of fine -->\n| kept |\n<!-- /table -->\n"
+    front.write_text(text)
+    assert f"README.md: no table {number} of fine" in module.report(experiments, tmp_path / "report")
+    assert front.read_text() == text
 
 
 def test_every_figure_is_there_as_png_beside_its_page_and_as_svg_in_the_report(module, experiments, tmp_path):
@@ -97,7 +122,7 @@ def test_every_figure_is_there_as_png_beside_its_page_and_as_svg_in_the_report(m
     assert not list(experiments.rglob("*.svg"))
 
 
-def test_the_report_needs_no_other_file(module, experiments, tmp_path):
+def test_the_report_refers_to_no_other_file(module, experiments, tmp_path):
     module.report(experiments, tmp_path / "report")
     text = (tmp_path / "report/report.html").read_text()
     assert text.count("<img") == text.count('src="data:image/png;base64,') == 2

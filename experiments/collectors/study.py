@@ -1,7 +1,7 @@
-"""Train H-PPO on one boat with each way of collecting, one run after another.
+"""Train H-PPO on one boat with each collector, one run after another.
 
-python experiments/collectors/study.py run   eighteen runs; writes results.csv, then tabulates
-python experiments/collectors/study.py       tabulates what results.csv holds
+python experiments/collectors/study.py run   makes eighteen runs, writes results.csv, then tabulates
+python experiments/collectors/study.py       tabulates the stored results.csv
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ SEEDS = (0, 1, 2)
 COMMON = ["high=none", "low=hppo", "eval.every=0", "log_every=0"]
 TASKS = {
     "cheap steps": ["env.controller=congruent", "total_frames=300000"],
-    # The same boat, each copy stepped by Python in turn.
-    "dear steps": [
+    # The same boat as a Gymnasium environment, whose copies Python steps one after another.
+    "expensive steps": [
         "env=gymnasium",
         "env.id=hpamdp/BoatDock-v0",
         "env.kwargs={controller:congruent}",
@@ -39,13 +39,17 @@ TASKS = {
 
 
 def train(task: str, collector: str, seed: int) -> dict[str, float | str]:
-    """Return the final score of a run, its speed and what it cost."""
+    """Make a run and return its final score, its speed and its cost."""
     with tempfile.TemporaryDirectory() as folder:
-        before = time.perf_counter()
-        words = [*COMMON, *TASKS[task], f"collector={collector}", f"seed={seed}", f"hydra.run.dir={folder}"]
-        command = [sys.executable, str(RUN), *words]
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        whole_s = time.perf_counter() - before
+        overrides = [*COMMON, *TASKS[task], f"collector={collector}", f"seed={seed}", f"hydra.run.dir={folder}"]
+        started = time.perf_counter()
+        subprocess.run(
+            [sys.executable, str(RUN), *overrides],
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        whole_s = time.perf_counter() - started
         summary = json.loads((Path(folder) / "summary.json").read_text())
     return {
         "task": task,
@@ -61,8 +65,8 @@ def train(task: str, collector: str, seed: int) -> dict[str, float | str]:
 
 
 def run_all() -> Rows:
-    """Return a row a run; ways and seeds take turns, so that a busy machine is busy for all alike."""
-    rows = []
+    """Return a row for each run; collectors and seeds alternate, so that other load on the machine slows all alike."""
+    rows: Rows = []
     for task in TASKS:
         for seed in SEEDS:
             for collector in COLLECTORS:
@@ -72,15 +76,19 @@ def run_all() -> Rows:
 
 
 def table(rows: Rows) -> str:
-    """Return a line a task and collector: mean ± standard deviation over seeds of the score, means of the rest."""
+    """Return a line for each task and collector: mean ± standard deviation over seeds of the score, else means."""
     lines = ["| | collector | score | frames/s | wall s | CPU s | whole command, s |", "|---|---|---|---|---|---|---|"]
-    for (task, collector), of in groups(rows, "task", "collector").items():
-        speed, wall, cpu, whole = (
-            np.mean([row[key] for row in of]) for key in ("frames_per_s", "wall_s", "cpu_s", "whole_s")
+    for (task, collector), runs in groups(rows, "task", "collector").items():
+        score = spread([run["score"] for run in runs])
+        lines.append(
+            f"| {task} | `{collector}` | {score} | {_mean(runs, 'frames_per_s'):,.0f} | {_mean(runs, 'wall_s'):.1f} | "
+            f"{_mean(runs, 'cpu_s'):.1f} | {_mean(runs, 'whole_s'):.1f} |"
         )
-        score = spread([row["score"] for row in of])
-        lines.append(f"| {task} | `{collector}` | {score} | {speed:,.0f} | {wall:.1f} | {cpu:.1f} | {whole:.1f} |")
     return "\n".join(lines)
+
+
+def _mean(rows: Rows, column: str) -> float:
+    return float(np.mean([row[column] for row in rows]))
 
 
 def main(words: Sequence[str]) -> None:
@@ -88,7 +96,7 @@ def main(words: Sequence[str]) -> None:
     if words == ["run"]:
         write_tables(HERE, {"results": run_all()})
     elif words:
-        raise SystemExit(f"{' '.join(words)}: the only word is run; without it what results.csv holds is tabulated")
+        raise SystemExit(f"{' '.join(words)}: the only argument is run; without it the stored results.csv is tabulated")
     print(table(read_csv(HERE / "results.csv")))
 
 

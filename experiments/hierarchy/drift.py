@@ -1,11 +1,12 @@
-"""Context-free selectors over frozen learners, one boat handicapped by motor noise, the other one half-way on.
+"""Context-free selectors over frozen learners: motor noise on one boat first, then on the other.
 
 python experiments/hierarchy/drift.py RUN     plays with the learners of a run's output folder, writes drift.csv, draws
-python experiments/hierarchy/drift.py         draws and tabulates what drift.csv holds
+python experiments/hierarchy/drift.py         draws and tabulates the stored drift.csv
 """
 
 from __future__ import annotations
 
+import itertools
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -19,30 +20,44 @@ from tqdm import tqdm
 
 from hpamdp import keys
 from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
-from hpamdp.config import run_config
+from hpamdp.config import conf_dir, read
 from hpamdp.run.assemble import acting, assemble, make_env
 
 HERE = Path(__file__).resolve().parent
 SELECTORS = ("ucb", "thompson", "epsilon_greedy", "exp3")
 MEMORIES = {"all": "#2b2b2b", "discounted": "#0072B2", "sliding_window": "#D55E00"}
 SEEDS = range(3)
-NUM_ENVS, DECISIONS, EVERY = 20, 10_000, 200
-# Of the incongruent and of the congruent boat: the congruent one is the better one first, then the other.
+NUM_ENVS = 20
+DECISIONS = 10_000  # in each phase
+EVERY = 200  # decisions between two rows
+# Motor noise of the incongruent and of the congruent boat in each phase: first the congruent boat is the better one.
 NOISE = ((0.15, 0.0), (0.0, 0.15))
+BETTER = (1, 0)  # option, in each phase
 RECOVERED = 0.8  # share of the better boat among the last EVERY decisions
 
 
 def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, float | str]]:
-    """Yield a row every `EVERY` decisions: the share of the better boat, and its mean payoff less that earned."""
-    words = [f"high={high}", f"high.memory={memory}", "low=hppo", f"low.checkpoint={run}", "low.freeze=true"]
-    words += [f"seed={seed}", f"num_envs={NUM_ENVS}", "steps_per_batch=1", "eval.layouts=1"]
-    with initialize_config_dir(str(HERE.parents[1] / "conf"), version_base="1.3"):
-        phases = [compose("config", [*words, f"env.motor_noise=[{a},{b}]"]) for a, b in NOISE]
-    settings = run_config(phases[0])
+    """Yield a row every `EVERY` decisions: the share of the better boat, and the mean reward of each boat."""
+    overrides = [
+        f"high={high}",
+        f"high.memory={memory}",
+        "low=hppo",
+        f"low.checkpoint={run}",
+        "low.freeze=true",
+        f"seed={seed}",
+        f"num_envs={NUM_ENVS}",
+        "steps_per_batch=1",
+        "eval.layouts=1",
+    ]
+    phases = []
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        for incongruent, congruent in NOISE:
+            noise = f"env.motor_noise=[{incongruent},{congruent}]"
+            phases.append(read(compose("config", [*overrides, noise], return_hydra_config=True)))
     torch.manual_seed(seed)
-    agent = assemble(phases[0], settings, Path(tempfile.gettempdir())).agent
-    for phase, cfg in enumerate(phases):
-        env, policy = acting(make_env(cfg, NUM_ENVS, torch.device("cpu"), seed), agent, settings)
+    agent = assemble(phases[0], Path(tempfile.gettempdir())).agent
+    for phase, config in enumerate(phases):
+        env, policy = acting(make_env(config, NUM_ENVS, torch.device("cpu"), seed), agent, config)
         options: list[torch.Tensor] = []
         rewards: list[torch.Tensor] = []
         td = env.reset()
@@ -53,52 +68,67 @@ def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, floa
             options.append(td[keys.OPTION])
             rewards.append(td["next", keys.REWARD].squeeze(-1))
             td = following
-            if sum(map(len, options)) >= EVERY:
-                option, reward = torch.cat(options), torch.cat(rewards)
+            if len(options) * NUM_ENVS >= EVERY:
+                option = torch.cat(options)
+                reward = torch.cat(rewards)
                 options, rewards = [], []
-                row = {"high": high, "memory": memory, "seed": seed, "phase": phase}
-                yield (
-                    row
-                    | {"better": round((option == 1 - phase).float().mean().item(), 4)}
-                    | {
-                        f"reward_{i}": round(reward[option == i].mean().item(), 4) if (option == i).any() else ""
-                        for i in range(2)
-                    }
-                )
+                yield {
+                    "high": high,
+                    "memory": memory,
+                    "seed": seed,
+                    "phase": phase,
+                    "better": round((option == BETTER[phase]).float().mean().item(), 4),
+                    "reward_0": _mean_reward(reward[option == 0]),
+                    "reward_1": _mean_reward(reward[option == 1]),
+                }
+
+
+def _mean_reward(rewards: torch.Tensor) -> float | str:
+    """Return the mean for the csv file, an empty cell if there are no rewards."""
+    return round(rewards.mean().item(), 4) if len(rewards) else ""
 
 
 def recovery(rows: Rows) -> float:
-    """Return after how many decisions of the second phase the better boat has its share; inf if never."""
-    after = [row["better"] for row in rows if row["phase"] == 1]
-    return next(((i + 1) * EVERY for i, share in enumerate(after) if share >= RECOVERED), np.inf)
+    """Return after how many decisions of the second phase a run chooses the better boat again; inf if never."""
+    shares = [row["better"] for row in rows if row["phase"] == 1]
+    for number, share in enumerate(shares, start=1):
+        if share >= RECOVERED:
+            return number * EVERY
+    return np.inf
 
 
 def table(rows: Rows) -> str:
-    """Return a line a form: the share of the better boat at the phases' ends, and the decisions to recover."""
+    """Return a line for each form: the share of the better boat at the end of each phase, and the recovery by seed."""
     lines = [
         "| selector | memory | better boat before the change | at the end | decisions to recover, by seed |",
         "|---|---|---|---|---|",
     ]
-    for (high, memory), of in groups(rows, "high", "memory").items():
-        ends = []
-        for phase in range(2):
-            shares = [[r["better"] for r in one if r["phase"] == phase][-5:] for one in groups(of, "seed").values()]
-            ends.append(np.mean(shares))
-        times = [recovery(one) for one in groups(of, "seed").values()]
-        said = ", ".join(f"{time:,.0f}" if np.isfinite(time) else "never" for time in times)
-        lines.append(f"| {high} | {memory} | {ends[0]:.1%} | {ends[1]:.1%} | {said} |")
+    for (high, memory), of_form in groups(rows, "high", "memory").items():
+        runs = list(groups(of_form, "seed").values())
+        before = np.mean([_last_shares(run, phase=0) for run in runs])
+        after = np.mean([_last_shares(run, phase=1) for run in runs])
+        times = [recovery(run) for run in runs]
+        recovered = ", ".join(f"{time:,.0f}" if np.isfinite(time) else "never" for time in times)
+        lines.append(f"| {high} | {memory} | {before:.1%} | {after:.1%} | {recovered} |")
     return "\n".join(lines)
 
 
+def _last_shares(rows: Rows, phase: int) -> list[float]:
+    """Return the shares of the better boat in the last five rows of a run's phase."""
+    return [row["better"] for row in rows if row["phase"] == phase][-5:]
+
+
 def draw(rows: Rows, path: Path) -> None:
-    """Draw the share of the better boat over decisions, a panel a selector."""
+    """Draw the share of the better boat over decisions, a panel for each selector."""
     figure = Figure(figsize=(13.0, 3.4), layout="constrained")
     for axes, high in zip(figure.subplots(1, len(SELECTORS), sharey=True), SELECTORS, strict=True):
         for memory, colour in MEMORIES.items():
-            of = [row for row in rows if row["high"] == high and row["memory"] == memory]
-            if of:
-                shares = np.mean([[row["better"] for row in one] for one in groups(of, "seed").values()], 0)
-                axes.plot(EVERY * np.arange(1, len(shares) + 1), shares, color=colour, linewidth=1.4, label=memory)
+            of_form = [row for row in rows if row["high"] == high and row["memory"] == memory]
+            if not of_form:
+                continue
+            runs = groups(of_form, "seed").values()
+            shares = np.mean([[row["better"] for row in run] for run in runs], axis=0)
+            axes.plot(EVERY * np.arange(1, len(shares) + 1), shares, color=colour, linewidth=1.4, label=memory)
         axes.axvline(DECISIONS, color="#8c8c8c", linestyle=":")
         axes.set_title(high, loc="left", fontsize=10, fontweight="bold")
         axes.set_xlabel("decisions")
@@ -112,8 +142,11 @@ def main(arguments: Sequence[str]) -> None:
     """Play, draw, tabulate."""
     if arguments:
         torch.set_num_threads(1)
-        forms = [(high, memory, seed) for high in SELECTORS for memory in MEMORIES for seed in SEEDS]
-        write_tables(HERE, {"drift": [row for form in tqdm(forms) for row in play(arguments[0], *form)]})
+        forms = itertools.product(SELECTORS, MEMORIES, SEEDS)
+        rows = []
+        for high, memory, seed in tqdm(forms, total=len(SELECTORS) * len(MEMORIES) * len(SEEDS)):
+            rows.extend(play(arguments[0], high, memory, seed))
+        write_tables(HERE, {"drift": rows})
     rows = read_csv(HERE / "drift.csv")
     draw(rows, HERE / "drift.png")
     print(table(rows))

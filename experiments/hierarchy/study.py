@@ -1,7 +1,7 @@
 """Gather the runs of the hierarchy's multirun into csv files, and draw and tabulate them.
 
 python experiments/hierarchy/study.py multirun/hierarchy     reads the runs, writes the csv files, then draws
-python experiments/hierarchy/study.py                        draws and tabulates what the csv files hold
+python experiments/hierarchy/study.py                        draws and tabulates the stored csv files
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -20,7 +21,7 @@ from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, 
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 
 HERE = Path(__file__).resolve().parent
-# Those that see the layout, those that do not, and the lines to hold them against.
+# Selectors that see the layout, those that do not, and the references.
 SELECTORS = {
     "meta_critic": "#0072B2",
     "linucb": "#009E73",
@@ -34,7 +35,8 @@ SELECTORS = {
     "human": "#D98200",
     "oracle": "#2b2b2b",
 }
-FIGURES = {
+# Columns of results.csv and the summary's names for them.
+COLUMNS = {
     "score": "score",
     "success": "success",
     "agreement": "oracle_agreement",
@@ -50,58 +52,80 @@ FIGURES = {
 
 
 def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
-    """Return a row a run, a row an evaluation, and a row a run and bin of bearings."""
-    results, curves, choices = [], [], []
+    """Return a row for each run, for each evaluation, and for each run and bin of bearings."""
+    results: Rows = []
+    curves: Rows = []
+    choices: Rows = []
     for run in runs:
-        summary = run.summary
-        practice = run.config.agent.get("uniform_option_frames", 0)
-        name = {"high": summary["high"], "low": summary["low"], "total": run.config.total_frames, "practice": practice}
-        name["seed"] = summary["seed"]
-        results.append(name | {column: round(summary[key], 4) for column, key in FIGURES.items()})
+        name = {
+            "high": run.summary["high"],
+            "low": run.summary["low"],
+            "total": run.config.total_frames,
+            "uniform_option_frames": run.config.agent.get("uniform_option_frames", 0),
+            "seed": run.summary["seed"],
+        }
+        figures = {column: round(run.summary[key], 4) for column, key in COLUMNS.items()}
+        results.append({**name, **figures})
         for row in run.evaluations():
-            told = {key: row[f"eval/{key}"] for key in ("score", "regret", "oracle_agreement")}
-            drift = [abs(value) for key, value in row.items() if key.startswith("eval/drift_")]
-            told["drift"] = float(np.mean(drift)) if drift else 0.0
-            curves.append(name | {"frames": row["frames"]} | {key: round(value, 4) for key, value in told.items()})
+            curves.append(
+                {
+                    **name,
+                    "frames": row["frames"],
+                    "score": round(row["eval/score"], 4),
+                    "regret": round(row["eval/regret"], 4),
+                    "oracle_agreement": round(row["eval/oracle_agreement"], 4),
+                    "drift": round(_mean_drift(row), 4),
+                }
+            )
         played = run.played()
         bins = np.digitize(played["bearing_offset"], OFFSET_EDGES[1:-1])
-        for i, low in enumerate(OFFSET_EDGES[:-1]):
-            share = played["option"][bins == i].mean()  # option 1 is the congruent boat
-            choices.append(name | {"offset": low, "congruent": round(float(share), 4)})
+        for number, offset in enumerate(OFFSET_EDGES[:-1]):
+            share = float(played["option"][bins == number].mean())  # option 1 is the congruent boat
+            choices.append({**name, "offset": offset, "congruent": round(share, 4)})
     return results, curves, choices
 
 
+def _mean_drift(evaluation: dict[str, float]) -> float:
+    """Return the mean absolute drift of the options, 0 where the evaluation has none."""
+    drift = [abs(value) for column, value in evaluation.items() if column.startswith("eval/drift_")]
+    return float(np.mean(drift)) if drift else 0.0
+
+
 def table(results: Rows) -> str:
-    """Return a line a selector and learner: mean and standard deviation over seeds."""
+    """Return a line for each selector and learner: mean and standard deviation over seeds, best score first."""
     lines = [
         "| selector | learner | presses, uniform | n | score | oracle's | weighted | regret | gain | success | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    by_score = sorted(
-        groups(results, "low", "total", "practice", "high").items(),
-        key=lambda item: (*item[0][:3], -np.mean([row["score"] for row in item[1]])),
-    )
-    for (low, total, practice, high), rows in by_score:
-        mean = {key: np.mean([row[key] for row in rows]) for key in FIGURES}
-        name = f"| {high} | {low} | {total:,.0f}, {practice:,.0f} | {len(rows)}"
-        score, agreement = spread([row["score"] for row in rows]), f"{mean['agreement']:.1%}"
+    cases = groups(results, "low", "total", "uniform_option_frames", "high").items()
+    for (low, total, uniform, high), runs in sorted(cases, key=_order):
+        mean = {column: np.mean([run[column] for run in runs]) for column in COLUMNS}
+        score = spread([run["score"] for run in runs])
         lines.append(
-            f"{name} | {score} | {agreement} | {mean['weighted_agreement']:.1%} | {mean['regret']:.3f} | "
-            f"{mean['choice_gain']:.3f} | {mean['success']:.1%} | {mean['cpu_s']:.0f} s |"
+            f"| {high} | {low} | {total:,.0f}, {uniform:,.0f} | {len(runs)} | {score} | {mean['agreement']:.1%} | "
+            f"{mean['weighted_agreement']:.1%} | {mean['regret']:.3f} | {mean['choice_gain']:.3f} | "
+            f"{mean['success']:.1%} | {mean['cpu_s']:.0f} s |"
         )
     return "\n".join(lines)
 
 
+def _order(case: tuple[tuple[Any, ...], Rows]) -> tuple[Any, ...]:
+    """Return the place of a line: by learner, length and uniform options, then the best score first."""
+    (low, total, uniform, _), runs = case
+    return low, total, uniform, -np.mean([run["score"] for run in runs])
+
+
 def of_the_map(rows: Rows) -> Rows:
-    """Return the rows of those runs of each learner that all selectors have: its commonest length, no practice."""
-    lengths = {
-        low: Counter(row["total"] for row in of).most_common(1)[0][0] for (low,), of in groups(rows, "low").items()
-    }
-    return [row for row in rows if row["total"] == lengths[row["low"]] and not row["practice"]]
+    """Return the runs that all selectors have: those of each learner's commonest length, without uniform options."""
+    commonest = {}
+    for (low,), of_learner in groups(rows, "low").items():
+        lengths = Counter(row["total"] for row in of_learner)
+        commonest[low], _ = lengths.most_common(1)[0]
+    return [row for row in rows if row["total"] == commonest[row["low"]] and row["uniform_option_frames"] == 0]
 
 
 def draw_map(results: Rows, path: Path) -> None:
-    """Draw the scores as a map of selectors and learners."""
+    """Draw the mean scores as a map, a row for each selector and a column for each learner."""
     lows = list(dict.fromkeys(row["low"] for row in results))
     highs = [high for high in SELECTORS if any(row["high"] == high for row in results)]
     scores = np.full((len(highs), len(lows)), np.nan)
@@ -119,8 +143,8 @@ def draw_map(results: Rows, path: Path) -> None:
     figure.savefig(path, dpi=140)
 
 
-def draw_curves(curves: Rows, key: str, label: str, path: Path) -> None:
-    """Draw a figure of the evaluations against presses, a panel a learner: mean and deviation over seeds."""
+def draw_curves(curves: Rows, column: str, label: str, path: Path) -> None:
+    """Draw a column of the evaluations against presses, a panel for each learner: mean and deviation over seeds."""
     lows = list(dict.fromkeys(row["low"] for row in curves))
     figure = Figure(figsize=(6.2 * len(lows), 4.0), layout="constrained")
     for axes, low in zip(figure.subplots(1, len(lows), squeeze=False)[0], lows, strict=True):
@@ -128,17 +152,17 @@ def draw_curves(curves: Rows, key: str, label: str, path: Path) -> None:
             rows = [row for row in curves if row["low"] == low and row["high"] == high]
             if not rows:
                 continue
-            x, mean, deviation = curve(rows, "frames", key)
+            x, mean, deviation = curve(rows, "frames", column)
             axes.plot(x, mean, color=colour, linewidth=1.5, label=high)
             axes.fill_between(x, mean - deviation, mean + deviation, color=colour, alpha=0.15, linewidth=0)
-        _finish(axes, f"{low}", "presses", label)
+        _label(axes, low, "presses", label)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.legend(fontsize=7, frameon=False, ncols=2)
     figure.savefig(path, dpi=130)
 
 
 def draw_choices(choices: Rows, path: Path) -> None:
-    """Draw the share of the congruent boat by the bearing's offset, a panel a learner, with people's."""
+    """Draw the share of the congruent boat by the bearing's offset, a panel for each learner, with people's share."""
     lows = list(dict.fromkeys(row["low"] for row in choices))
     middle = np.add(OFFSET_EDGES[:-1], OFFSET_EDGES[1:]) / 2
     figure = Figure(figsize=(6.2 * len(lows), 4.0), layout="constrained")
@@ -147,16 +171,17 @@ def draw_choices(choices: Rows, path: Path) -> None:
             rows = [row for row in choices if row["low"] == low and row["high"] == high]
             if not rows or high == "human":
                 continue
-            shares = [np.mean([r["congruent"] for r in of]) for of in groups(rows, "offset").values()]
+            bins = groups(rows, "offset").values()
+            shares = [np.mean([row["congruent"] for row in of_bin]) for of_bin in bins]
             axes.plot(middle, shares, color=colour, linewidth=1.5, label=high)
         axes.plot(middle, HUMAN_CONGRUENT_BY_OFFSET, "--", color=SELECTORS["human"], linewidth=2.2, label="people")
-        _finish(axes, low, "degrees from the congruent boat's nearest direction", "share of the congruent boat")
+        _label(axes, low, "degrees from the congruent boat's nearest direction", "share of the congruent boat")
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.legend(fontsize=7, frameon=False, ncols=2)
     figure.savefig(path, dpi=130)
 
 
-def _finish(axes: Axes, title: str, x: str, y: str) -> None:
+def _label(axes: Axes, title: str, x: str, y: str) -> None:
     axes.set_title(title, loc="left", fontsize=10, fontweight="bold")
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -165,13 +190,14 @@ def _finish(axes: Axes, title: str, x: str, y: str) -> None:
 
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
-    names = ("results", "curves", "choices")
     if folders:
-        write_tables(HERE, dict(zip(names, gather(finished(folders)), strict=True)))
-    results, curves, choices = (read_csv(HERE / f"{name}.csv") for name in names)
+        results, curves, choices = gather(finished(folders))
+        write_tables(HERE, {"results": results, "curves": curves, "choices": choices})
+    results = read_csv(HERE / "results.csv")
+    curves = of_the_map(read_csv(HERE / "curves.csv"))
+    choices = of_the_map(read_csv(HERE / "choices.csv"))
     print(table(results))
-    results, curves, choices = map(of_the_map, (results, curves, choices))
-    draw_map(results, HERE / "map.png")
+    draw_map(of_the_map(results), HERE / "map.png")
     draw_curves(curves, "regret", "regret of the greedy choice", HERE / "regret.png")
     draw_curves(curves, "score", "score, greedy, 1,000 layouts", HERE / "curves.png")
     draw_choices(choices, HERE / "choices.png")

@@ -1,7 +1,8 @@
-"""Measure people on the released recording into csv files, and draw and tabulate what these hold.
+"""Measure people's episodes in the released recording, write csv files, draw and tabulate them.
 
-python experiments/human/study.py measure     reads the recording (HPAMDP_HUMAN_DATA or the cache), writes the csv files
-python experiments/human/study.py             draws and tabulates what the csv files hold
+python experiments/human/study.py measure     reads the recording (HPAMDP_HUMAN_DATA or the cache), writes the csv
+                                              files, then draws and tabulates
+python experiments/human/study.py             draws and tabulates the stored csv files
 """
 
 from __future__ import annotations
@@ -25,11 +26,22 @@ from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.reference import OFFSET_EDGES
 
 HERE = Path(__file__).resolve().parent
-PEOPLE, FAINT, INK, CHOICE, PRESSES = "#D98200", "#c9c9c9", "#2b2b2b", "#CC79A7", "#0072B2"
-GOOD, FAST, SHORT = "#009E73", "#D55E00", "#332288"
-STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "savefig.dpi": 150}
-STYLE |= {"axes.titlelocation": "left", "axes.titleweight": "bold", "axes.titlesize": 10}
+HUMAN, FAINT, INK, CHOICE, PRESSES = "#D98200", "#c9c9c9", "#2b2b2b", "#CC79A7", "#0072B2"
+DOCKED, TOO_FAST, SHORT = "#009E73", "#D55E00", "#332288"
+STYLE = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "savefig.dpi": 150,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.titlesize": 10,
+}
+BLOCK_EPISODES = 60
+ALL_BLOCKS = -1
+BOTH_BOATS = -1
 Rows = list[dict[str, float]]
+Columns = dict[str, np.ndarray]
 
 
 def measure() -> None:
@@ -37,146 +49,188 @@ def measure() -> None:
     data = read(one_frame=True)
     best = statistics.best_scores(data)
     gaps = statistics.optimality_gaps(data, best)
-    write("people", people(data, best, gaps))
+    write("persons", persons(data, best, gaps))
     write("blocks", blocks(data, gaps))
     write("choices", choices(data, best))
-    singles, ways = validation.single_presses(data), validation.first_presses(data)
+    singles = validation.single_presses(data)
     write("singles", rows_of(singles._asdict()))
-    write("first_presses", rows_of(ways._asdict()))
+    write("first_presses", rows_of(validation.first_presses(data)._asdict()))
     fit = validation.fit(singles)
-    names = ("likely_glide", "likely_speed", "agreeing_glide", "agreeing_speed")
-    write("fit", [dict(zip(("value", "low", "high"), getattr(fit, n), strict=True), constant=n) for n in names])
+    constants = ("likely_glide", "likely_speed", "agreeing_glide", "agreeing_speed")
+    rows = []
+    for constant in constants:
+        value, low, high = getattr(fit, constant)
+        rows.append({"value": value, "low": low, "high": high, "constant": constant})
+    write("fit", rows)
     glide, speed = torch.meshgrid(fit.glides, fit.speeds, indexing="ij")
-    columns = {"glide": glide.flatten(), "docking_speed": speed.flatten(), "agreement": fit.agreement.flatten()}
-    write("agreement", rows_of(columns))
+    grid = {"glide": glide.flatten(), "docking_speed": speed.flatten(), "agreement": fit.agreement.flatten()}
+    write("agreement", rows_of(grid))
 
 
 def rows_of(columns: Mapping[str, torch.Tensor]) -> Rows:
+    """Return columns as rows."""
     lists = {name: column.double().tolist() for name, column in columns.items()}
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
 
 
-def people(data: HumanData, best: torch.Tensor, gaps: Mapping[str, torch.Tensor]) -> Rows:
-    """Return a row a person: figures, and the mean gaps to the best plans on the person's own layouts."""
+def persons(data: HumanData, best: torch.Tensor, gaps: Mapping[str, torch.Tensor]) -> Rows:
+    """Return a row for each person: figures, and the mean gaps to the best plans on the person's own layouts."""
     rows = []
-    better = best.argmax(1) == data.episodes["controller"]
+    is_better_boat = best.argmax(1) == data.episodes["controller"]
+    last_block = data.episodes["block"] == 5
     for person, figures in statistics.figures_by(data, "person").items():
         own = data.episodes["person"] == person
-        means = {name: gap[own].mean().item() for name, gap in gaps.items()}
-        last = statistics.figures(data, own & (data.episodes["block"] == 5))["score"]
-        ceiling = {"ceiling": best[own].max(1).values.mean().item(), "better_boat": better[own].double().mean().item()}
-        rows.append({"person": person, **figures, **ceiling, **means, "score_last_60": last})
+        row = {"person": person, **figures}
+        row["ceiling"] = best[own].max(1).values.mean().item()
+        row["better_boat"] = is_better_boat[own].double().mean().item()
+        for name, gap in gaps.items():
+            row[name] = gap[own].mean().item()
+        row["score_last_60"] = statistics.figures(data, own & last_block)["score"]
+        rows.append(row)
     return rows
 
 
 def blocks(data: HumanData, gaps: Mapping[str, torch.Tensor]) -> Rows:
-    """Return a row a block and a boat (or both, -1), with the middle half of the people."""
+    """Return a row for each block and boat (or both boats), with quantiles of the people's mean scores."""
     rows = []
     for block in data.episodes["block"].unique().tolist():
         of_block = data.episodes["block"] == block
-        for controller in (-1, *range(len(harbour.CONTROLLERS))):
-            mask = of_block if controller < 0 else of_block & (data.episodes["controller"] == controller)
-            person, num = data.episodes["person"][mask], len(data.episodes["person"].unique())
-            means = torch.bincount(person, score(data)[mask], num) / torch.bincount(person, minlength=num)
-            means = means[means.isfinite()].double()
-            spread = {f"score_{q}": means.quantile(q / 100).item() for q in (10, 25, 75, 90)}
-            mean_gaps = {name: gap[mask].mean().item() for name, gap in gaps.items()}
-            rows.append(
-                {"block": block, "controller": controller, **statistics.figures(data, mask), **spread, **mean_gaps}
-            )
+        for controller in (BOTH_BOATS, *range(len(harbour.CONTROLLERS))):
+            mask = of_block
+            if controller != BOTH_BOATS:
+                mask = of_block & (data.episodes["controller"] == controller)
+            row = {"block": block, "controller": controller, **statistics.figures(data, mask)}
+            means = _mean_score_of_each_person(data, mask)
+            for percent in (10, 25, 75, 90):
+                row[f"score_{percent}"] = means.quantile(percent / 100).item()
+            for name, gap in gaps.items():
+                row[name] = gap[mask].mean().item()
+            rows.append(row)
     return rows
 
 
+def _mean_score_of_each_person(data: HumanData, mask: torch.Tensor) -> torch.Tensor:
+    """Return the mean scores of the people who have episodes in `mask`, float64."""
+    person = data.episodes["person"][mask]
+    num_persons = len(data.episodes["person"].unique())
+    means = torch.bincount(person, score(data)[mask], num_persons) / torch.bincount(person, minlength=num_persons)
+    return means[means.isfinite()].double()
+
+
 def choices(data: HumanData, best: torch.Tensor) -> Rows:
-    """Return a row a block (or all, -1) and a bin of bearings: who chose the congruent boat, where it was better."""
-    rows, bins = [], statistics.offset_bins(data)
-    better = (best.argmax(1) == harbour.CONGRUENT).double()
+    """Return a row for each block (or all) and bin of bearings: how often the congruent boat was chosen, and better."""
+    rows = []
+    bins = statistics.offset_bins(data)
+    is_congruent_better = (best.argmax(1) == harbour.CONGRUENT).double()
     worth = (best[:, 1] - best[:, 0]).abs()
-    for block in (-1, *data.episodes["block"].unique().tolist()):
-        mask = torch.ones_like(bins, dtype=torch.bool) if block < 0 else data.episodes["block"] == block
+    for block in (ALL_BLOCKS, *data.episodes["block"].unique().tolist()):
+        mask = torch.ones_like(bins, dtype=torch.bool) if block == ALL_BLOCKS else data.episodes["block"] == block
         for number, share in enumerate(statistics.choice_curve(data, mask)):
             own = mask & (bins == number)
             rows.append(
-                {"block": block, "offset": OFFSET_EDGES[number], "episodes": int(own.sum()), "congruent": share}
-                | {"congruent_is_better": better[own].mean().item(), "worth": worth[own].mean().item()}
+                {
+                    "block": block,
+                    "offset": OFFSET_EDGES[number],
+                    "episodes": int(own.sum()),
+                    "congruent": share,
+                    "congruent_is_better": is_congruent_better[own].mean().item(),
+                    "worth": worth[own].mean().item(),
+                }
             )
     return rows
 
 
 def write(name: str, rows: Iterable[Mapping[str, object]]) -> None:
-    rows = [{k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()} for row in rows]
+    """Write rows as a csv file, numbers with four digits."""
+    rounded = [
+        {column: round(value, 4) if isinstance(value, float) else value for column, value in row.items()}
+        for row in rows
+    ]
     with (HERE / f"{name}.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer = csv.DictWriter(file, list(rounded[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(rounded)
 
 
-def load(name: str) -> dict[str, np.ndarray]:
+def load(name: str) -> Columns:
+    """Read the columns of a csv file: numbers, but for the names of constants."""
     with (HERE / f"{name}.csv").open() as file:
         rows = list(csv.DictReader(file))
-    return {k: np.array([row[k] for row in rows]) if k == "constant" else np.array([float(row[k]) for row in rows])
-            for k in rows[0]}  # fmt: skip
+    columns = {}
+    for column in rows[0]:
+        values = [row[column] for row in rows]
+        columns[column] = np.array(values) if column == "constant" else np.array(values, dtype=float)
+    return columns
 
 
 def draw() -> None:
     """Draw the three figures."""
-    for name, panels in (
-        ("yardstick", (draw_learning, draw_gaps)),
-        ("choices", (draw_choices, draw_better_boat)),
-        ("physics", (draw_singles, draw_ways, draw_agreement)),
-    ):
+    figures = {
+        "yardstick": (draw_learning, draw_gaps),
+        "choices": (draw_choices, draw_better_boat),
+        "physics": (draw_singles, draw_ways, draw_agreement),
+    }
+    for name, panels in figures.items():
         with mpl.rc_context(STYLE):
             figure = Figure(figsize=(3.6 * len(panels) + 1.2, 3.6), layout="constrained")
-            axes = np.atleast_1d(figure.subplots(1, len(panels)))
-            for panel, each in zip(panels, axes, strict=True):
-                panel(each)
+            for draw_panel, axes in zip(panels, figure.subplots(1, len(panels)), strict=True):
+                draw_panel(axes)
             figure.savefig(HERE / f"{name}.png")
 
 
 def draw_learning(axes: Axes) -> None:
-    rows, persons = load("blocks"), load("people")
-    both = rows["controller"] < 0
-    x = 60 * rows["block"][both] + 30
-    axes.fill_between(x, rows["score_10"][both], rows["score_90"][both], color=PEOPLE, alpha=0.15, linewidth=0)
-    axes.fill_between(x, rows["score_25"][both], rows["score_75"][both], color=PEOPLE, alpha=0.25, linewidth=0)
-    axes.plot(x, rows["score"][both], color=PEOPLE, marker="o", markersize=4)
-    axes.annotate("people: mean,\nmiddle 50 % and 80 %", (x[3], 0.75), color=PEOPLE, ha="center")
-    best = persons["score"].max()
-    for value, text in ((persons["ceiling"].mean(), "best plan with the better boat"), (best, "best person")):
-        axes.axhline(value, color=INK if value > best else PEOPLE, linewidth=1, linestyle="-" if value > best else "-.")
-        axes.annotate(text, (0, value), xytext=(2, 3), textcoords="offset points")
-    axes.set(
-        xlabel="episode", ylabel="score", xlim=(0, 360), ylim=(0, 4), title="People learn, and stay below the ceiling"
+    """Draw the mean score of each block, with the middle half and the middle four fifths of the people."""
+    rows, of_persons = load("blocks"), load("persons")
+    both = rows["controller"] == BOTH_BOATS
+    x = BLOCK_EPISODES * rows["block"][both] + BLOCK_EPISODES / 2
+    axes.fill_between(x, rows["score_10"][both], rows["score_90"][both], color=HUMAN, alpha=0.15, linewidth=0)
+    axes.fill_between(x, rows["score_25"][both], rows["score_75"][both], color=HUMAN, alpha=0.25, linewidth=0)
+    axes.plot(x, rows["score"][both], color=HUMAN, marker="o", markersize=4)
+    axes.annotate("people: mean,\nmiddle 50 % and 80 %", (x[3], 0.75), color=HUMAN, ha="center")
+    references = (
+        ("best plan with the better boat", of_persons["ceiling"].mean(), INK, "-"),
+        ("best person", of_persons["score"].max(), HUMAN, "-."),
     )
+    for text, height, colour, style in references:
+        axes.axhline(height, color=colour, linewidth=1, linestyle=style)
+        axes.annotate(text, (0, height), xytext=(2, 3), textcoords="offset points")
+    axes.set(xlabel="episode", ylabel="score", xlim=(0, 360), ylim=(0, 4))
+    axes.set_title("People learn, and stay below the ceiling")
 
 
 def draw_gaps(axes: Axes) -> None:
-    rows = load("people")
+    """Draw what each person lost with the keys and by the choice of the boat."""
+    rows = load("persons")
     order = np.argsort(rows["gap"])
     x = np.arange(len(order))
-    axes.bar(x, rows["press_gap"][order], color=PRESSES, width=0.8, label="lost with the keys")
-    bottom = rows["press_gap"][order]
-    axes.bar(
-        x, rows["choice_gap"][order], bottom=bottom, color=CHOICE, width=0.8, label="lost by the choice of the boat"
-    )
-    axes.set(
-        xlabel="people, best first", xticks=[], ylabel="score below the best plan", title="Optimality gap, own layouts"
-    )
+    lost_with_keys = rows["press_gap"][order]
+    lost_by_choice = rows["choice_gap"][order]
+    axes.bar(x, lost_with_keys, color=PRESSES, width=0.8, label="lost with the keys")
+    axes.bar(x, lost_by_choice, bottom=lost_with_keys, color=CHOICE, width=0.8, label="lost by the choice of the boat")
+    axes.set(xlabel="people, best first", xticks=[], ylabel="score below the best plan")
+    axes.set_title("Optimality gap, own layouts")
     axes.legend(frameon=False, loc="upper left")
 
 
 def draw_choices(axes: Axes) -> None:
+    """Draw how often the congruent boat was chosen by the bearing, and how often it was the better one."""
     rows = load("choices")
-    for block, colour, label in ((-1, PEOPLE, "people"), (0, FAINT, "first 60"), (5, INK, "last 60")):
+    for block, colour, label in ((ALL_BLOCKS, HUMAN, "people"), (0, FAINT, "first 60"), (5, INK, "last 60")):
         own = rows["block"] == block
-        share, num = rows["congruent"][own], rows["episodes"][own]
-        error = 1.96 * np.sqrt(share * (1 - share) / num)
+        share = rows["congruent"][own]
+        error = 1.96 * np.sqrt(share * (1 - share) / rows["episodes"][own])
         axes.errorbar(
             rows["offset"][own] + 5, share, error, color=colour, marker="o", markersize=4, capsize=2, label=label
         )
-    every = rows["block"] < 0
-    axes.plot(rows["offset"][every] + 5, rows["congruent_is_better"][every], color=PRESSES, marker="s", markersize=4,
-              label="better boat")  # fmt: skip
+    every = rows["block"] == ALL_BLOCKS
+    axes.plot(
+        rows["offset"][every] + 5,
+        rows["congruent_is_better"][every],
+        color=PRESSES,
+        marker="s",
+        markersize=4,
+        label="better boat",
+    )
     axes.set(xlim=(0, 60), ylim=(0, 1), title="Congruent boat chosen")
     axes.set_xlabel("degrees between bearing and congruent boat's nearest key")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -184,8 +238,9 @@ def draw_choices(axes: Axes) -> None:
 
 
 def draw_better_boat(axes: Axes) -> None:
-    rows = load("people")
-    axes.scatter(rows["better_boat"], rows["score"], color=PEOPLE, s=18)
+    """Draw each person's score against the share of episodes with the better boat."""
+    rows = load("persons")
+    axes.scatter(rows["better_boat"], rows["score"], color=HUMAN, s=18)
     axes.set(xlabel="episodes with the better boat", ylabel="score", title="Choosing well and scoring well, 40 people")
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     correlation = np.corrcoef(rows["better_boat"], rows["score"])[0, 1]
@@ -193,11 +248,18 @@ def draw_better_boat(axes: Axes) -> None:
 
 
 def draw_singles(axes: Axes) -> None:
+    """Draw where single presses ended, and the lines at which our boats stop or get too slow to fail."""
     rows = load("singles")
-    for code, colour, label in ((1, GOOD, "docked"), (2, FAST, "too fast"), (-1, SHORT, "dock not reached")):
-        own = rows["outcome"] == code if code > 0 else rows["outcome"] > 2
-        wrong = own & (_reached(rows["outcome"]) != _reached(rows["predicted"]))
+    outcome = rows["outcome"]
+    is_wrong = _reached(outcome) != _reached(rows["predicted"])
+    groups = (
+        (outcome == physics.SUCCESS, DOCKED, "docked"),
+        (outcome == physics.TOO_FAST, TOO_FAST, "too fast"),
+        (outcome > physics.TOO_FAST, SHORT, "dock not reached"),
+    )
+    for own, colour, label in groups:
         axes.scatter(rows["pressed"][own], rows["to_dock"][own], s=8, color=colour, label=f"{label} ({own.sum()})")
+        wrong = own & is_wrong
         axes.scatter(
             rows["pressed"][wrong], rows["to_dock"][wrong], s=38, facecolor="none", edgecolor=INK, linewidth=0.8
         )
@@ -209,7 +271,7 @@ def draw_singles(axes: Axes) -> None:
     axes.plot(x, way, color=INK, linewidth=1, linestyle="--")
     axes.annotate("74 px/s", (93, 1.95 * 93 - 0.95 * slow), xytext=(4, -10), textcoords="offset points")
     axes.set(xlabel="px covered while the key is down", ylabel="px to the dock", xlim=(0, 118), ylim=(0, 200))
-    axes.set_title("Single presses (ringed: told wrong)")
+    axes.set_title("Single presses (ringed: predicted wrong)")
     axes.legend(frameon=False, loc="upper left")
 
 
@@ -220,12 +282,14 @@ def duration_at(speed: float) -> torch.Tensor:
 
 
 def _reached(outcome: np.ndarray) -> np.ndarray:
+    """Return how the boat reached the dock, 0 where it did not."""
     return np.where((outcome == physics.SUCCESS) | (outcome == physics.TOO_FAST), outcome, 0)
 
 
 def draw_ways(axes: Axes) -> None:
+    """Draw how far first presses went, as a multiple of the way while the key is down."""
     rows = load("first_presses")
-    axes.hist(rows["travelled"] / rows["pressed"], bins=np.arange(0.9, 2.25, 0.05), color=PEOPLE)
+    axes.hist(rows["travelled"] / rows["pressed"], bins=np.arange(0.9, 2.25, 0.05), color=HUMAN)
     for edge, text in ((1.0, "no glide"), (1.0 + physics.GLIDE, "at rest")):
         axes.axvline(edge, color=INK, linewidth=1)
         axes.annotate(text, (edge, 74), ha="center", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1})
@@ -234,58 +298,68 @@ def draw_ways(axes: Axes) -> None:
 
 
 def draw_agreement(axes: Axes) -> None:
+    """Draw the share of outcomes predicted right over both constants, with the fitted ones and ours."""
     rows = load("agreement")
     glides, speeds = np.unique(rows["glide"]), np.unique(rows["docking_speed"])
     share = rows["agreement"].reshape(len(glides), len(speeds))
     image = axes.pcolormesh(speeds, glides, share, cmap="viridis", vmin=0.7, shading="nearest", rasterized=True)
-    axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, decimals=0), label="outcomes told right")
-    fit = {row: i for i, row in enumerate(load("fit")["constant"])}
-    values = load("fit")
-    for name, colour, label in (("likely", "white", "most likely"), ("agreeing", FAST, "most told right")):
-        y, x = (fit[f"{name}_{constant}"] for constant in ("glide", "speed"))
-        errors = [np.abs(np.array([[values["low"][i]], [values["high"][i]]]) - values["value"][i]) for i in (x, y)]
-        axes.errorbar(values["value"][x], values["value"][y], yerr=errors[1], xerr=errors[0], color=colour, marker="o",
-                      capsize=3, label=label)  # fmt: skip
+    axes.figure.colorbar(image, ax=axes, format=PercentFormatter(1.0, decimals=0), label="outcomes predicted right")
+    for name, colour, label in (("likely", "white", "most likely"), ("agreeing", TOO_FAST, "most predicted right")):
+        glide, glide_errors = _fitted(f"{name}_glide")
+        speed, speed_errors = _fitted(f"{name}_speed")
+        axes.errorbar(
+            speed, glide, yerr=glide_errors, xerr=speed_errors, color=colour, marker="o", capsize=3, label=label
+        )
     axes.plot(physics.DOCKING_SPEED, physics.GLIDE, "k*", markersize=11, label="ours")
     axes.set(xlabel="docking speed, px/s", ylabel="glide", title="Constants, with 95 % intervals")
     axes.legend(frameon=True, loc="lower right", fontsize=8)
 
 
-def cells(rows: dict[str, np.ndarray], of_blocks: np.ndarray) -> str:
-    """Return a line's cells: means over the episodes of these blocks."""
+def _fitted(constant: str) -> tuple[float, np.ndarray]:
+    """Return a constant's fitted value and its errors `[2, 1]`, downwards and upwards."""
+    fit = load("fit")
+    row = list(fit["constant"]).index(constant)
+    value = fit["value"][row]
+    return value, np.abs(np.array([[fit["low"][row]], [fit["high"][row]]]) - value)
 
-    def mean(name: str, controller: int = -1) -> float:
-        own = of_blocks & (rows["controller"] == controller)
+
+def table_cells(rows: Columns, mask: np.ndarray) -> str:
+    """Return the cells of a line: means over the episodes of the masked blocks."""
+
+    def mean(name: str, controller: int = BOTH_BOATS) -> float:
+        own = mask & (rows["controller"] == controller)
         return np.average(rows[name][own], weights=rows["episodes"][own])
 
+    scores = [f"{mean('score', controller):.3f}" for controller in (BOTH_BOATS, harbour.CONGRUENT, harbour.INCONGRUENT)]
     shares = [f"{mean(name):.1%}" for name in ("success", "too_fast", "out_of_bounds", "out_of_fuel")]
-    scores = [f"{mean('score', controller):.3f}" for controller in (-1, 1, 0)]
-    gaps = [f"{mean(name):.2f}" for name in ("presses", "press_gap", "choice_gap")]
-    return " | ".join([*scores, *shares, *gaps])
+    numbers = [f"{mean(name):.2f}" for name in ("presses", "press_gap", "choice_gap")]
+    return " | ".join([*scores, *shares, *numbers])
 
 
 def tabulate() -> None:
-    """Print the tables of the page."""
+    """Print the table of the page, then the other figures in it."""
     rows = load("blocks")
     print("| episodes | score | congruent | incongruent | success | too fast | out | no fuel | presses | keys | boat |")
-    print("|---|" + "---|" * 10)
+    print("|---|---|---|---|---|---|---|---|---|---|---|")
     for block in np.unique(rows["block"]):
-        print(f"| {60 * block + 1:.0f} to {60 * block + 60:.0f} | {cells(rows, rows['block'] == block)} |")
-    print(f"| all | {cells(rows, np.ones_like(rows['block'], dtype=bool))} |")
-    persons = load("people")
+        first = BLOCK_EPISODES * block + 1
+        last = BLOCK_EPISODES * block + BLOCK_EPISODES
+        print(f"| {first:.0f} to {last:.0f} | {table_cells(rows, rows['block'] == block)} |")
+    print(f"| all | {table_cells(rows, np.ones_like(rows['block'], dtype=bool))} |")
+    of_persons = load("persons")
     for name in ("score", "success", "better_boat", "gap", "press_gap", "choice_gap", "ceiling", "score_last_60"):
-        low, middle, high = np.quantile(persons[name], [0, 0.5, 1])
-        print(f"{name}: mean {persons[name].mean():.3f}, people from {low:.3f} to {high:.3f}, median {middle:.3f}")
+        low, middle, high = np.quantile(of_persons[name], [0, 0.5, 1])
+        print(f"{name}: mean {of_persons[name].mean():.3f}, people from {low:.3f} to {high:.3f}, median {middle:.3f}")
     fit = load("fit")
-    for i, name in enumerate(fit["constant"]):
-        print(f"{name} {fit['value'][i]:g} ({fit['low'][i]:g} to {fit['high'][i]:g})")
+    for constant, value, low, high in zip(fit["constant"], fit["value"], fit["low"], fit["high"], strict=True):
+        print(f"{constant} {value:g} ({low:g} to {high:g})")
     agreement = load("agreement")
-    ours = (np.abs(agreement["glide"] - 0.94) < 0.015) & (agreement["docking_speed"] == 74)
-    print(f"best agreement {agreement['agreement'].max():.3f}; near ours {agreement['agreement'][ours]}")
+    is_near_ours = (np.abs(agreement["glide"] - 0.94) < 0.015) & (agreement["docking_speed"] == 74)
+    print(f"best agreement {agreement['agreement'].max():.3f}; near ours {agreement['agreement'][is_near_ours]}")
 
 
 def main(words: Sequence[str]) -> None:
-    """Measure, if asked; draw, tabulate."""
+    """Measure if asked, draw, tabulate."""
     if list(words) == ["measure"]:
         measure()
     elif words:

@@ -1,8 +1,8 @@
-"""Draw and tabulate what learners come to under the rules of the released environment.
+"""Draw and tabulate what learners reach under the rules of the released environment.
 
 python experiments/released/study.py FOLDER...   gathers the finished runs in these folders into learned.csv and
                                                  curves.csv, then draws and tabulates
-python experiments/released/study.py             draws and tabulates what these hold
+python experiments/released/study.py             draws and tabulates the stored csv files
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,50 +21,72 @@ from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
 COLOURS = {"hppo": "#0072B2", "pdqn": "#009E73", "hyar": "#CC79A7", "qpamdp": "#E69F00", "dlpa": "#56B4E9"}
-FIGURES = ("score", "success", "wall", "out_of_fuel", "time_limit", "presses")
-IDLING = 1_979  # the return of 980 idle presses and then docking: claims.py
+SHARES = ("success", "wall", "out_of_fuel", "time_limit")
+EVALUATION_COLUMNS = ("frames", "eval/score", "eval/success")
+IDLING_RETURN = 1_979  # of 980 idle presses and then docking: claims.py
 
 
 def gather(runs: Sequence[Run]) -> dict[str, Rows]:
-    """Return a row a run and a row an evaluation of these, those under other rules left out."""
-    found: dict[str, Rows] = {"learned": [], "curves": []}
-    for run in (run for run in runs if run.summary["env"] == "boatdock_released"):
+    """Return a row for each run and for each evaluation under the released rules, by learner and boat."""
+    learned: Rows = []
+    curves: Rows = []
+    for run in runs:
         summary = run.summary
-        name = {"low": summary["low"], "boat": summary["controller"], "seed": summary["seed"]}
-        found["learned"].append(name | {key: round(summary[key], 4) for key in FIGURES} | {"frames": summary["frames"]})
-        keys = ("frames", "eval/score", "eval/success")
-        found["curves"] += [name | {key: round(row[key], 4) for key in keys} for row in run.evaluations()]
-    order = list(COLOURS)
-    return {file: sorted(rows, key=lambda row: (order.index(row["low"]), row["boat"])) for file, rows in found.items()}
+        if summary["env"] != "boatdock_released":
+            continue
+        name = {"low": summary["low"], "boat": run.config.env.controller, "seed": summary["seed"]}
+        learned.append(
+            {
+                **name,
+                "score": round(summary["score"], 4),
+                **{share: round(summary[share], 4) for share in SHARES},
+                "presses": round(summary["steps"], 4),
+                "frames": summary["frames"],
+            }
+        )
+        for row in run.evaluations():
+            curves.append({**name, **{column: round(row[column], 4) for column in EVALUATION_COLUMNS}})
+    return {"learned": sorted(learned, key=_order), "curves": sorted(curves, key=_order)}
+
+
+def _order(row: dict[str, Any]) -> tuple[int, str]:
+    return list(COLOURS).index(row["low"]), row["boat"]
 
 
 def table(rows: Rows) -> str:
-    """Return a line a learner and boat, its seeds side by side: no mean says much about them."""
+    """Return a line for each learner and boat, with its seeds side by side: they differ too much for a mean."""
     lines = [
         "| learner | boat | trained | return, by seed | docks in | idles to the limit in | presses an episode |",
         "|---|---|---|---|---|---|---|",
     ]
-    for (low, boat), of in groups(rows, "low", "boat").items():
-        shares = [", ".join(f"{row[key]:.0%}" for row in of) for key in ("success", "time_limit")]
-        returns, presses = (
-            ", ".join(f"{row[key]:{form}}" for row in of) for key, form in (("score", ".1f"), ("presses", ".0f"))
-        )
-        lines.append(f"| {low} | {boat} | {of[0]['frames']:,.0f} | {returns} | {' | '.join(shares)} | {presses} |")
+    for (low, boat), runs in groups(rows, "low", "boat").items():
+        returns = ", ".join(f"{run['score']:.1f}" for run in runs)
+        docked = ", ".join(f"{run['success']:.0%}" for run in runs)
+        idled = ", ".join(f"{run['time_limit']:.0%}" for run in runs)
+        presses = ", ".join(f"{run['presses']:.0f}" for run in runs)
+        lines.append(f"| {low} | {boat} | {runs[0]['frames']:,.0f} | {returns} | {docked} | {idled} | {presses} |")
     return "\n".join(lines)
 
 
 def draw(curves: Rows, path: Path) -> None:
-    """Draw return and success against presses, a row a boat: each seed, and the mean over seeds."""
+    """Draw return and success against presses, a row for each boat: each seed, and the mean over seeds."""
     figure = Figure(figsize=(11.5, 7.2), layout="constrained")
     for boat, (left, right) in zip(BOATS, figure.subplots(2, 2, sharex=True), strict=True):
-        of = [row for row in curves if row["boat"] == boat]
-        _draw_learners(left, of, "eval/score")
-        _draw_learners(right, of, "eval/success")
+        of_boat = [row for row in curves if row["boat"] == boat]
+        _draw_learners(left, of_boat, "eval/score")
+        _draw_learners(right, of_boat, "eval/success")
         left.set_yscale("symlog", linthresh=1.0)
         left.set(ylim=(-1.0, 3_000), ylabel="return, greedy")
-        left.axhline(IDLING, color="#2b2b2b", linewidth=1.0)
-        left.annotate("idling 980 times, then docking", (0.995, IDLING), xytext=(0, -10), fontsize=8, ha="right",
-                      xycoords=("axes fraction", "data"), textcoords="offset points")  # fmt: skip
+        left.axhline(IDLING_RETURN, color="#2b2b2b", linewidth=1.0)
+        left.annotate(
+            "idling 980 times, then docking",
+            (0.995, IDLING_RETURN),
+            xytext=(0, -10),
+            fontsize=8,
+            ha="right",
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+        )
         right.set(ylim=(0.0, 1.04), ylabel="share of episodes docked, greedy")
         right.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         for axes in (left, right):
@@ -75,12 +98,14 @@ def draw(curves: Rows, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def _draw_learners(axes: Axes, rows: Rows, key: str) -> None:
-    for (low,), of in groups([row for row in rows if row["frames"]], "low").items():
-        for each in groups(of, "seed").values():
-            x, y = ([row[name] for row in each] for name in ("frames", key))
+def _draw_learners(axes: Axes, rows: Rows, column: str) -> None:
+    late = [row for row in rows if row["frames"] > 0]  # the axis is logarithmic
+    for (low,), of_learner in groups(late, "low").items():
+        for run in groups(of_learner, "seed").values():
+            x = [row["frames"] for row in run]
+            y = [row[column] for row in run]
             axes.plot(x, y, color=COLOURS[low], linewidth=0.7, alpha=0.5)
-        x, mean, _ = curve(of, "frames", key)
+        x, mean, _ = curve(of_learner, "frames", column)
         axes.plot(x, mean, color=COLOURS[low], linewidth=1.8, label=low)
 
 

@@ -1,30 +1,32 @@
-"""Score trained agents under noise that they were not, or were, trained with.
+"""Score trained agents under noise, whether or not they were trained with it.
 
 python experiments/robustness/study.py FOLDER...   scores the agents of the finished runs in these folders and puts
                                                    them into results.csv, then draws and tabulates
-python experiments/robustness/study.py             draws and tabulates what results.csv holds
+python experiments/robustness/study.py             draws and tabulates the stored results.csv
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from omegaconf import OmegaConf
 from tqdm import tqdm
 
 from hpamdp.analysis.study import Rows, Run, finished, groups, read_csv, spread, write_tables
+from hpamdp.config import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
-from hpamdp.env.decisions import with_decisions
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import make_agent, make_env, resolve
+from hpamdp.run.assemble import make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.resume import resolve
 from hpamdp.specs import PAMDPSpecs
 
 HERE = Path(__file__).resolve().parent
@@ -40,72 +42,84 @@ AXES = {
 }
 COLOURS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#2b2b2b")
 NO_NOISE, PLUS = "no noise", " + "
+FIGURES = ("score", "success", "too_fast", "out_of_bounds")
+AGENT_COLUMNS = ("agent", "boat", "trained_with", "seed")
 
 
 def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, float | str]]:
-    """Yield a row for each noise and level: the score of a run's agent.
+    """Yield a row for each noise and level: how well a run's agent does.
 
-    `evaluations` are kept by the config of their boats: what is known of the layouts takes longer than playing them.
+    Args:
+        run: a finished run.
+        evaluations: those made so far, by the options of their environment, to which new ones are added: planning their
+            layouts takes longer than playing them.
     """
     device = torch.device("cpu")
-    with initialize_config_dir(str(HERE.parents[1] / "conf"), version_base="1.3"):
-        words = ["mode=eval", f"checkpoint={run.folder}"]
-        cfg, settings, source = resolve(compose("config", words), words)
-    noisy = [f"{noise} {cfg.env[noise]}" for noise in LEVELS if cfg.env[noise]]
-    high, low = run.summary["high"], run.summary["low"]
-    who = {"agent": low if high == "none" else f"{high} x {low}", "boat": run.summary["controller"]}
-    who |= {"trained_with": PLUS.join(noisy) or NO_NOISE, "seed": cfg.seed}
-    agent = make_agent(cfg, settings, PAMDPSpecs.from_env(make_env(cfg, 1, device, 0)), device)
+    overrides = ["mode=eval", f"checkpoint={run.folder}"]
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config, source = resolve(compose("config", overrides, return_hydra_config=True), overrides)
+    env = make_env(config, 1, device, 0)
+    agent = make_agent(config, PAMDPSpecs.from_env(env), device)
     checkpoint.load(source, agent, device, with_training=False)
-    for name, levels in LEVELS.items():
+    high, low = run.summary["high"], run.summary["low"]
+    options = config.env.options
+    trained_with = [f"{noise} {options[noise]:g}" for noise in LEVELS if options[noise]]
+    name = {
+        "agent": low if high == "none" else f"{high} x {low}",
+        "boat": run.summary["controller"],
+        "trained_with": PLUS.join(trained_with) or NO_NOISE,
+        "seed": config.run.seed,
+    }
+    for noise, levels in LEVELS.items():
         for level in levels:
-            for noise in LEVELS:
-                cfg.env[noise] = level if noise == name else 0.0
-            boats = OmegaConf.to_yaml(cfg.env)
-            if boats not in evaluations:
-                env = with_decisions(make_env(cfg, settings.eval.layouts, device, 0))
-                evaluations[boats] = Evaluation(env, settings.eval.seed)
-            told = evaluations[boats].measure(evaluations[boats].run(agent.policy))
-            figures = {key: round(told[key], 4) for key in ("score", "success", "too_fast", "out_of_bounds")}
-            yield who | {"noise": name, "level": level} | figures
+            noisy = {**options, **dict.fromkeys(LEVELS, 0.0), noise: level}
+            key = str(noisy)
+            if key not in evaluations:
+                evaluations[key] = make_evaluation(replace(config, env=replace(config.env, options=noisy)), env)
+            evaluation = evaluations[key]
+            measured = evaluation.measure(evaluation.run(agent.policy))
+            figures = {figure: round(measured[figure], 4) for figure in FIGURES}
+            yield {**name, "noise": noise, "level": level, **figures}
 
 
 def add(runs: Sequence[Run]) -> None:
-    """Score the runs' agents and put them into results.csv, each as soon as it is done, in the place of its like."""
-    file, evaluations = HERE / "results.csv", {}
+    """Score the agents of runs and write results.csv after each, in which its rows replace those of the same agent."""
+    evaluations: dict[str, Evaluation] = {}
     for run in tqdm(runs):
         new = list(score(run, evaluations))
-        names, old = ("agent", "boat", "trained_with", "seed"), read_csv(file) if file.exists() else []
-        kept = [row for row in old if any(row[name] != new[0][name] for name in names)]
+        old = read_csv(HERE / "results.csv") if (HERE / "results.csv").exists() else []
+        kept = [row for row in old if _agent(row) != _agent(new[0])]
         write_tables(HERE, {"results": kept + new})
 
 
+def _agent(row: dict[str, Any]) -> list[Any]:
+    return [row[column] for column in AGENT_COLUMNS]
+
+
 def table(rows: Rows) -> str:
-    """Return a line an agent and noise: the scores at each level, mean and deviation over seeds."""
+    """Return a line for each agent and noise: the score at each level, mean and standard deviation over seeds."""
     lines = ["| agent | boat | trained with | noise | level: score |", "|---|---|---|---|---|"]
-    for (*names, noise), of in groups(rows, "agent", "boat", "trained_with", "noise").items():
-        levels = groups(of, "level").items()
-        said = ", ".join(f"{level:g}: {spread([row['score'] for row in each], 2)}" for (level,), each in levels)
-        lines.append(f"| {' | '.join(names)} | {noise} | {said} |")
+    cases = groups(rows, "agent", "boat", "trained_with", "noise").items()
+    for (agent, boat, trained_with, noise), of_case in cases:
+        scores = []
+        for (level,), of_level in groups(of_case, "level").items():
+            scores.append(f"{level:g}: {spread([row['score'] for row in of_level], digits=2)}")
+        lines.append(f"| {agent} | {boat} | {trained_with} | {noise} | {', '.join(scores)} |")
     return "\n".join(lines)
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """Draw scores on the congruent boat against the level: above without noise in training, below H-PPO with it."""
+    """Draw scores on the congruent boat against the level of each noise.
+
+    Above: all agents trained without noise. Below: H-PPO trained without, with this noise, and with all three.
+    """
     figure = Figure(figsize=(12.0, 7.2), layout="constrained")
     above, below = figure.subplots(2, len(LEVELS), sharey=True)
     rows = [row for row in rows if row["boat"] == "congruent"]
-    everything = max((row["trained_with"] for row in rows), key=lambda name: name.count(PLUS), default="")
     for upper, lower, noise in zip(above, below, LEVELS, strict=True):
-        of = [row for row in rows if row["noise"] == noise]
-        calm = groups([row for row in of if row["trained_with"] == NO_NOISE], "agent")
-        for colour, ((agent,), each) in zip(COLOURS, calm.items(), strict=False):
-            _draw_line(upper, each, colour, agent)
-        trained = groups([row for row in of if row["agent"] == "hppo"], "trained_with")
-        own = [name for (name,) in trained if name.startswith(noise) and PLUS not in name]
-        shown = [name for name in dict.fromkeys((NO_NOISE, *own, everything)) if (name,) in trained]
-        for colour, name in zip(COLOURS, shown, strict=False):
-            _draw_line(lower, trained[name,], colour, name.replace("_noise", ""))
+        of_noise = [row for row in rows if row["noise"] == noise]
+        _draw_agents(upper, [row for row in of_noise if row["trained_with"] == NO_NOISE])
+        _draw_training(lower, [row for row in of_noise if row["agent"] == "hppo"], noise)
         upper.set_title(noise, loc="left", fontsize=10, fontweight="bold")
         lower.set_title("H-PPO, trained with", loc="left", fontsize=9)
         lower.set_xlabel(AXES[noise])
@@ -120,10 +134,33 @@ def draw(rows: Rows, path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
+def _draw_agents(axes: Axes, rows: Rows) -> None:
+    """Draw a line for each agent."""
+    agents = groups(rows, "agent").items()
+    for colour, ((agent,), of_agent) in zip(COLOURS, agents, strict=False):
+        _draw_line(axes, of_agent, colour, agent)
+
+
+def _draw_training(axes: Axes, rows: Rows, noise: str) -> None:
+    """Draw a line for training without noise, with this one, and with the most noises."""
+    trained = groups(rows, "trained_with")
+    names = [name for (name,) in trained]
+    with_this = [name for name in names if name.startswith(noise) and PLUS not in name]
+    with_most = max(names, key=lambda name: name.count(PLUS), default=NO_NOISE)
+    shown = [name for name in dict.fromkeys((NO_NOISE, *with_this, with_most)) if name in names]
+    for colour, name in zip(COLOURS, shown, strict=False):
+        _draw_line(axes, trained[(name,)], colour, name.replace("_noise", ""))
+
+
 def _draw_line(axes: Axes, rows: Rows, colour: str, label: str) -> None:
     levels = groups(rows, "level")
     means = [np.mean([row["score"] for row in each]) for each in levels.values()]
     axes.plot([level for (level,) in levels], means, "o-", color=colour, markersize=4, linewidth=1.5, label=label)
+
+
+def _order(row: dict[str, Any]) -> tuple[bool, int]:
+    """Return the place of a row: agents trained without noise first, then those trained with one, two, three."""
+    return row["trained_with"] != NO_NOISE, row["trained_with"].count(PLUS)
 
 
 def main(folders: Sequence[str]) -> None:
@@ -132,7 +169,7 @@ def main(folders: Sequence[str]) -> None:
         torch.set_num_threads(1)
         add(finished(folders))
     rows = read_csv(HERE / "results.csv")
-    rows.sort(key=lambda row: (row["trained_with"] != NO_NOISE, row["trained_with"].count(PLUS)))
+    rows.sort(key=_order)
     draw(rows, HERE / "robustness.png")
     print(table(rows))
 

@@ -1,11 +1,12 @@
-"""How many presses a second the environment makes on one core; writes results.csv and prints a table.
+"""Measure how many presses a second the environment makes on one core; write results.csv and print the figures.
 
 Run: python experiments/throughput/throughput.py [--seconds 2] [--device cpu]
 
-Three ways to step are timed, each with automatic resets and random actions drawn beforehand (a pool of eight):
-- physics: `episode.step` and `episode.reset` as one function, nothing observed;
-- env: `BoatDockEnv.step_and_maybe_reset`, observations and TorchRL's bookkeeping included;
-- gymnasium: `BoatDockVector.step`, NumPy in and out; and Gymnasium's own vectorised CartPole beside it as a yardstick.
+Three interfaces are timed, each with automatic resets and with random actions that were sampled before (a pool of
+eight):
+- physics: `episode.step` and `episode.reset` as one function, without observations;
+- env: `BoatDockEnv.step_and_maybe_reset`, with observations and TorchRL's bookkeeping;
+- gymnasium: `BoatDockVector.step`, with NumPy arrays. Gymnasium's own vectorised CartPole is timed for comparison.
 """
 
 from __future__ import annotations
@@ -33,30 +34,32 @@ POOL = 8
 
 
 def rate(step: Callable[[], object], num_envs: int, seconds: float) -> float:
-    """Return the presses a second of the fastest of five stretches that take `seconds` together."""
+    """Return the presses a second of the fastest of five trials that take about `seconds` together."""
     for _ in range(POOL + 2):
         step()
-    started, count = time.perf_counter(), 0
+    num_steps = 0  # in a twentieth of the time
+    started = time.perf_counter()
     while time.perf_counter() - started < seconds / 20:
         step()
-        count += 1
+        num_steps += 1
+    num_steps *= 4
     best = 0.0
     for _ in range(5):
         started = time.perf_counter()
-        for _ in range(4 * count):
+        for _ in range(num_steps):
             step()
-        best = max(best, 4 * count * num_envs / (time.perf_counter() - started))
+        best = max(best, num_steps * num_envs / (time.perf_counter() - started))
     return best
 
 
 def random_actions(env: BoatDockEnv) -> Iterator[dict[str, Tensor]]:
-    """Cycle through a pool of random actions."""
+    """Return an endless iterator over a pool of random actions."""
     pool = [env.rand_action(env.reset()).select(keys.OPTION, keys.ACTION) for _ in range(POOL)]
     return itertools.cycle(pool)
 
 
 def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], object]:
-    """Return one press with resets as a function of nothing."""
+    """Return a function that makes one press in every environment, with resets."""
     rules = Rules()
     seed = counter_rng.seed_tensor(0, torch.device(device))
     environment = torch.arange(num_envs, dtype=torch.int32, device=device)
@@ -82,7 +85,7 @@ def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[
 
 
 def env_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], object]:
-    """Return one `step_and_maybe_reset` as a function of nothing."""
+    """Return a function that calls `step_and_maybe_reset` once."""
     env = BoatDockEnv(num_envs, compile_physics=is_compiled, device=device)
     actions = random_actions(env)
     td = env.reset()
@@ -95,7 +98,7 @@ def env_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], o
 
 
 def gymnasium_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
-    """Return one step of a Gymnasium vector environment as a function of nothing."""
+    """Return a function that makes one step of a Gymnasium vector environment."""
     env = gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point")
     env.reset(seed=0)
     env.action_space.seed(0)
@@ -103,8 +106,20 @@ def gymnasium_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
     return lambda: env.step(next(actions))
 
 
+def steppers(num_envs: int, device: str) -> dict[str, Callable[[], Callable[[], object]]]:
+    """Return what makes each function to time, by its name in the table."""
+    return {
+        "physics eager": lambda: physics_stepper(num_envs, False, device),
+        "physics compiled": lambda: physics_stepper(num_envs, True, device),
+        "env eager": lambda: env_stepper(num_envs, False, device),
+        "env compiled": lambda: env_stepper(num_envs, True, device),
+        "gymnasium": lambda: gymnasium_stepper("hpamdp/BoatDock-v0", num_envs),
+        "gymnasium CartPole-v1": lambda: gymnasium_stepper("CartPole-v1", num_envs),
+    }
+
+
 def main() -> None:
-    """Measure everything and write results.csv beside this file."""
+    """Measure everything and write the csv file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=2.0, help="for each figure")
     parser.add_argument("--device", default="cpu")
@@ -113,19 +128,11 @@ def main() -> None:
     print(f"hpamdp {hpamdp.__version__}, torch {torch.__version__}, one thread, {arguments.device}")
     rows = []
     for num_envs in SIZES:
-        steppers = {
-            "physics eager": lambda n=num_envs: physics_stepper(n, False, arguments.device),
-            "physics compiled": lambda n=num_envs: physics_stepper(n, True, arguments.device),
-            "env eager": lambda n=num_envs: env_stepper(n, False, arguments.device),
-            "env compiled": lambda n=num_envs: env_stepper(n, True, arguments.device),
-            "gymnasium": lambda n=num_envs: gymnasium_stepper("hpamdp/BoatDock-v0", n),
-            "gymnasium CartPole-v1": lambda n=num_envs: gymnasium_stepper("CartPole-v1", n),
-        }
-        for what, make in steppers.items():
+        for what, make in steppers(num_envs, arguments.device).items():
             torch.compiler.reset()
-            presses = rate(make(), num_envs, arguments.seconds)
-            rows.append({"what": what, "num_envs": num_envs, "million_presses_per_s": round(presses / 1e6, 4)})
-            print(f"{what:<22} {num_envs:>8,} environments {presses / 1e6:9.3f} million presses/s", flush=True)
+            million = rate(make(), num_envs, arguments.seconds) / 1e6
+            rows.append({"what": what, "num_envs": num_envs, "million_presses_per_s": round(million, 4)})
+            print(f"{what:<22} {num_envs:>8,} environments {million:9.3f} million presses/s", flush=True)
     name = "results.csv" if arguments.device == "cpu" else f"results_{arguments.device}.csv"
     with (Path(__file__).parent / name).open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])
