@@ -20,7 +20,7 @@ from hpamdp.data.export import write_memmap
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.released_file import SHA256, default_path, load_bytes, read
 from hpamdp.data.human.transitions import transitions
-from hpamdp.env.boatdock.episode import MAX_PRESSES
+from hpamdp.env.boatdock.episode import MAX_PRESSES, ObservationForm, RewardForm
 
 _FORMAT = 1  # to be raised whenever the transitions of the same file change
 
@@ -70,8 +70,8 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         successes: bool = False,
         best_people: int | None = None,
         controller: str | None = None,
-        reward: str = "paper",
-        observation: str = "scaled",
+        reward: RewardForm = "paper",
+        observation: ObservationForm = "scaled",
         has_choice: bool = True,
         sampler: Sampler | None = None,
         transform: Callable[[TensorDict], TensorDict] | None = None,

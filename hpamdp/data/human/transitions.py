@@ -24,14 +24,14 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FRAMES_PER_SECOND, HumanData
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics
-from hpamdp.env.boatdock.episode import BoatState, Rules
+from hpamdp.env.boatdock.episode import BoatState, ObservationForm, RewardForm, Rules
 
 _REWARDS = ("paper", "sparse")
 _OBSERVATIONS = ("scaled", "pixels")
 
 
 def transitions(
-    data: HumanData, *, reward: str = "paper", observation: str = "scaled", has_choice: bool = True
+    data: HumanData, *, reward: RewardForm = "paper", observation: ObservationForm = "scaled", has_choice: bool = True
 ) -> TensorDict:
     """Return the presses as transitions `[N]`, in the order of episodes and presses.
 

@@ -21,6 +21,9 @@ SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
 # The scaled observation divides by these, so that entries lie in about [-1, 1].
 _SPEED_SCALE = float(physics.speed(torch.tensor(physics.MAX_DURATION)))
 
+RewardForm = Literal["paper", "sparse"]
+ObservationForm = Literal["scaled", "pixels"]
+
 FUEL = "fuel"  # the tensordict entry: the fraction of the tank that is left
 
 OBSERVATION_NAMES = (
@@ -62,8 +65,8 @@ class Rules(NamedTuple):
 
     controller: Literal["choose", "congruent", "incongruent", "random"] = "choose"
     keymap: Literal[1, 2, "random"] = 1
-    reward: Literal["paper", "sparse"] = "paper"
-    observation: Literal["scaled", "pixels"] = "scaled"
+    reward: RewardForm = "paper"
+    observation: ObservationForm = "scaled"
     motor_noise: tuple[float, float] = (0.0, 0.0)  # of the incongruent and of the congruent boat
     sensor_noise: float = 0.0
     slip: float = 0.0
