@@ -75,6 +75,10 @@ def crossing(*words: str) -> Config:
             "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all (LinUCB, conf/high/linucb.yaml)",
         ),
         (
+            "high=exp3 low=iql mode=offline data=human",
+            "high=exp3: learns from its own choices only; use mode=train, or another high",
+        ),
+        (
             "low.checkpoint=/nowhere",
             "low.checkpoint=/nowhere: no checkpoint there; give a run's output folder or its checkpoint.zip",
         ),

@@ -183,6 +183,8 @@ def check_modes(config: Config) -> None:
         raise ConfigError("mode=offline: data=none leaves nothing to learn from; choose a data set")
     if mode != "eval" and has_data and "offline" not in modes:
         raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
+    if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
+        raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
     if mode == "offline" and config.run.low.freeze:
         raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
 
