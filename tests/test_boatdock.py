@@ -107,7 +107,9 @@ def test_global_generators_are_neither_moved_nor_read():
 
     with global_generators_unmoved():
         once = run()
-    torch.rand(3), np.random.rand(), random.random()
+    torch.rand(3)
+    np.random.rand()
+    random.random()
     assert (run() == once).all()
 
 
@@ -118,7 +120,8 @@ def test_a_partial_reset_leaves_the_other_boats_alone():
     before = snapshot(env)
     mask = torch.tensor([[False], [True], [False], [True]])
     reading = env.reset(TensorDict({"_reset": mask}, batch_size=[4]))
-    kept, fresh = ~mask[:, 0], mask[:, 0]
+    kept = ~mask[:, 0]
+    fresh = mask[:, 0]
     assert is_unchanged(env, before, kept)
     assert env.state.episode.tolist() == [0, 1, 0, 1]
     assert (env.state.presses[fresh] == 0).all()
@@ -159,7 +162,8 @@ def test_a_finished_episode_stays_finished_and_earns_nothing():
 def test_given_layouts_are_played_with_their_controllers_and_keymaps():
     env = BoatDockEnv(3, controller="random", keymap="random", observation="pixels")
     given = layout([-20.0, 10.0], [40.0, 50.0], 3)
-    given["controller"], given["keymap"] = torch.tensor([1, 0, 0]), torch.tensor([1, 1, 2])
+    given["controller"] = torch.tensor([1, 0, 0])
+    given["keymap"] = torch.tensor([1, 1, 2])
     reading = env.reset(given)
     assert reading["observation"][:, :4].tolist() == [[620.0, 522.0, 680.0, 562.0]] * 3
     press(env, [0, 0, 0], [0.5] * 3)
@@ -228,7 +232,8 @@ def test_an_invalid_action_is_refused_and_changes_nothing(name):
 @pytest.mark.parametrize("noise", [{}, NOISE])
 def test_returned_tensors_never_change_later(noise):
     env = BoatDockEnv(16, controller="choose", **noise)
-    returned, copies = [], []
+    returned = []
+    copies = []
 
     def keep(reading: TensorDictBase) -> None:
         returned.append(reading)

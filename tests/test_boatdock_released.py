@@ -80,7 +80,8 @@ def test_a_seed_fixes_everything_and_global_generators_are_neither_moved_nor_rea
     def states() -> tuple:
         return torch.get_rng_state().tolist(), str(np.random.get_state()), random.getstate()
 
-    env, before = ReleasedBoatDockEnv(30, controller="incongruent", seed=1), states()
+    env = ReleasedBoatDockEnv(30, controller="incongruent", seed=1)
+    before = states()
     env.set_seed(seed)
     first = [env.reset(), press(env, 0, -0.95), env.reset()]
     assert states() == before

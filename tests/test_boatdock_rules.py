@@ -184,7 +184,8 @@ def test_the_pixel_observation_has_the_entries_of_the_paper():
 
 def test_the_scaled_observation_is_in_units_of_radius_and_top_speed_and_adds_the_vector_to_the_goal():
     pixels, scaled = (BoatDockEnv(64, controller="random", observation=kind) for kind in ("pixels", "scaled"))
-    seen, small = play(pixels, 3)[-1]["observation"], play(scaled, 3)[-1]["observation"]
+    seen = play(pixels, 3)[-1]["observation"]
+    small = play(scaled, 3)[-1]["observation"]
     points = (seen[:, [0, 1, 2, 3, 8, 9]].unflatten(-1, (3, 2)) - CENTRE).flatten(1) / 120.0
     torch.testing.assert_close(small[:, [0, 1, 2, 3, 8, 9]], points, atol=1e-5, rtol=0.0)
     torch.testing.assert_close(small[:, 10:12], seen[:, 10:12] / (400.0 - 160.0 / 3.0))

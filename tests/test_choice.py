@@ -63,7 +63,8 @@ def test_the_reward_is_the_return_of_the_same_episode_played_step_by_step(option
     for _ in range(2):
         learner = Learner(specs)
         learner.policy = Presser()
-        learner.policy.in_keys, learner.policy.out_keys = [keys.OBSERVATION], [keys.DISCRETE, keys.PARAMETERS]
+        learner.policy.in_keys = [keys.OBSERVATION]
+        learner.policy.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         learners.append(learner)
     agent = HierarchicalAgent(Fixed(specs, option=option), learners, specs)
     rows = presses.rollout(25, agent.policy, break_when_any_done=False)
@@ -168,7 +169,8 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
             optimizer.step()
     collector.shutdown(close_env=False)
 
-    test, returns = planned(200), []
+    test = planned(200)
+    returns = []
     for chosen in (0, 1, None):
         td = test.reset(test.fixed_episodes(0))
         td = greedy(td) if chosen is None else td.set(keys.OPTION, torch.full((200,), chosen))

@@ -150,11 +150,13 @@ def test_the_selector_learns_from_every_decision_once_and_the_oldest_first():
     torch.manual_seed(0)
     env = with_decisions(Toll(4, start=6.0), 0.9, 2)
     specs = PAMDPSpecs.from_env(env)
-    agent, rows = steppers(Listener(specs), specs), []
+    agent = steppers(Listener(specs), specs)
+    rows = []
     for batch in collect(env, agent.policy, 4, 60, 5):
         rows.append(batch.clone())
         agent.learn(batch)
-    rows, heard = torch.cat(rows, 1), torch.cat(agent.selector.heard)
+    rows = torch.cat(rows, 1)
+    heard = torch.cat(agent.selector.heard)
     is_end = rows["next", keys.IS_DECISION].squeeze(-1)
     assert len(heard) == is_end.sum() > 60
     expected = torch.cat([rows[:, t][is_end[:, t]]["next", keys.OPTION_RETURN] for t in range(60)])

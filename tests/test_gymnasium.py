@@ -241,7 +241,8 @@ def test_closing_closes_every_copy():
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_four_value_environment_behaves_like_its_gymnasium_form(form):
-    one, other = make(2, form=form, kwargs={"length": 4}), make(2, form=form, entry_point="toy_environments:OldToy")
+    one = make(2, form=form, kwargs={"length": 4})
+    other = make(2, form=form, entry_point="toy_environments:OldToy")
     for env in other.envs:
         env.unwrapped.env.toy.length = 4
     assert torch.equal(one.reset()["observation"], other.reset()["observation"])

@@ -149,7 +149,8 @@ def test_both_action_formats_and_the_vector_give_the_same_results():
         env.reset(seed=0, options={name: np.stack([point, point]) for name, point in layout.items()})
     duration = np.array([0.1, 0.4, 0.9], np.float32)
     expected = single.step({"option": 1, "key": 1, "duration": duration})[0]
-    pairs, options = np.stack([duration, duration]), np.array([1, 0])
+    pairs = np.stack([duration, duration])
+    options = np.array([1, 0])
     columns = tuple(pairs[:, [k]] for k in range(3))
     assert same(nested.step((1, 1, tuple(duration[[k]] for k in range(3))))[0], expected)
     rows = many.step({"option": options, "key": np.array([1, 1]), "duration": pairs})[0]
@@ -263,7 +264,8 @@ def test_the_vector_behaves_like_gymnasiums_vector_of_single_boats(mode):
         actions = ours.action_space.sample()
         actions["duration"] *= 0.6
         (seen, *flags, infos), (expected, *expected_flags, expected_infos) = ours.step(actions), theirs.step(actions)
-        fresh, ended = infos["presses"] == 0, flags[1] | flags[2]
+        fresh = infos["presses"] == 0
+        ended = flags[1] | flags[2]
         assert np.allclose(seen[~fresh], expected[~fresh], atol=1e-5)
         assert all(np.allclose(one, other, atol=1e-5) for one, other in zip(flags, expected_flags, strict=True))
         assert [flag.dtype for flag in flags] == [flag.dtype for flag in expected_flags]

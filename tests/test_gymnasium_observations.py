@@ -32,7 +32,8 @@ def running(num_envs: int = 3, **options) -> GymnasiumEnv:
 
 
 def test_running_statistics_are_those_of_all_observations_so_far():
-    env, plain = running(kwargs={"length": 3}), make(3, kwargs={"length": 3})
+    env = running(kwargs={"length": 3})
+    plain = make(3, kwargs={"length": 3})
     so_far = [plain.reset()["observation"]]
     assert torch.allclose(env.reset()["observation"].mean(0), torch.zeros(2), atol=1e-6)
     for number in range(5):

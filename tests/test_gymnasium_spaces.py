@@ -12,7 +12,8 @@ from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.four_value import FourValueEnv, to_gymnasium
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 
-UNIT, TWO_BOXES = Box(0, 1, (1,)), Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
+UNIT = Box(0, 1, (1,))
+TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
 
 
 @pytest.mark.parametrize(

@@ -69,14 +69,16 @@ def test_layouts_have_the_distribution_of_rejection_sampling(layouts, rejection_
 @pytest.mark.parametrize("keymap", [1, 2])
 @pytest.mark.parametrize("key", [0, 1, 2])
 def test_direction_follows_the_table(key, keymap):
-    key, keymap = torch.tensor([key]), torch.tensor([keymap])
+    key = torch.tensor([key])
+    keymap = torch.tensor([keymap])
     for controller, row in ((INCONGRUENT, keymap.item() - 1), (CONGRUENT, 2)):
         direction = torch.cat(harbour.direction(torch.tensor([controller]), keymap, key))
         assert direction.tolist() == pytest.approx(harbour.DIRECTIONS[row][key.item()], abs=1e-6)
 
 
 def test_the_layouts_of_an_environment_depend_neither_on_the_batch_nor_on_other_resets():
-    seed, rules = counter_rng.seed_tensor(5), episode.Rules(controller="random", keymap="random")
+    seed = counter_rng.seed_tensor(5)
+    rules = episode.Rules(controller="random", keymap="random")
 
     def blank(num: int) -> episode.BoatState:
         return episode.BoatState(

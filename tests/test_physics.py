@@ -42,10 +42,14 @@ class Simulated(NamedTuple):
 @st.composite
 def cases(sample):
     """Sample boats anywhere in the harbour with a dock in any direction, about half of them heading for it."""
-    radius, angle = sample(st.floats(0, 118)), sample(st.floats(0, 2 * math.pi))
-    x, y = radius * math.cos(angle), radius * math.sin(angle)
-    distance, bearing = sample(st.floats(15.6, 200)), sample(st.floats(0, 2 * math.pi))
-    goal_x, goal_y = x + distance * math.cos(bearing), y + distance * math.sin(bearing)
+    radius = sample(st.floats(0, 118))
+    angle = sample(st.floats(0, 2 * math.pi))
+    x = radius * math.cos(angle)
+    y = radius * math.sin(angle)
+    distance = sample(st.floats(15.6, 200))
+    bearing = sample(st.floats(0, 2 * math.pi))
+    goal_x = x + distance * math.cos(bearing)
+    goal_y = y + distance * math.sin(bearing)
     heading = bearing + sample(st.floats(-0.3, 0.3) | st.floats(-math.pi, math.pi))
     return Case(x, y, goal_x, goal_y, heading, sample(st.floats(0.1, 2)), sample(st.floats(0.05, 6)))
 
@@ -66,7 +70,8 @@ def simulate(case: Case) -> Simulated:
     speeds = np.concatenate([rising, rising[::-1]])
     steps = np.concatenate([rising * dt, rising[::-1] * dt * 0.95])
     way = np.cumsum(steps)
-    x, y = case.x + way * math.cos(case.heading), case.y + way * math.sin(case.heading)
+    x = case.x + way * math.cos(case.heading)
+    y = case.y + way * math.sin(case.heading)
     to_dock = np.hypot(x - case.goal_x, y - case.goal_y) - 15.0
     to_rim = 120.0 - np.hypot(x, y)
     docked, left = (np.flatnonzero(gap <= 0.0) for gap in (to_dock, to_rim))
@@ -119,7 +124,8 @@ def test_small_time_steps_agree_on_many_presses_of_every_outcome():
 def test_the_boat_stops_on_the_circle_that_it_met(batch):
     after = press(batch)
     goal_x, goal_y = torch.tensor([[case.goal_x, case.goal_y] for case in batch]).unbind(-1)
-    from_goal, from_centre = torch.hypot(after.x - goal_x, after.y - goal_y), torch.hypot(after.x, after.y)
+    from_goal = torch.hypot(after.x - goal_x, after.y - goal_y)
+    from_centre = torch.hypot(after.x, after.y)
     docks = (after.outcome == SUCCESS) | (after.outcome == TOO_FAST)
     leaves = after.outcome == OUT_OF_BOUNDS
     assert (from_goal[docks] - physics.DOCK_RADIUS).abs().lt(1e-3).all()
@@ -244,7 +250,8 @@ def test_compiled_and_eager_agree(compiled):
     direction = harbour.direction(options, state.keymap, keys)
     columns = (state.x, state.y, state.fuel, state.goal_x, state.goal_y, *direction, durations[:, 0])
     arguments = (state, options, keys, durations, seed, rows, rules)
-    eager, fast = flat(press_and_step(columns, arguments)), flat(compiled(columns, arguments))
+    eager = flat(press_and_step(columns, arguments))
+    fast = flat(compiled(columns, arguments))
     # Rounding may change the outcome of a boat that nearly touches a circle; the others must agree.
     same = torch.stack([(a.float() - b.float()).abs() < 1e-4 for a, b in zip(eager, fast, strict=True)])
     assert same.all(0).float().mean() > 0.999

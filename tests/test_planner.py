@@ -143,7 +143,10 @@ def test_an_unsupported_number_of_presses_is_refused(layout: Layout, max_presses
 
 @pytest.mark.parametrize("num_presses", [1, 2, 3])
 def test_an_evolutionary_search_never_beats_the_planner(num_presses: int) -> None:
-    num, samples, elite, children = 40, 6000, 40, 8
+    num = 40
+    samples = 6000
+    elite = 40
+    children = 8
     layout = fixed_layouts(num, seed=2)
     plans = best_plans(layout, filled(1, num))
     generator = torch.Generator().manual_seed(num_presses)

@@ -56,7 +56,8 @@ def test_a_hand_written_policy_arrives_with_a_return_of_one():
 
 
 def test_random_actions_cover_less_than_a_sixth_of_the_course():
-    env, generator = PlatformEnv(2000), torch.Generator().manual_seed(0)
+    env = PlatformEnv(2000)
+    generator = torch.Generator().manual_seed(0)
     last, total = play(env, lambda _: random_action(env, generator))
     assert last[keys.DONE].all()
     assert total.mean().item() == pytest.approx(0.154, abs=0.01)  # gym-platform: .154, standard error .002
@@ -105,7 +106,8 @@ def test_only_the_parameter_of_the_chosen_action_counts_and_is_clipped():
 
 
 def test_observations_lie_in_their_range_and_encode_the_state():
-    env, generator = PlatformEnv(300), torch.Generator().manual_seed(0)
+    env = PlatformEnv(300)
+    generator = torch.Generator().manual_seed(0)
     place(env, **random_columns(300, generator))
     columns = env.env_state()
     # A step that is masked in every row returns the state as it is.
@@ -158,7 +160,8 @@ def test_without_noise_the_seed_makes_no_difference():
 
 
 def test_episodes_stay_valid_with_a_hundred_times_the_noise():
-    env, generator = PlatformEnv(200, noise=100.0), torch.Generator().manual_seed(0)
+    env = PlatformEnv(200, noise=100.0)
+    generator = torch.Generator().manual_seed(0)
     last, total = play(env, lambda _: random_action(env, generator), 200)
     assert last[keys.OBSERVATION].isfinite().all()
     assert ((total >= 0.0) & (total <= 1.0)).all()
@@ -174,7 +177,9 @@ def test_global_generators_are_neither_moved_nor_read():
 
     with global_generators_unmoved():
         once = run()
-    torch.rand(3), np.random.rand(), random.random()
+    torch.rand(3)
+    np.random.rand()
+    random.random()
     assert (run() == once).all()
 
 
@@ -194,7 +199,8 @@ def test_a_partial_reset_leaves_the_other_environments_alone():
 
 
 def test_a_finished_episode_stays_finished_and_earns_nothing():
-    env, generator = PlatformEnv(64), torch.Generator().manual_seed(0)
+    env = PlatformEnv(64)
+    generator = torch.Generator().manual_seed(0)
     env.reset()
     env.step(random_action(env, generator))
     before = snapshot(env)
@@ -208,7 +214,8 @@ def test_a_finished_episode_stays_finished_and_earns_nothing():
 
 
 def test_returned_tensors_never_change_later():
-    env, generator = PlatformEnv(16), torch.Generator().manual_seed(0)
+    env = PlatformEnv(16)
+    generator = torch.Generator().manual_seed(0)
     returned = [env.reset()]
     copies = [returned[0].clone()]
     columns = env.env_state()

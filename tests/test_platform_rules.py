@@ -42,13 +42,16 @@ class ScalarCourse:
 
         `numbers` are normal: two for a jump, then one for the agent and one for the enemy each tick.
         """
-        start, tick, time_left = self.x, 0, 1.0
+        start = self.x
+        tick = 0
+        time_left = 1.0
         while True:
             self._choose(discrete, parameter, numbers, tick)
             self._patrol(numbers[3 + 2 * tick])
             self._move()
             outcome = self._outcome()
-            tick, time_left = tick + 1, time_left - self.TICK
+            tick = tick + 1
+            time_left = time_left - self.TICK
             if outcome != ON_THE_WAY or (time_left <= 0.0 if discrete == RUN else self.stands()):
                 return (self.x - start) / COURSE, outcome
 
@@ -56,11 +59,13 @@ class ScalarCourse:
         on_ground = self.stands()
         across, up = 0.0, -9.8
         if on_ground and discrete == RUN:
-            across, up = parameter / self.TICK, 0.0
+            across = parameter / self.TICK
+            up = 0.0
         elif on_ground:
             rise = 35.0 if discrete == HOP else 25.0
             change = min(max(parameter / (2.0 * rise / 9.8 + 1.0) - self.speed, -600.0), 200.0 - rise)
-            across, up = (change - abs(numbers[0])) / self.TICK, (rise - abs(numbers[1])) / self.TICK
+            across = (change - abs(numbers[0])) / self.TICK
+            up = (rise - abs(numbers[1])) / self.TICK
         self.speed += min(max(across, -600.0), 600.0) * self.TICK - abs(0.025 * numbers[2 + 2 * tick])
         self.speed = min(max(self.speed, 0.0), 70.0 if on_ground else 100.0)
         self.rise = min(max(self.rise + min(max(up, -4000.0), 4000.0) * self.TICK, -200.0), 200.0)
@@ -85,7 +90,8 @@ class ScalarCourse:
                 if aside is not None and abs(self.x - aside) < self.TOP - self.y:
                     self.x = aside
                 else:
-                    self.y, self.rise = self.TOP, 0.0
+                    self.y = self.TOP
+                    self.rise = 0.0
 
     def _outcome(self) -> int:
         if self.x >= COURSE:
@@ -114,8 +120,10 @@ def compare(
     over = env.env_state()["outcome"] != ON_THE_WAY
     numbers = numbers_of_next_action(env, seed)
     reading = env.step(actions.clone())["next"]
-    discrete, parameter = actions[keys.DISCRETE].tolist(), actions[keys.PARAMETERS].tolist()
-    rewards, got_outcomes = reading[keys.REWARD].squeeze(-1).tolist(), reading[keys.OUTCOME].tolist()
+    discrete = actions[keys.DISCRETE].tolist()
+    parameter = actions[keys.PARAMETERS].tolist()
+    rewards = reading[keys.REWARD].squeeze(-1).tolist()
+    got_outcomes = reading[keys.OUTCOME].tolist()
     names = ("x", "speed", "enemy_x", "enemy_speed")
     state = list(zip(*(env.env_state()[name].tolist() for name in names), strict=True))
     outcomes = []
@@ -133,7 +141,9 @@ def compare(
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_actions_from_anywhere_follow_the_published_rules(noise):
-    num, seed, generator = 500, 5, torch.Generator().manual_seed(1)
+    num = 500
+    seed = 5
+    generator = torch.Generator().manual_seed(1)
     env = PlatformEnv(num, noise=noise, seed=seed)
     place(env, **random_columns(num, generator))
     state = env.env_state()
@@ -146,14 +156,17 @@ def test_actions_from_anywhere_follow_the_published_rules(noise):
 
 
 def test_episodes_from_start_to_end_follow_the_published_rules():
-    num, seed, generator = 100, 2**40 + 7, torch.Generator().manual_seed(2)
+    num = 100
+    seed = 2**40 + 7
+    generator = torch.Generator().manual_seed(2)
     env = PlatformEnv(num, seed=seed)
     observation = env.reset()[keys.OBSERVATION]
     courses = [ScalarCourse(0.0, 0.0, 230.0, -30.0) for _ in range(num)]
     ends = []
     for _ in range(12):
         careless = torch.rand(num, 1, generator=generator) < 0.1
-        by_rule, by_chance = rule(observation), random_action(env, generator)
+        by_rule = rule(observation)
+        by_chance = random_action(env, generator)
         discrete = torch.where(careless.squeeze(-1), by_chance[keys.DISCRETE], by_rule[keys.DISCRETE])
         parameter = torch.where(careless, by_chance[keys.PARAMETERS], by_rule[keys.PARAMETERS])
         observation, outcomes = compare(env, courses, action(discrete, parameter), seed, 1.0)

@@ -115,7 +115,8 @@ class Wrong(Toy):
 
     def __init__(self, size: int = 2, value: float = 0.0):
         super().__init__()
-        self.size, self.value = size, value
+        self.size = size
+        self.value = value
 
     def _observation(self):
         return np.full(self.size, self.value)
@@ -135,7 +136,8 @@ class OldToy:
     """Toy with the four-value interface and the time limit of `gym`, and no `gymnasium.Env`."""
 
     def __init__(self, form: str = "nested", length: int = 0, limit: int = 0):
-        self.toy, self.limit = Toy(form, length), limit
+        self.toy = Toy(form, length)
+        self.limit = limit
         self.action_space, self.observation_space = map(old_space, (self.toy.action_space, self.toy.observation_space))
         self.seeds: list[int | None] = []
 

@@ -146,7 +146,9 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         self._state = restored(columns, self._state, "ReleasedBoatDockEnv")
 
     def _make_specs(self) -> None:
-        n, device, dtype = self.num_envs, self.device, self.float_type
+        n = self.num_envs
+        device = self.device
+        dtype = self.float_type
         names = released.SCALED_NAMES if self.is_scaled else released.OBSERVATION_NAMES
         self.observation_spec = Composite(
             observation=Unbounded(shape=(n, len(names)), device=device, dtype=dtype),

@@ -180,7 +180,8 @@ class GymnasiumEnv(PAMDPEnv):
         return entry
 
     def _make_specs(self) -> None:
-        n, device = self.num_envs, self.device
+        n = self.num_envs
+        device = self.device
         self.observation_spec = Composite(
             {
                 keys.OBSERVATION: Unbounded(shape=(n, self.observations.dim), device=device),

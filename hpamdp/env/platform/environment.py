@@ -101,7 +101,8 @@ class PlatformEnv(PAMDPEnv):
         self._state = restored(columns, self._state, "PlatformEnv")
 
     def _make_specs(self) -> None:
-        n, device = self.num_envs, self.device
+        n = self.num_envs
+        device = self.device
         self.observation_spec = Composite(
             observation=Unbounded(shape=(n, len(rules.OBSERVATION_NAMES)), device=device),
             outcome=Categorical(len(rules.OUTCOMES), shape=(n,), device=device),
