@@ -55,7 +55,7 @@ class PAMDPEnv(EnvBase):
     can_change_option: ClassVar[bool] = True  # whether an option may end before its episode
     parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
     max_steps: int  # steps of the longest episode
-    result_keys: ClassVar[tuple[str, ...]] = ()  # leaves of an episode's last step that `results` reads
+    result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
 
     # Settings that leave the choice of an option to the agent and that take it away, to name in an error.
     choice_setting: ClassVar[str] = ""

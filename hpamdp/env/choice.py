@@ -38,7 +38,7 @@ class OptionChoiceEnv(PAMDPEnv):
         self.option_names = env.option_names
         self.parameter_dims = env.parameter_dims
         self.max_steps = 1
-        self.result_keys = env.result_keys  # type: ignore[misc]  # a wrapper has those of the environment in it
+        self.result_keys = env.result_keys
         self.observation_spec = env.observation_spec.clone()
         self.action_spec = Composite(option=env.full_action_spec[keys.OPTION].clone(), shape=env.batch_size)
         self.reward_spec = Unbounded(shape=(*env.batch_size, 1), device=env.device)

@@ -18,6 +18,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
+from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.episode import BoatState, Rules
@@ -74,7 +75,7 @@ class BoatDockEnv(PAMDPEnv):
     can_change_option: ClassVar[bool] = False
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
-    result_keys: ClassVar[tuple[str, ...]] = (keys.OUTCOME, episode.FUEL)
+    result_keys = (keys.OUTCOME, episode.FUEL)
     choice_setting: ClassVar[str] = "env.controller=choose"
     no_choice_setting: ClassVar[str] = "env.controller=congruent, incongruent, random"
     table_metrics: ClassVar[tuple[Metric, ...]] = (
@@ -309,9 +310,13 @@ class BoatDockEnv(PAMDPEnv):
         )
         if not is_action.all():
             row = int((~is_action).nonzero()[0])
-            raise ValueError(
-                f"step: environment {row} got option={option[row].item()} (allowed 0, 1), key={key[row].item()} "
-                f"(allowed 0, 1, 2), durations={durations[row].tolist()} (the pressed key's must be finite)"
+            raise invalid_action(
+                row,
+                {
+                    "option": (option[row].item(), "allowed 0 to 1"),
+                    "key": (key[row].item(), "allowed 0 to 2"),
+                    "durations": (durations[row].tolist(), "the pressed key's must be finite"),
+                },
             )
         mask = tensordict.get("_step", None)
         if mask is not None:

@@ -10,7 +10,7 @@ observations and a new layout for each episode are possible.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -64,7 +64,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
     """
 
     parameter_dims = (1, 1, 1)
-    result_keys: ClassVar[tuple[str, ...]] = (keys.OUTCOME,)
+    result_keys = (keys.OUTCOME,)
     _state: ReleasedState
 
     def __init__(
