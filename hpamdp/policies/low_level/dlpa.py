@@ -18,6 +18,10 @@ Differs from the source:
   with the true model of this project's benchmark, a warm start adds .002 to .005 of the best possible score at 5
   iterations, .006 to .01 at 3;
 - exploring actions are sampled from the plan's final distribution, a fraction of them uniformly.
+
+TorchRL's SliceSampler (`fragmented`, padded) does not fit: it samples trajectories instead of steps uniformly, and none
+of its windows starts in the last `horizon - 1` steps of a longer trajectory, so that the model learns most terminations
+from predicted states only; on this project's benchmark the score after 8,000 steps was .77 with it and 2.71 without.
 """
 
 from __future__ import annotations
@@ -222,8 +226,8 @@ class DLPAPolicy(TensorDictModuleBase):
 class DLPA(ReplayLearner):
     """A PAMDPModel trained on windows from a replay buffer, and a Planner that acts in it.
 
-    A stored step carries the number of its trajectory, which is an unbroken sequence of this learner's steps within one
-    environment, episode and option, and the place of the step that follows it there.
+    Windows never leave their trajectory, which is an unbroken sequence of this learner's steps within one environment,
+    episode and option. It may span several batches.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train",)
@@ -296,30 +300,34 @@ class DLPA(ReplayLearner):
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
-        """Add the transitions in `mask`, with their trajectories and the links within them.
+        """Add the transitions in `mask` of a batch `[*B, T]`, each with its trajectory and a link to the next step.
 
-        `trajectory` is unique in the buffer. `successor` is the place of the trajectory's next step, -1 if there is
-        none so far. `is_open` marks the steps whose successor may come with the next batch.
+        `trajectory` is a number, unique in the buffer. `successor` is the place of the trajectory's next step in the
+        buffer, -1 while there is none. `is_open` marks the steps whose successor may come with the next batch, which
+        holds the same environments in the same order.
         """
         num_steps = mask.shape[-1]
         rows = self.transitions(batch).reshape(-1, num_steps)
         mask = mask.reshape(-1, num_steps)
         ends = option_ends(batch).reshape(-1, num_steps)
+        # A step follows the one before it, which may be the last step of an earlier batch.
         last_place, last_trajectory = self._open_steps(rows["state"][:, 0])
         follows = torch.zeros_like(mask)
         follows[:, 0] = mask[:, 0] & (last_place >= 0)
         follows[:, 1:] = mask[:, 1:] & mask[:, :-1] & ~ends[:, :-1]
 
+        # New trajectories are numbered on from those in the buffer.
         num_stored = len(self.buffer)
         first_number = int(self.buffer[:]["trajectory"].max()) + 1 if num_stored else 0
         is_first = mask & ~follows
         number = first_number + is_first.flatten().cumsum(0).reshape(mask.shape) - 1
-        has_begun = is_first.cumsum(-1) > 0
-        rows["trajectory"] = torch.where(has_begun, number, last_trajectory.unsqueeze(-1))
+        is_new = is_first.cumsum(-1) > 0
+        rows["trajectory"] = torch.where(is_new, number, last_trajectory.unsqueeze(-1))
         rows["environment"] = torch.arange(len(mask), device=mask.device).unsqueeze(-1).expand_as(mask)
         rows["successor"] = torch.full_like(number, -1)
-        rows["is_open"] = torch.zeros_like(mask)
-        rows["is_open"][:, -1] = ~ends[:, -1]
+        is_open = torch.zeros_like(mask)
+        is_open[:, -1] = ~ends[:, -1]
+        rows["is_open"] = is_open
 
         if num_stored:
             self.buffer[:]["is_open"].fill_(False)
@@ -329,9 +337,10 @@ class DLPA(ReplayLearner):
         self.buffer[:]["successor"][previous[follows]] = place[follows]
 
     def _open_steps(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the place and the trajectory of the stored step that each environment's state `[N, obs]` follows.
+        """Return which stored step each environment goes on from: its place and its trajectory, each `[N]`.
 
-        Each `[N]`; -1 where there is none, as in an environment that was started anew.
+        Both are -1 where there is none, or where it did not end in the environment's state `[N, observation_dim]`, as
+        after a restart.
         """
         place = torch.full((len(state),), -1, device=state.device)
         trajectory = place.clone()

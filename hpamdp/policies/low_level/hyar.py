@@ -14,6 +14,9 @@ Differs from the source:
   entry dominates the reconstruction loss;
 - the random actions of the warm-up and of epsilon-greedy exploration have no latent action of their own: they are
   encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones.
+
+TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.5 times as long with it (8.0 instead of
+5.3 ms of CPU time, batches of 256), because it runs the networks as functional calls under vmap.
 """
 
 from __future__ import annotations
