@@ -3,32 +3,93 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 IS_ALLOWED := import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
 
-.PHONY: run test report
+# Environments of their own for `make slow` and `make lowest`.
+SLOW := .venv-slow
+RAY := .venv-ray-launcher
+LOWEST := .venv-lowest
+
+COVERAGE := --cov=hpamdp --cov-report=term:skip-covered --cov-fail-under=90
+# The one slow test that needs the Ray launcher, which shares no environment with the others.
+RAY_TEST := test_a_killed_sweep_is_finished_by_the_same_command and ray
+
+.PHONY: run test slow slow-tests ray-launcher wheel lowest report
 
 # A first run: which boat, by UCB; how to sail it, by HyAR. More settings: make run ARGS="seed=1"
 run: $(VENV)/.installed
 	$(PYTHON) run.py high=ucb low=hyar $(ARGS)
 
+# The gate: what every change has to pass.
 test: $(VENV)/.installed
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
-	$(PYTHON) -m pytest -n auto $(ARGS)
+	$(PYTHON) -m mypy hpamdp
+	$(PYTHON) -m pytest -n auto $(COVERAGE) $(ARGS)
+
+# What takes longer, one after another: launchers, Ray, the wheel, the oldest dependencies.
+slow:
+	$(MAKE) slow-tests
+	$(MAKE) ray-launcher
+	$(MAKE) wheel
+	$(MAKE) lowest
+
+# All slow tests, and those quick ones on sweeps that need a launcher.
+slow-tests: $(SLOW)/.installed
+	$(SLOW)/bin/python -m pytest -m slow -k 'not ($(RAY_TEST))' $(ARGS)
+	$(SLOW)/bin/python -m pytest tests/test_sweeps.py -k 'not missing_launcher' $(ARGS)
+
+ray-launcher: $(RAY)/.installed
+	$(RAY)/bin/python -m pytest tests/test_sweeps.py -m slow -k '$(RAY_TEST)' $(ARGS)
+
+# The source distribution, the wheel made of it, and a run of that wheel away from this folder.
+wheel: $(SLOW)/.installed
+	rm -rf $(SLOW)/wheel
+	$(SLOW)/bin/python -m build --outdir $(SLOW)/wheel .
+	$(SLOW)/bin/python -m pip install --quiet --no-deps --target $(SLOW)/wheel/site $(SLOW)/wheel/*.whl
+	cd $(SLOW)/wheel && PYTHONPATH=site ../bin/python -c 'import hpamdp; assert "wheel/site" in hpamdp.__file__'
+	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp \
+	    high=ucb low=hyar total_frames=1024 num_envs=32 eval.layouts=10 eval.every=0
+
+# The quick tests with the lowest versions that pyproject.toml allows.
+lowest: $(LOWEST)/.installed
+	$(LOWEST)/bin/python -m pytest -n auto $(ARGS)
 
 # Figures, tables and pages of all studies, from their csv files: report/report.html
 report: $(VENV)/.installed
 	$(PYTHON) experiments/report.py
 
 # A python on the PATH may be a stub that does not run (pyenv) or lack venv's pip (Debian), so each is tried.
+define venv
+@$(@D)/bin/python -c 'import pip; $(IS_ALLOWED)' 2>/dev/null || { \
+    for python in python3.11 python3.12 python3.10 python3; do \
+        $$python -c 'import ensurepip; $(IS_ALLOWED)' 2>/dev/null && break; \
+        python=; \
+    done; \
+    test -n "$$python" || { echo "hpamdp needs Python 3.10, 3.11 or 3.12; there is none on the PATH" >&2; exit 1; }; \
+    echo "Making $(@D) with $$($$python --version)"; \
+    $$python -m venv --clear $(@D) || exit 1; \
+}
+@echo "Installing into $(@D); the first time takes some minutes"
+endef
+INSTALL = @$(@D)/bin/python -m pip install --quiet --disable-pip-version-check
+
 $(VENV)/.installed: pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import pip; $(IS_ALLOWED)' 2>/dev/null || { \
-	    for python in python3.11 python3.12 python3.10 python3; do \
-	        $$python -c 'import ensurepip; $(IS_ALLOWED)' 2>/dev/null && break; \
-	        python=; \
-	    done; \
-	    test -n "$$python" || { echo "hpamdp needs Python 3.10, 3.11 or 3.12; there is none on the PATH" >&2; exit 1; }; \
-	    echo "Making $(VENV) with $$($$python --version)"; \
-	    $$python -m venv --clear $(VENV) || exit 1; \
-	}
-	@echo "Installing into $(VENV); the first time takes some minutes"
-	@$(PYTHON) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(venv)
+	$(INSTALL) -c constraints.txt -e '.[dev]'
+	@touch $@
+
+$(SLOW)/.installed: pyproject.toml constraints.txt
+	$(venv)
+	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray]'
+	@touch $@
+
+# This launcher wants cloudpickle < 3.
+$(RAY)/.installed: pyproject.toml constraints.txt
+	$(venv)
+	@grep -v '^cloudpickle==' constraints.txt > $(@D)/constraints.txt
+	$(INSTALL) -c $(@D)/constraints.txt -e '.[dev,ray-launcher]'
+	@touch $@
+
+$(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
+	$(venv)
+	$(INSTALL) -c constraints-lowest.txt -e '.[dev]'
 	@touch $@

@@ -1,10 +1,10 @@
-"""A research framework for hierarchical parameterised-action MDPs, with the boat-docking benchmark.
+"""A research framework for hierarchical and parameterised-action reinforcement learning.
 
-Importing it registers the Gymnasium ids (`hpamdp/BoatDock-v0`) and loads neither torch nor TorchRL.
+Importing it registers the Gymnasium ids of its problems and loads neither torch nor TorchRL.
 """
 
 from hpamdp.env.registration import register
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 register()

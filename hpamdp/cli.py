@@ -25,7 +25,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.config import GROUPS, RUN_FILE, ConfigError, no_such, no_such_option
+from hpamdp.config import GROUPS, RUN_FILE, ConfigError, conf_dir, no_such, no_such_option
+from hpamdp.messages import first_line, one_line
 from hpamdp.run import sweep
 
 _MISTAKE, _INTERRUPTED = 2, 130
@@ -37,16 +38,16 @@ _EXTRAS = {
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
 
 _HELP = """\
-hpamdp trains and scores two-level agents on parameterised-action MDPs: a selector (high) picks an option, such as which
-boat to steer; a learner (low) picks which key to press and for how long.
+hpamdp trains and scores two-level agents on parameterised-action MDPs: a selector (high) chooses an option; a learner
+(low) chooses a discrete action and its parameters at every step.
 
 Usage: {program} [GROUP=CHOICE ...] [GROUP.OPTION=VALUE ...] [VALUE=... ...] [--multirun]
 
-Groups, and what there is to choose
+Groups and their choices
 {groups}
-  The options of a choice, explained: conf/GROUP/CHOICE.yaml in {folder}
+  The options of a choice are explained in conf/GROUP/CHOICE.yaml in {folder}
 
-Values of the run, and what they are without a word from you
+Values of the run, with their defaults
 {values}
 
 Examples
@@ -64,17 +65,36 @@ Examples
 """
 
 
-def conf_dir() -> Path:
-    """Return the folder of the yaml files: inside the package where it is installed, beside it in a clone."""
-    package = Path(__file__).resolve().parent
-    for folder in (package / "conf", package.parent / "conf"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
-
-
 def main() -> None:
-    """Run the command line; exit with 0, 1 (a bug, with its traceback), 2 (a user's mistake) or 130 (interrupted)."""
+    """Run the command line.
+
+    Exits with 0, 1 (a bug, with its traceback), 2 (a user's mistake, told in one line) or 130 (interrupted).
+    """
+    # Classes of one's own may lie in the working directory, as with `python -m`.
+    if os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    # Hydra then raises what it would print, in several lines, itself.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    # TorchRL logs every replay buffer that it fills.
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    try:
+        conf = conf_dir()
+        arguments = _parse()
+        if arguments.help:
+            print(help_page(conf))
+            return
+        _check_groups(arguments.overrides, conf)
+        _run_hydra(conf, arguments)
+    except OverrideParseException as error:
+        _exit_with(f"{error.override}: {_GRAMMAR}")
+    except ConfigError as error:
+        _exit_with(str(error))
+    except KeyboardInterrupt:
+        sys.exit(_INTERRUPTED)
+
+
+def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
+    """Let Hydra run the job, or the jobs of a sweep, and tell mistakes in the command line in one line."""
     has_started = False
     start = uuid.uuid4().hex
 
@@ -83,43 +103,28 @@ def main() -> None:
         has_started = True
         return _run_job(cfg, start)
 
-    # Hydra then raises what it would print, in several lines, itself.
-    os.environ["HYDRA_FULL_ERROR"] = "1"
-    # TorchRL tells of every replay buffer that it fills.
-    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     try:
-        arguments = _parse()
-        conf = conf_dir()
-        if arguments.help:
-            print(help_page(conf))
-            return
-        _check_groups(arguments.overrides, conf)
-        try:
-            hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
-        except (Exception, KeyboardInterrupt, SystemExit) as error:
-            if not sweep.has_begun(start):
-                raise
-            sys.exit(sweep.report(start, error))
+        hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
+    except (Exception, KeyboardInterrupt, SystemExit) as error:
         if sweep.has_begun(start):
-            sys.exit(sweep.report(start))
-    except ConfigError as error:
-        _exit_with(str(error))
-    except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError) as error:
-        if has_started:  # then it is not about the command line
-            raise
-        _exit_with(_explain(error, conf, arguments))
-    except RuntimeError as error:
-        if "srun" not in str(error):  # which submitit looks for
-            raise
-        _exit_with(f"hydra/launcher=submitit_slurm: {error}")
-    except KeyboardInterrupt:
-        sys.exit(_INTERRUPTED)
+            sys.exit(sweep.report(start, error))
+        if isinstance(error, RuntimeError) and "srun" in str(error):  # which submitit looks for
+            raise ConfigError(f"hydra/launcher=submitit_slurm: {error}") from error
+        # Once a job has started, such errors are not about the command line.
+        if not has_started and isinstance(error, HydraException | OmegaConfBaseException | yaml.YAMLError | OSError):
+            raise ConfigError(_explain(error, conf, arguments)) from error
+        raise
+    if sweep.has_begun(start):
+        sys.exit(sweep.report(start))
 
 
 def help_page(conf: Path) -> str:
     """Return the text of `--help`: the groups as the folders have them, the run's values as config.yaml has them."""
     groups = {folder.name: _choices(folder) for folder in sorted(conf.iterdir()) if folder.is_dir()}
-    values = re.search(r"^# [^\n]*\nmode:.*?(?=^hydra:)", (conf / "config.yaml").read_text(), re.DOTALL | re.MULTILINE)
+    # From the comment above the first value to the part that is Hydra's.
+    values = re.search(
+        r"^(?:# [^\n]*\n)+mode:.*?(?=^hydra:)", (conf / "config.yaml").read_text(), re.DOTALL | re.MULTILINE
+    )
     return _HELP.format(
         program="python run.py" if sys.argv[0].endswith(".py") else "hpamdp",
         groups="\n".join(f"  {group:<12}{', '.join(choices)}" for group, choices in groups.items()),
@@ -139,7 +144,7 @@ def _parse() -> argparse.Namespace:
         raise ConfigError(f"{message}; see --help")
 
     parser = get_args_parser()
-    parser.error = refuse
+    parser.error = refuse  # type: ignore[method-assign]  # Hydra makes the parser, and its own prints two lines
     arguments = parser.parse_args()
     flags = ("run", "multirun", "cfg", "info", "shell_completion")
     given = [f"--{flag.replace('_', '-')}" for flag in flags if getattr(arguments, flag)]
@@ -176,7 +181,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
 
     output_dir = Path(job.runtime.output_dir)
     try:
-        code = train.run(cfg, output_dir, OmegaConf.to_container(job.overrides.task))
+        code = train.run(cfg, output_dir, list(job.overrides.task))
     except ConfigError as error:
         # Not raised any further: Hydra would announce it in a line of its own.
         with suppress(OSError):
@@ -188,7 +193,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
 
 
 def _exit_with(mistake: str) -> NoReturn:
-    print(" ".join(mistake.splitlines()), file=sys.stderr)
+    print(one_line(mistake), file=sys.stderr)
     sys.exit(_MISTAKE)
 
 
@@ -219,8 +224,8 @@ def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
 def _first_lines(error: Exception) -> str:
     """Return the first line of an error and that of its cause."""
     causes = [error] if error.__cause__ is None else [error, error.__cause__]
-    lines = [str(cause).strip().split("\n")[0].rstrip(".") for cause in causes]
-    return ": ".join(dict.fromkeys(" ".join(line.split()) for line in lines if line)) or type(error).__name__
+    lines = [first_line(cause).rstrip(".") for cause in causes]
+    return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
 
 
 def _wrong_key(overrides: list[Override], conf: Path) -> str | None:
@@ -268,3 +273,7 @@ def _no_such_key(cfg: DictConfig, path: list[str], name: str, node: dict[str, An
         file = f"conf/{path[0]}/{cfg.hydra.runtime.choices[path[0]]}.yaml"
         return no_such_option(node, name, file)
     return no_such(f"value of {'.'.join(path)}", name, node)
+
+
+if __name__ == "__main__":
+    main()

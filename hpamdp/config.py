@@ -1,7 +1,7 @@
-"""What a user may set, checked before anything is built.
+"""What a user may set, checked once, before anything is built.
 
-The run's own values are RunConfig. The options of a class are the arguments of its constructor: its signature is the
-schema of its yaml, and there is no other list of them.
+`read` turns the composed yaml files into a `Config`. The run's own values are those of `RunConfig`. The options of a
+class are the arguments of its constructor: its signature is the schema of its yaml, and there is no other list of them.
 """
 
 from __future__ import annotations
@@ -13,9 +13,13 @@ import json
 import linecache
 import re
 import traceback
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
+import hydra
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -30,14 +34,26 @@ from pydantic import (
     create_model,
 )
 
+from hpamdp.messages import first_line
+
 if TYPE_CHECKING:
     import torch  # takes seconds, and the help page needs this module too
 
-GROUPS = ("env", "high", "low", "data", "logger", "collector")
-_CAN_BE_NONE = ("high", "data")
+# The groups of conf/, and the constructor arguments that the program supplies; all others are set in the yaml.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human"),
+    "high": ("specs", "device"),
+    "low": ("specs", "device"),
+    "data": ("env",),
+    "logger": ("output_dir", "config"),
+    "collector": ("config", "parts", "frames"),
+}
 RUN_FILE = "conf/config.yaml"
-# Entries of a class's part of the config that are not options of the class.
-_TARGET, _RUNS_OWN = "_target_", ("budget", "checkpoint", "freeze")
+
+_CAN_BE_NONE = ("high", "data")
+_TARGET = "_target_"
+# Entries of a learner's yaml that are not options of its class.
+_NO_OPTIONS = ("budget", "checkpoint", "freeze")
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
 
@@ -62,7 +78,7 @@ class EvalConfig(BaseModel):
     every: NonNegativeInt
     layouts: PositiveInt
     seed: Seed
-    stop_score: float | None = None  # early runs' configs lack it
+    stop_score: float | None
 
 
 class AgentConfig(BaseModel):
@@ -85,7 +101,7 @@ class OfflineConfig(BaseModel):
 
 
 class StartConfig(BaseModel):
-    """Where the learners begin."""
+    """The learners that a run starts with."""
 
     model_config = _STRICT
 
@@ -116,12 +132,12 @@ class RunConfig(BaseModel):
 
     @property
     def num_frames(self) -> int:
-        """How long the run is to train: in updates with mode=offline, else in presses or decisions."""
+        """Length of the training: in updates with mode=offline, else in steps or decisions."""
         return self.offline.updates if self.mode == "offline" else self.total_frames
 
     @property
     def eval_every(self) -> int:
-        """How far evaluations are apart, in the same; 0: only at the start and at the end."""
+        """Distance between two evaluations, in the same unit; 0: only at the start and at the end."""
         return self.offline.eval_every if self.mode == "offline" else self.eval.every
 
     def resolve_device(self) -> torch.device:
@@ -142,19 +158,107 @@ class RunConfig(BaseModel):
         return device
 
 
-def run_config(cfg: DictConfig) -> RunConfig:
-    """Check the run's own values in the composed config.
+@dataclass(frozen=True)
+class Component:
+    """A class that was chosen for a group, with its options.
+
+    Attributes:
+        group: such as `low`.
+        name: of its yaml, such as `hyar`.
+        cls: the class; None for `high=none` and `data=none`.
+        options: checked arguments of its constructor.
+    """
+
+    group: str
+    name: str
+    cls: type | None
+    options: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        return f"{self.group}={self.name}"
+
+    def build(self, **context: Any) -> Any:
+        """Build the object; None where there is no class.
+
+        Args:
+            context: what the program supplies; each goes to a constructor that has an argument of that name.
+
+        Raises:
+            ConfigError: the constructor refuses its arguments with a ValueError.
+        """
+        if self.cls is None:
+            return None
+        accepted = constructor_arguments(self.cls)
+        supplied = {name: value for name, value in context.items() if name in accepted}
+        try:
+            return self.cls(**supplied, **self.options)
+        except ValueError as error:
+            if not _is_deliberate(error, self.cls):
+                raise
+            file = _file(self.group, self.name)
+            raise ConfigError(f"{self.group}: {first_line(error)} ({self.cls.__name__}, {file})") from error
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that was set for a run, checked."""
+
+    run: RunConfig
+    env: Component
+    high: Component
+    low: Component
+    data: Component
+    logger: Component
+    collector: Component
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the config as plain values, with the classes by their names: what a run saves and is resumed from."""
+        values = self.run.model_dump(mode="json")
+        for group in GROUPS:
+            component: Component = getattr(self, group)
+            options = json.loads(json.dumps(dict(component.options)))  # tuples become lists
+            values[group] = {"name": component.name, **options, **values.get(group, {})}
+        return values
+
+
+def conf_dir() -> Path:
+    """Return the folder of the yaml files: inside the package where it is installed, beside it in a clone."""
+    package = Path(__file__).resolve().parent
+    for folder in (package / "conf", package.parent / "conf"):
+        if (folder / "config.yaml").is_file():
+            return folder
+    raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
+
+
+def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
+    """Check the composed config.
+
+    Args:
+        cfg: as Hydra composes conf/config.yaml, with or without its `hydra` part.
+        choices: the name that was chosen for each group; None: those that Hydra knows.
 
     Raises:
         ConfigError: a wrong value, or a group for which nothing is chosen.
     """
+    names = chosen_names(cfg) if choices is None else choices
     for group in GROUPS:
         if cfg.get(group) is None or _TARGET not in cfg[group]:
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
-    plain = _plain(cfg)
+    plain = _plain(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]))
     values = {name: value for name, value in plain.items() if name not in GROUPS}
     values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
+    _check_mode(run)
+    return Config(run, **{group: component(group, names[group], plain[group]) for group in GROUPS})
+
+
+def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
+    """Return the name that was chosen for each group, from the config's `hydra` part or else from the running job."""
+    node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
+    return node.runtime.choices
+
+
+def _check_mode(run: RunConfig) -> None:
     if run.mode == "eval" and run.checkpoint is None:
         raise ConfigError("checkpoint: missing; mode=eval needs the output folder of a run")
     if run.mode != "eval" and run.checkpoint is not None:
@@ -163,58 +267,68 @@ def run_config(cfg: DictConfig) -> RunConfig:
         raise ConfigError("resume: goes with mode=train and mode=offline; to score an agent, set checkpoint")
     if run.mode != "eval" and run.eval.stop_score is not None and run.eval_every == 0:
         every = "offline.eval_every" if run.mode == "offline" else "eval.every"
-        raise ConfigError(f"eval.stop_score={run.eval.stop_score}: wants evaluations on the way; set {every} above 0")
-    return run
+        raise ConfigError(
+            f"eval.stop_score={run.eval.stop_score}: needs evaluations during training; set {every} above 0"
+        )
 
 
-def validate(group: str, node: Any, context_names: Iterable[str] = ()) -> tuple[type | None, dict[str, Any]]:
-    """Check a group's `_target_` and options against the class's constructor, and return both; build nothing.
+def component(group: str, name: str, node: Any) -> Component:
+    """Check a group's `_target_` and options against the class's constructor; build nothing.
 
     Args:
         group: such as `low`.
-        node: the group's part of the config; its `budget`, `checkpoint` and `freeze` are the run's business.
-        context_names: constructor arguments that the program gives, which no yaml may.
-
-    Returns:
-        The class and its options; None and no options for `high=none`, where nothing chooses, and `data=none`.
+        name: of the yaml that was chosen.
+        node: the group's part of the config.
 
     Raises:
         ConfigError: all that is wrong with this group, in one line.
     """
     options = _plain(node, group)
-    for name in _RUNS_OWN:
-        options.pop(name, None)
+    for entry in _NO_OPTIONS:
+        options.pop(entry, None)
     target = options.pop(_TARGET, None)
-    # Where the environment gives the option, nothing chooses.
-    cls = None if target is None and group in _CAN_BE_NONE else _load_target(group, target)
-    name = "none" if cls is None else cls.__name__
-    schema = create_model(name, __config__=_STRICT) if cls is None else _schema(cls, set(context_names))
-    what, where = f"option of {name} ({_file(group)})", f"{name}, {_file(group)}"
-    model = _validated(schema, options, f"{group}.", what, where)
-    return cls, {option: getattr(model, option) for option in schema.model_fields}
+    file = _file(group, name)
+    cls = None if target is None and group in _CAN_BE_NONE else _load_target(group, target, file)
+    class_name = "none" if cls is None else cls.__name__
+    schema = create_model(class_name, __config__=_STRICT) if cls is None else _schema(cls, GROUPS[group])
+    model = _validated(schema, options, f"{group}.", f"option of {class_name} ({file})", f"{class_name}, {file}")
+    return Component(group, name, cls, {option: getattr(model, option) for option in schema.model_fields})
 
 
-def build(group: str, node: Any, **context: Any) -> Any:
-    """Build the object that a group's part of the config describes; None for `high=none` and `data=none`.
-
-    Args:
-        group: such as `low`.
-        node: the group's part of the config.
-        context: what the program gives; each goes to a constructor that has an argument of that name.
+def compose_saved(saved: Mapping[str, Any]) -> tuple[DictConfig, dict[str, str]]:
+    """Return a config that `Config.to_dict` gave as `read` takes it, with the classes of today's yaml files.
 
     Raises:
-        ConfigError: what `validate` finds, or what the constructor refuses with a ValueError.
+        ConfigError: a name of the saved config is in no folder that is searched for yaml files.
     """
-    cls, options = validate(group, node, context)
-    if cls is None:
-        return None
-    accepted = inspect.signature(cls.__init__).parameters
+    choices = {group: saved[group]["name"] for group in GROUPS}
+    today = _compose([f"{group}={name}" for group, name in choices.items()])
+    values = dict(saved)
+    for group in GROUPS:
+        options = {name: value for name, value in saved[group].items() if name != "name"}
+        values[group] = {**{str(key): value for key, value in today[group].items()}, **options}
+    return OmegaConf.create(values), choices
+
+
+def _compose(overrides: list[str]) -> DictConfig:
+    if HydraConfig.initialized():
+        given = HydraConfig.get().overrides.hydra
+        overrides = [*(word for word in given if word.startswith("hydra.searchpath=")), *overrides]
     try:
-        return cls(**{name: value for name, value in context.items() if name in accepted}, **options)
-    except ValueError as error:
-        if not _is_deliberate(error, cls):
-            raise
-        raise ConfigError(f"{group}: {_one_line(error)} ({cls.__name__}, {_file(group)})") from error
+        if GlobalHydra.instance().is_initialized():
+            return hydra.compose("config", overrides)
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose("config", overrides)
+    except hydra.errors.MissingConfigException as error:
+        raise ConfigError(
+            f"the saved run chose {error.missing_cfg_file}, which is not there; is a --config-dir missing?"
+        ) from error
+
+
+def constructor_arguments(cls: type) -> dict[str, inspect.Parameter]:
+    """Return the arguments of a class's constructor, without `self`."""
+    constructor: Callable[..., None] = cls.__init__  # type: ignore[misc]  # a subclass's may differ, but this is `cls`
+    return dict(list(inspect.signature(constructor).parameters.items())[1:])
 
 
 def load_class(dotted: str) -> type:
@@ -239,16 +353,11 @@ def load_class(dotted: str) -> type:
     return cls
 
 
-def _load_target(group: str, target: Any) -> type:
+def _load_target(group: str, target: Any, file: str) -> type:
     try:
         return load_class(str(target))
     except ConfigError as error:
-        raise ConfigError(f"{group}.{_TARGET}={error} ({_file(group)})") from error
-
-
-def name_of(node: Mapping[str, Any]) -> str:
-    """Return the name by which a class of a group is chosen: that of the class's file, or `none`."""
-    return "none" if node[_TARGET] is None else node[_TARGET].split(".")[-2]
+        raise ConfigError(f"{group}.{_TARGET}={error} ({file})") from error
 
 
 def no_such_option(node: Mapping[str, Any], name: str, file: str) -> str:
@@ -268,27 +377,31 @@ def no_such(what: str, name: str, known: Iterable[str]) -> str:
 def _plain(node: Any, where: str = "the config") -> dict[str, Any]:
     """Resolve a part of the config into plain Python values."""
     if not isinstance(node, Mapping | DictConfig):
-        raise ConfigError(f"{where}={_written(node)}: must be a mapping")
-    if not OmegaConf.is_config(node):
+        raise ConfigError(f"{where}={_as_json(node)}: must be a mapping")
+    if not isinstance(node, DictConfig):
         return dict(node)
     try:
-        return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+        container = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
-        raise ConfigError(f"{error.full_key or where}: {_one_line(error)}") from error
+        raise ConfigError(f"{error.full_key or where}: {first_line(error)}") from error
+    assert isinstance(container, dict)
+    return {str(name): value for name, value in container.items()}
 
 
-def _schema(cls: type, given: set[str]) -> type[BaseModel]:
-    hints = get_type_hints(cls.__init__, include_extras=True)
-    fields = {}
-    for name, argument in list(inspect.signature(cls.__init__).parameters.items())[1:]:
-        if name in given or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
+def _schema(cls: type, supplied: Iterable[str]) -> type[BaseModel]:
+    """Return a model with a field for each argument of the constructor that the program does not supply."""
+    hints = get_type_hints(cls.__init__, include_extras=True)  # type: ignore[misc]  # as in `constructor_arguments`
+    fields: dict[str, Any] = {}
+    for name, argument in constructor_arguments(cls).items():
+        if name in supplied or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
             continue
-        fields[name] = (hints.get(name, Any), ... if argument.default is argument.empty else argument.default)
+        default = ... if argument.default is argument.empty else argument.default
+        fields[name] = (hints.get(name, Any), default)
     return create_model(cls.__name__, __config__=_STRICT, **fields)
 
 
 def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what: str, where: str) -> Any:
-    """Return the values as the model; `what` they are and `where` they stand is told if they are wrong."""
+    """Return the values as the model; an error names `what` they are and `where` they are set."""
     try:
         # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
         return model.model_validate_json(json.dumps(values, default=str))
@@ -306,41 +419,40 @@ def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what
                 message = problem["msg"].removeprefix("Value error, ").replace("valid array", "list")
                 message = re.sub("^(Input|String|List) should", "must", message)
                 # A union complains once for each of its types.
-                wrong.setdefault(f"{key}={_written(value)}", {})[message] = None
-        raise ConfigError(
-            "; ".join([*unknown, *(f"{key}: {' or '.join(wrong[key])} ({where})" for key in wrong)])
-        ) from error
+                wrong.setdefault(f"{key}={_as_json(value)}", {})[message] = None
+        complaints = [f"{key}: {' or '.join(messages)} ({where})" for key, messages in wrong.items()]
+        raise ConfigError("; ".join([*unknown, *complaints])) from error
 
 
 def _locate(location: tuple[int | str, ...], values: dict[str, Any]) -> tuple[list[str], Any]:
-    """Return the keys to where a problem is, and what stands there."""
-    path, value = [], values
+    """Return the keys that lead to a problem, and the value there."""
+    path: list[str] = []
+    value: Any = values
     for part in location:
         # The other parts name the type of a union that was tried.
-        if isinstance(value, dict) or (isinstance(value, list) and isinstance(part, int)):
+        if isinstance(value, dict):
             path.append(str(part))
-            value = value.get(part) if isinstance(value, dict) else value[part]
+            value = value.get(part)
+        elif isinstance(value, list) and isinstance(part, int):
+            path.append(str(part))
+            value = value[part]
     return path, value
 
 
 def _fields(model: type[BaseModel], path: list[str]) -> Iterable[str]:
     for name in path:
-        model = model.model_fields[name].annotation
+        inner = model.model_fields[name].annotation
+        assert isinstance(inner, type)
+        model = inner
     return model.model_fields
 
 
-def _file(group: str) -> str:
-    """Return the yaml that was chosen for a group."""
-    chosen = HydraConfig.get().runtime.choices.get(group) if HydraConfig.initialized() else None
-    return f"conf/{group}/{chosen}.yaml" if chosen else f"conf/{group}"
+def _file(group: str, name: str) -> str:
+    return f"conf/{group}/{name}.yaml"
 
 
-def _written(value: Any) -> str:
+def _as_json(value: Any) -> str:
     return json.dumps(value, default=str)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split("\n")[0].split())
 
 
 def _is_deliberate(error: ValueError, cls: type) -> bool:

@@ -1,4 +1,4 @@
-"""The names under which data travels in tensordicts, once."""
+"""The names of the entries of a tensordict, in one place."""
 
 OBSERVATION = "observation"
 OPTION = "option"
@@ -7,7 +7,7 @@ DISCRETE = (ACTION, "discrete")
 PARAMETERS = (ACTION, "parameters")
 REWARD = "reward"
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
-OUTCOME, FUEL = "outcome", "fuel"
+OUTCOME = "outcome"  # how the episode ended, in an environment's own codes
 
 # Written by DecisionTracker.
 IS_DECISION = "is_decision"
@@ -15,13 +15,13 @@ OPTION_RETURN, OPTION_STEPS = "option_return", "option_steps"
 DECISION_OBSERVATION = "decision_observation"
 EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
 
-# Written by an environment that knows the best action: what the `oracle` selector and the `planner` learner read.
+# Written by an environment that knows the best action; read by the `oracle` selector and the `planner` learner.
 ORACLE_OPTION = ("oracle", "option")
 ORACLE_DISCRETE = ("oracle", "discrete")
 ORACLE_PARAMETERS = ("oracle", "parameters")
 
-# Written by an environment that knows what people do: their shares of the options, what the `human` selector reads.
+# Written by an environment with human data: how often people choose each option; read by the `human` selector.
 HUMAN_OPTION = ("human", "option")
 
-# Written by the agent for a selector that asks for it: what each option's learner expects of the state.
+# Written by the agent for a selector that needs it: the value of the state by each option's learner.
 OPTION_VALUES = "option_values"

@@ -14,17 +14,26 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hpamdp.cli import main
+from hpamdp.config import Config, read
 
 # Two processes on two cores fight over threads otherwise.
 torch.set_num_threads(1)
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
+# The word that adds the tests' own yaml files.
+OWN = f"hydra.searchpath=[file://{Path(__file__).resolve().parent / 'conf'}]"
 
 
 def compose_config(overrides: Sequence[str]) -> DictConfig:
-    """Compose conf/config.yaml as the command line does."""
+    """Compose conf/config.yaml as the command line does; yaml files in tests/conf are found, too."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", list(overrides))
+        own = [] if any(word.startswith("hydra.searchpath=") for word in overrides) else [OWN]
+        return compose("config", [*own, *overrides], return_hydra_config=True)
+
+
+def make_config(overrides: Sequence[str]) -> Config:
+    """Return the checked config of a command line."""
+    return read(compose_config(overrides))
 
 
 def choices(group: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""A recorded episode of the released code, and plays in ReleasedBoatDockEnv."""
+"""A recorded episode of the released code, and helpers to act in ReleasedBoatDockEnv."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
 
 REPLAY = Path(__file__).resolve().parent.parent / "experiments" / "released" / "replay.py"
 TRACES = sorted(Path(os.environ["HPAMDP_TRACES"]).glob("*.json")) if "HPAMDP_TRACES" in os.environ else []
-IDLE, STEP = -1.0, -0.92  # no time at all; .2 s, which carry 66.65 px
+IDLE, STEP = -1.0, -0.92  # durations u: 0 s, and .2 s, which move a boat by 66.65 px
 X, Y = 9, 10
 VELOCITY, FUEL, DISTANCE = slice(11, 13), 13, 14
 
-# A recorded episode of the released code: key, parameter, boat, velocity, fuel, distance, reward; the last press docks.
+# A recorded episode of the released code; the last press docks. Each press: key, parameter, boat, velocity, fuel,
+# distance.
 HEAD = (693.0, 585.0, 611.0, 482.0, 640.0, 512.0, 120.0, 1.0, -1.0)
 FIRST, SECOND, THIRD = (
     (693.0, 527.7580543433888),
@@ -34,13 +35,20 @@ PRESSES = (
 )
 REWARDS = (0.2867475991457688, 0.27145976624673207, 0.28728523914262266, 17.12512230873108)
 RECORDED = {
-    **{"controller": 1, "keymap": -1, "start": HEAD[:2], "goal": HEAD[2:4]},
+    "controller": 1,
+    "keymap": -1,
+    "start": HEAD[:2],
+    "goal": HEAD[2:4],
     "observation0": (*HEAD, *HEAD[:2], 0.0, 0.0, 1.0, 1.0),
     "steps": [
         {
-            **{"key": key, "parameter": (parameter,) * 3, "reward": reward},
+            "key": key,
+            "parameter": (parameter,) * 3,
+            "reward": reward,
             "observation": (*HEAD, *boat, *velocity, fuel, distance),
-            **{"done": reward == REWARDS[-1], "truncated": False, "success": reward == REWARDS[-1]},
+            "done": reward == REWARDS[-1],
+            "truncated": False,
+            "success": reward == REWARDS[-1],
         }
         for (key, parameter, boat, velocity, fuel, distance), reward in zip(PRESSES, REWARDS, strict=True)
     ],
@@ -55,8 +63,9 @@ def load_replay():
 
 
 def action(key, duration) -> TensorDict:
-    """Build an action: `key` a list, `duration` a number for each environment or `[N, 3]`."""
-    key, duration = torch.as_tensor(key), torch.as_tensor(duration, dtype=torch.float32)
+    """Return actions: `key` is a list, `duration` has a number for each environment or is `[N, 3]`."""
+    key = torch.as_tensor(key)
+    duration = torch.as_tensor(duration, dtype=torch.float32)
     duration = duration if duration.ndim == 2 else duration.unsqueeze(-1).expand(-1, 3)
     return TensorDict({keys.ACTION: TensorDict(discrete=key, parameters=duration, batch_size=[len(key)])}, [len(key)])
 
@@ -66,26 +75,32 @@ def press(env: ReleasedBoatDockEnv, key: int, duration: float) -> TensorDict:
 
 
 def place(env: ReleasedBoatDockEnv, start, goal, **more) -> TensorDict:
-    """Start one boat there."""
-    layout = {"start": torch.tensor([start]).double(), "goal": torch.tensor([goal]).double()}
-    return env.reset(TensorDict({**layout, **{name: torch.tensor([value]) for name, value in more.items()}}, [1]))
+    """Start an episode of one boat in this layout."""
+    layout = TensorDict(
+        {"start": torch.tensor([start], dtype=torch.float64), "goal": torch.tensor([goal], dtype=torch.float64)}, [1]
+    )
+    for name, value in more.items():
+        layout[name] = torch.tensor([value])
+    return env.reset(layout)
 
 
-def seen(td: TensorDict) -> list[float]:
+def observed(td: TensorDict) -> list[float]:
+    """Return the observation of the only boat."""
     return td[keys.OBSERVATION][0].tolist()
 
 
 def end(td: TensorDict) -> tuple[int, float, bool, bool]:
-    flags = [td[name].item() for name in (keys.TERMINATED, keys.TRUNCATED)]
-    return (td[keys.OUTCOME].item(), td[keys.REWARD].item(), *flags)
+    """Return outcome, reward, terminated and truncated of the only boat."""
+    return td[keys.OUTCOME].item(), td[keys.REWARD].item(), td[keys.TERMINATED].item(), td[keys.TRUNCATED].item()
 
 
 def one(**arguments) -> ReleasedBoatDockEnv:
     return ReleasedBoatDockEnv(dtype="float64", **arguments)
 
 
-def restart(env: ReleasedBoatDockEnv, td: TensorDict, rows: list[bool]) -> TensorDict:
-    return env.reset(td.clone().set("_reset", torch.tensor(rows).unsqueeze(-1)))
+def restart(env: ReleasedBoatDockEnv, td: TensorDict, mask: list[bool]) -> TensorDict:
+    """Start new episodes in the rows of the mask."""
+    return env.reset(td.clone().set("_reset", torch.tensor(mask).unsqueeze(-1)))
 
 
 def layouts(td: TensorDict) -> Tensor:

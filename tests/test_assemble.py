@@ -4,13 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import compose_config
-from omegaconf import DictConfig, OmegaConf
+from conftest import make_config
 from test_grid import SHORT, SMALL
 from toy_options import Crossing
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, run_config
+from hpamdp.config import Config, ConfigError
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.train import Trainer
@@ -19,26 +18,22 @@ OWN_VALUES = ("hppo", "hsac", "hyar", "pdqn", "qpamdp")
 QUICK_CRITIC = ["high=meta_critic", "high.warmup_decisions=0", "high.updates_per_decision=0.2", "high.batch_size=16"]
 
 
-def make(cfg: DictConfig, folder: Path) -> Parts:
+def make(config: Config, folder: Path) -> Parts:
     torch.manual_seed(0)
-    return assemble(cfg, run_config(cfg), folder)
+    return assemble(config, folder)
 
 
-def train(cfg: DictConfig, folder: Path) -> Parts:
-    """Train as `cfg` says and leave the checkpoint in the folder."""
+def train(config: Config, folder: Path) -> Parts:
+    """Train and leave the checkpoint in the folder."""
     folder.mkdir()
-    parts = make(cfg, folder)
-    assert not Trainer(cfg, run_config(cfg), parts, folder).train()
+    parts = make(config, folder)
+    assert not Trainer(config, parts, folder).train()
     return parts
 
 
-def crossing(*words: str) -> DictConfig:
-    """Compose a config on an environment whose options may change within an episode, for learners that know the way."""
-    cfg = compose_config([*SMALL, "low=random", *words])
-    OmegaConf.set_struct(cfg, False)
-    cfg.env = {"_target_": "toy_options.Crossing", "start": 3.0}
-    cfg.low._target_ = "toy_options.Stepper"
-    return cfg
+def crossing(*words: str) -> Config:
+    """Return a config with options that may change within an episode, and learners that know the way."""
+    return make_config([*SMALL, "env=crossing", "low=stepper", *words])
 
 
 @pytest.mark.parametrize(
@@ -52,11 +47,11 @@ def crossing(*words: str) -> DictConfig:
         ("high=ucb env=boatdock_released", "high=ucb: env=boatdock_released has no options to choose; use high=none"),
         (
             "high=ucb env.controller=random",
-            "high=ucb: env.controller=random leaves nothing to choose; use high=none or env.controller=choose",
+            "high=ucb: env=boatdock leaves nothing to choose; use high=none or env.controller=choose",
         ),
         (
             "high=none",
-            "high=none: env.controller=choose needs a selector; use another high or env.controller=congruent, "
+            "high=none: env=boatdock needs a selector; use another high or env.controller=congruent, "
             "incongruent, random",
         ),
         (
@@ -77,7 +72,11 @@ def crossing(*words: str) -> DictConfig:
         ),
         (
             "high=linucb env=boatdock env.observation=pixels",
-            "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all (LinUCB, conf/high)",
+            "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all (LinUCB, conf/high/linucb.yaml)",
+        ),
+        (
+            "high=exp3 low=iql mode=offline data=human",
+            "high=exp3: learns from its own choices only; use mode=train, or another high",
         ),
         (
             "low.checkpoint=/nowhere",
@@ -88,7 +87,7 @@ def crossing(*words: str) -> DictConfig:
 def test_what_does_not_go_together_is_refused_in_one_line(words, complaint, tmp_path):
     low = [] if "low=" in words else ["low=random"]
     with pytest.raises(ConfigError) as error:
-        make(compose_config([*SMALL, *low, *words.split()]), tmp_path)
+        make(make_config([*SMALL, *low, *words.split()]), tmp_path)
     assert str(error.value) == complaint
 
 
@@ -103,7 +102,7 @@ def test_frozen_learners_play_whole_episodes_so_that_options_cannot_be_shorter(t
 def trained(tmp_path_factory) -> Path:
     """Return the output folder of a tiny run of H-PPO."""
     folder = tmp_path_factory.mktemp("runs") / "hppo"
-    train(compose_config([*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"]]), folder)
+    train(make_config([*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"]]), folder)
     return folder
 
 
@@ -112,7 +111,7 @@ def trained(tmp_path_factory) -> Path:
 )
 def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained, tmp_path):
     with pytest.raises(ConfigError) as error:
-        make(compose_config([*SMALL, *words.split(), f"low.checkpoint={trained}"]), tmp_path)
+        make(make_config([*SMALL, *words.split(), f"low.checkpoint={trained}"]), tmp_path)
     line = str(error.value)
     assert line.startswith(f"low.checkpoint={trained / 'checkpoint.zip'}: ")
     assert "it holds 2 learners, but this agent has 1" in line or "of another class or size than low: " in line
@@ -129,13 +128,13 @@ def is_same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> boo
 
 def test_frozen_learners_of_another_run_stay_as_they_are_while_the_selector_learns(trained, tmp_path):
     words = [*SMALL, "low=hppo", *SHORT["hppo"], "agent.sharing=per_option"]
-    fresh = copied(make(compose_config([*words, "high=ucb"]), tmp_path / "fresh").agent.learners)
+    fresh = copied(make(make_config([*words, "high=ucb"]), tmp_path / "fresh").agent.learners)
     words += [*QUICK_CRITIC, f"low.checkpoint={trained}", "low.freeze=true"]
-    parts = make(compose_config(words), tmp_path / "before")
+    parts = make(make_config(words), tmp_path / "before")
     assert isinstance(parts.env.base_env, OptionChoiceEnv)
     start, selector = copied(parts.agent.learners), copied(parts.agent.selector)
     assert not is_same(start, fresh)
-    parts = train(compose_config(words), tmp_path / "after")
+    parts = train(make_config(words), tmp_path / "after")
     assert is_same(copied(parts.agent.learners), start)
     now = copied(parts.agent.selector)
     assert int(now["num_decisions"]) == 256, "a frame is a decision"
@@ -144,21 +143,21 @@ def test_frozen_learners_of_another_run_stay_as_they_are_while_the_selector_lear
 
 def test_learners_of_another_run_go_on_learning_where_they_are_not_frozen(trained, tmp_path):
     words = [*SMALL, "high=ucb", "low=hppo", *SHORT["hppo"], f"low.checkpoint={trained}"]
-    start = copied(make(compose_config(words), tmp_path).agent.learners)
-    assert not is_same(copied(train(compose_config(words), tmp_path / "on").agent.learners), start)
+    start = copied(make(make_config(words), tmp_path).agent.learners)
+    assert not is_same(copied(train(make_config(words), tmp_path / "on").agent.learners), start)
 
 
 def test_frozen_learners_that_need_no_training_need_no_checkpoint(tmp_path):
     words = [*SMALL, "high=ucb", "low=random", "low.freeze=true"]
-    parts = train(compose_config(words), tmp_path / "out")
-    assert parts.agent.selector.rewards.num_decisions.item() == 256
+    parts = train(make_config(words), tmp_path / "out")
+    assert parts.agent.selector.statistics.num_decisions.item() == 256
 
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])
 @pytest.mark.parametrize("low", OWN_VALUES)
 def test_the_meta_critic_learns_from_the_learners_own_values(low, sharing, tmp_path, monkeypatch):
     words = [*SMALL, *QUICK_CRITIC, "high.bootstrap=0.5", f"low={low}", *SHORT[low], f"agent.sharing={sharing}"]
-    parts = make(compose_config(words), tmp_path)
+    parts = make(make_config(words), tmp_path)
     agent, learn, num = parts.agent, parts.agent.selector.learn, []
 
     def checked(decisions):
@@ -191,7 +190,7 @@ def test_options_of_a_fixed_length_are_chosen_and_discounted_as_the_selector_ask
     assert parts.evaluation.env.transform.option_length == 2
     assert "high/critic" in parts.agent.learn(batch.contiguous())
     played = parts.evaluation.run_agent(parts.agent)
-    assert played["option_scores"].shape == (10, 2) and played["presses"].max() <= Crossing.max_steps
+    assert played["option_scores"].shape == (10, 2) and played["steps"].max() <= Crossing.max_steps
 
 
 def test_an_episodes_return_is_not_discounted_where_options_last_as_long(tmp_path):

@@ -1,4 +1,4 @@
-"""Context-free bandits: what they count, what they choose, and that they find and follow the better option."""
+"""Context-free bandits: their statistics and choices, and that they find the better option and follow its changes."""
 
 import math
 
@@ -31,51 +31,52 @@ def make(name: str, memory: str = "all", **changes: float) -> Bandit:
 
 
 def share_of_right(options: torch.Tensor) -> float:
+    """Return how often the second option, `right`, was chosen."""
     return options.float().mean().item()
 
 
-# What is remembered.
+# Statistics.
 
 
-def test_all_payoffs_count_the_same():
-    rewards = RewardStatistics(2, "all", 0.9, 3)
+def test_with_memory_all_every_reward_has_the_same_weight():
+    statistics = RewardStatistics(2, "all", 0.9, 3)
     for option, reward in ((0, 1.0), (1, 2.5), (0, 2.0), (0, 3.0)):
-        rewards.add(torch.tensor([option]), torch.tensor([reward]))
-    assert rewards.counts.tolist() == [3, 1] and rewards.means.tolist() == [2.0, 2.5]
-    assert rewards.deviation.item() == pytest.approx(torch.tensor([1.0, 2.5, 2.0, 3.0]).std(correction=0).item())
-    assert rewards.best() == 1 and rewards.num_decisions.item() == 4
+        statistics.add(torch.tensor([option]), torch.tensor([reward]))
+    assert statistics.counts.tolist() == [3, 1] and statistics.means.tolist() == [2.0, 2.5]
+    assert statistics.deviation.item() == pytest.approx(torch.tensor([1.0, 2.5, 2.0, 3.0]).std(correction=0).item())
+    assert statistics.best() == 1 and statistics.num_decisions.item() == 4
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 3, 6])
-def test_discounted_payoffs_weigh_by_their_age_in_decisions(at_once):
-    options, values = torch.tensor([0, 1, 0, 0, 1, 0]), torch.tensor([1.0, 2.0, -3.0, 4.0, 5.0, -6.0])
-    rewards = RewardStatistics(2, "discounted", 0.9, 3)
-    for o, v in zip(options.split(at_once), values.split(at_once), strict=True):
-        rewards.add(o, v)
+def test_discounted_rewards_are_weighted_by_their_age_in_decisions(at_once):
+    options, rewards = torch.tensor([0, 1, 0, 0, 1, 0]), torch.tensor([1.0, 2.0, -3.0, 4.0, 5.0, -6.0])
+    statistics = RewardStatistics(2, "discounted", 0.9, 3)
+    for some_options, some_rewards in zip(options.split(at_once), rewards.split(at_once), strict=True):
+        statistics.add(some_options, some_rewards)
     weights = 0.9 ** torch.arange(5, -1, -1).double()
     for option in (0, 1):
         own = options == option
-        assert rewards.counts[option].item() == pytest.approx(weights[own].sum().item())
-        mean = (weights * values)[own].sum() / weights[own].sum()
-        assert rewards.means[option].item() == pytest.approx(mean.item())
+        assert statistics.counts[option].item() == pytest.approx(weights[own].sum().item())
+        mean = (weights * rewards)[own].sum() / weights[own].sum()
+        assert statistics.means[option].item() == pytest.approx(mean.item())
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 3, 6])
-def test_a_sliding_window_holds_the_last_decisions_alone(at_once):
-    rewards = RewardStatistics(2, "sliding_window", 0.9, 4)
-    options, values = torch.tensor([0, 0, 1, 1, 0, 0]), torch.tensor([9.0, 9.0, 1.0, 2.0, 3.0, 5.0])
-    for o, v in zip(options.split(at_once), values.split(at_once), strict=True):
-        rewards.add(o, v)
-    assert rewards.counts.tolist() == [2, 2] and rewards.means.tolist() == [4.0, 1.5]
+def test_a_sliding_window_holds_only_the_last_decisions(at_once):
+    statistics = RewardStatistics(2, "sliding_window", 0.9, 4)
+    options, rewards = torch.tensor([0, 0, 1, 1, 0, 0]), torch.tensor([9.0, 9.0, 1.0, 2.0, 3.0, 5.0])
+    for some_options, some_rewards in zip(options.split(at_once), rewards.split(at_once), strict=True):
+        statistics.add(some_options, some_rewards)
+    assert statistics.counts.tolist() == [2, 2] and statistics.means.tolist() == [4.0, 1.5]
 
 
 def test_an_option_that_left_the_window_is_untried_again():
-    rewards = RewardStatistics(2, "sliding_window", 0.9, 2)
-    rewards.add(torch.tensor([1, 0, 0]), torch.tensor([5.0, -1.0, -1.0]))
-    assert rewards.is_untried.tolist() == [False, True] and rewards.best() == 0
+    statistics = RewardStatistics(2, "sliding_window", 0.9, 2)
+    statistics.add(torch.tensor([1, 0, 0]), torch.tensor([5.0, -1.0, -1.0]))
+    assert statistics.is_untried.tolist() == [False, True] and statistics.best() == 0
 
 
-# What is chosen.
+# Choices.
 
 
 @every_bandit
@@ -93,7 +94,7 @@ def test_greedy_choices_are_the_best_option_everywhere(name, memory):
 
 @every_bandit
 @pytest.mark.parametrize("rewards", [[], [5.0], [1.0, 2.0, 3.0, 2.0, 2.0]])
-def test_options_without_payoffs_get_tried(name, rewards):
+def test_untried_options_get_tried(name, rewards):
     torch.manual_seed(0)
     bandit = make(name, **({"epsilon_scale": 1e-3, "epsilon_final": 0.0} if name == "epsilon_greedy" else {}))
     if rewards:
@@ -103,29 +104,31 @@ def test_options_without_payoffs_get_tried(name, rewards):
 
 
 @every_bandit
-def test_only_decisions_that_are_due_are_drawn(name):
+def test_only_decisions_that_are_due_are_sampled(name):
     torch.manual_seed(0)
     root = due(100)
     root[keys.IS_DECISION][:50] = False
-    bandit, drawn = make(name), []
-    bandit.sample = lambda num: drawn.append(num) or torch.ones(num, dtype=torch.long)
+    bandit = make(name)
+    sampled = []
+    bandit.sample = lambda num: sampled.append(num) or torch.ones(num, dtype=torch.long)
     assert bandit.select(root)[50:].tolist() == [1] * 50
-    assert drawn == [50]
+    assert sampled == [50]
 
 
-def test_epsilon_falls_with_one_over_the_decisions_to_its_end():
+def test_epsilon_falls_as_one_over_the_decisions_to_its_lower_bound():
     torch.manual_seed(0)
     bandit = make("epsilon_greedy", epsilon_scale=100.0, epsilon_final=0.05)
     bandit.learn(paid([0, 1] * 200, [1.0, 0.0] * 200))
-    # At decisions 401 to 10,400: 2 options, so half of the random choices are wrong.
+    # At decisions 401 to 10,400; with 2 options, half of the random choices are wrong.
     expected = sum(max(0.05, 100.0 / t) for t in range(401, 10_401)) / 2
     assert bandit.select(due(10_000)).sum().item() == pytest.approx(expected, abs=4 * math.sqrt(expected))
 
 
 def test_ucb1_chooses_by_its_formula():
-    ucb, rewards = make("ucb"), [1.0, 2.0, 3.0, 1.2]
+    ucb = make("ucb")
+    rewards = [1.0, 2.0, 3.0, 1.2]
     ucb.learn(paid([0, 0, 0, 1], rewards))
-    # Means 2 and 1.2, decision 5: the factor at which the bounds of 3 payoffs and of 1 are the same.
+    # Means 2 and 1.2 at decision 5: `even` is the factor for which the bounds from 3 rewards and from 1 are equal.
     deviation = torch.tensor(rewards).std(correction=0).item()
     even = (2.0 - 1.2) / (deviation * math.sqrt(2 * math.log(5)) * (1 - 1 / math.sqrt(3)))
     for factor, chosen in ((0.99, 0), (1.01, 1)):
@@ -134,7 +137,7 @@ def test_ucb1_chooses_by_its_formula():
 
 
 @pytest.mark.parametrize("tried", [(30, 10), (30, 0), (0, 0)])
-def test_ucb_serves_simultaneous_decisions_as_if_one_after_another(tried):
+def test_ucb_serves_simultaneous_decisions_as_if_they_came_one_after_another(tried):
     torch.manual_seed(0)
     ucb = make("ucb", exploration=1.0)
     rewards = torch.randn(sum(tried))
@@ -144,7 +147,7 @@ def test_ucb_serves_simultaneous_decisions_as_if_one_after_another(tried):
     means = torch.stack(means) if sum(tried) else torch.zeros(2)
     counts = torch.tensor(tried, dtype=torch.float64)
     for _ in range(64):
-        bounds = means + ucb.rewards.deviation * (2 * math.log(sum(tried) + 64) / counts).sqrt()
+        bounds = means + ucb.statistics.deviation * (2 * math.log(sum(tried) + 64) / counts).sqrt()
         counts[bounds.argmax()] += 1
     chosen = torch.bincount(ucb.select(due(64)), minlength=2)
     assert chosen.tolist() == (counts - torch.tensor(tried)).tolist()
@@ -154,12 +157,12 @@ def test_thompson_chooses_an_option_as_often_as_it_is_likely_to_be_the_best():
     torch.manual_seed(0)
     thompson = make("thompson", exploration=0.8)
     thompson.learn(paid([0] * 8 + [1] * 2, [1.0, 0.0] * 4 + [1.2, 0.0]))
-    deviation = 0.8 * thompson.rewards.deviation * math.sqrt(1 / 8 + 1 / 2)
+    deviation = 0.8 * thompson.statistics.deviation * math.sqrt(1 / 8 + 1 / 2)
     likely = torch.distributions.Normal(0.0, 1.0).cdf(0.1 / deviation).item()
     assert share_of_right(thompson.select(due(40_000))) == pytest.approx(likely, abs=0.01)
 
 
-def test_exp3_weighs_payoffs_by_the_probability_of_their_choice():
+def test_exp3_weights_rewards_by_the_probability_of_their_choice():
     exp3 = make("exp3", exploration=0.5)
     exp3.learn(paid([0, 1, 1], [4.0, 2.0, 3.0], **{PROBABILITY: torch.tensor([0.8, 0.2, 0.25])}))
     gains = torch.tensor([1.0 / 0.8, 0.0 / 0.2 + 0.5 / 0.25])  # scaled by the range, 2 to 4
@@ -172,7 +175,7 @@ def test_exp3_weighs_payoffs_by_the_probability_of_their_choice():
     torch.testing.assert_close(td[PROBABILITY], expected[td[keys.OPTION]])
 
 
-# What they achieve.
+# What the bandits achieve.
 
 
 @every_bandit
@@ -186,7 +189,7 @@ def test_the_better_option_is_found(name, memory, batch):
 
 
 @every_bandit
-def test_forgetting_bandits_follow_a_change_of_the_better_option_and_others_lag(name):
+def test_bandits_that_forget_follow_a_change_of_the_better_option_and_others_lag(name):
     share = {}
     for memory in MEMORIES:
         torch.manual_seed(0)
@@ -201,7 +204,7 @@ def test_forgetting_bandits_follow_a_change_of_the_better_option_and_others_lag(
 
 @every_bandit
 @every_memory
-def test_a_copy_made_of_a_state_dict_goes_on_identically(name, memory):
+def test_a_copy_made_from_a_state_dict_continues_identically(name, memory):
     torch.manual_seed(0)
     source, target = make(name, memory), make(name, memory)
     play(source, constant(0.0, 1.0), 50)
@@ -212,13 +215,13 @@ def test_a_copy_made_of_a_state_dict_goes_on_identically(name, memory):
     assert torch.equal(play(target, constant(1.0, 0.0), 60, 2)[0], expected)
 
 
-# Regret where payoffs stand still, at T and at 4 T decisions, with means 1 apart.
+# Regret after T and after 4 T decisions with stationary rewards, whose means are 1 apart.
 
 T = 2000
 
 
 def growth(name: str, **changes: float) -> tuple[float, float]:
-    """Return the mean regret at T decisions, and by what it grows until 4 T."""
+    """Return the mean regret after T decisions, and the factor by which it grows until 4 T."""
     curves = []
     for seed in range(5):
         torch.manual_seed(seed)
@@ -233,14 +236,14 @@ def growth(name: str, **changes: float) -> tuple[float, float]:
 )
 def test_regret_grows_with_the_logarithm_of_time(name, changes):
     regret, factor = growth(name, **changes)
-    assert regret < 0.08 * T and factor < 1.8  # of log T: 1.2
+    assert regret < 0.08 * T and factor < 1.8  # log(4 T) / log(T) = 1.2
 
 
-def test_a_constant_share_of_random_choices_costs_regret_in_proportion_to_time():
+def test_with_a_constant_epsilon_regret_grows_in_proportion_to_time():
     assert growth("epsilon_greedy", epsilon_scale=1.0, epsilon_final=0.1)[1] > 3.0
 
 
-def test_regret_of_exp3_tuned_to_the_horizon_grows_with_the_root_of_time():
+def test_the_regret_of_exp3_tuned_to_the_horizon_grows_with_the_square_root_of_time():
     regret = {}
     for horizon in (T, 4 * T):
         gamma = math.sqrt(2 * math.log(2) / ((math.e - 1) * horizon))  # corollary 3.2 of the source
@@ -250,6 +253,6 @@ def test_regret_of_exp3_tuned_to_the_horizon_grows_with_the_root_of_time():
             bandit = make("exp3", exploration=gamma)
             total += play(bandit, constant(1.0, 0.0), horizon, 10, noise=0.5)[1].sum().item() / 3
         regret[horizon] = total
-        rewards = bandit.high - bandit.low
-        assert total < 2.63 * rewards * math.sqrt(horizon * 2 * math.log(2))
-    assert regret[4 * T] / regret[T] < 2.6  # of the root: 2
+        reward_range = bandit.high - bandit.low
+        assert total < 2.63 * reward_range * math.sqrt(horizon * 2 * math.log(2))
+    assert regret[4 * T] / regret[T] < 2.6  # sqrt(4 T) / sqrt(T) = 2

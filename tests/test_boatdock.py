@@ -1,4 +1,4 @@
-"""BoatDockEnv keeps TorchRL's contract, whatever it is given."""
+"""BoatDockEnv keeps TorchRL's contract, also for invalid inputs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 from hpamdp import keys
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import SCALED_NAMES
+from hpamdp.env.boatdock.episode import FUEL, SCALED_NAMES
 
 CENTRE = torch.tensor(harbour.CENTRE)
 NOISE = {"motor_noise": 0.2, "sensor_noise": 3.0, "slip": 0.3}
@@ -28,13 +28,15 @@ MODES = list(
 
 
 def action(key, duration, option=None) -> TensorDict:
-    """Build an action of every boat: `key` and `option` lists or `[N]`, `duration` one number a boat or `[N, 3]`."""
-    key, duration = torch.as_tensor(key), torch.as_tensor(duration, dtype=torch.float32)
+    """Return actions: `key` and `option` are lists or `[N]`, `duration` has a number for each boat or is `[N, 3]`."""
+    key = torch.as_tensor(key)
+    duration = torch.as_tensor(duration, dtype=torch.float32)
     num = len(key)
     duration = duration if duration.ndim == 2 else duration.reshape(-1, 1).expand(num, 3)
-    press = TensorDict(discrete=key, parameters=duration, batch_size=[num])
-    chosen = {} if option is None else {keys.OPTION: torch.as_tensor(option)}
-    return TensorDict({keys.ACTION: press, **chosen}, batch_size=[num])
+    td = TensorDict({keys.ACTION: TensorDict(discrete=key, parameters=duration, batch_size=[num])}, batch_size=[num])
+    if option is not None:
+        td[keys.OPTION] = torch.as_tensor(option)
+    return td
 
 
 def press(env: BoatDockEnv, key, duration, option=None) -> TensorDictBase:
@@ -49,26 +51,30 @@ def random_action(env: BoatDockEnv, generator: torch.Generator, longest: float =
 
 
 def layout(start, goal, num: int = 1, **rest) -> TensorDict:
-    """Build a layout from px relative to the harbour's centre, the same for every boat."""
-    points = {"start": torch.tensor(start) + CENTRE, "goal": torch.tensor(goal) + CENTRE}
-    expanded = {name: point.expand(num, 2) for name, point in points.items()}
-    return TensorDict(
-        {**expanded, **{name: torch.full((num,), value) for name, value in rest.items()}}, batch_size=[num]
-    )
+    """Return a layout given in px from the harbour's centre, the same for every boat."""
+    td = TensorDict(batch_size=[num])
+    td["start"] = (torch.tensor(start) + CENTRE).expand(num, 2)
+    td["goal"] = (torch.tensor(goal) + CENTRE).expand(num, 2)
+    for name, value in rest.items():
+        td[name] = torch.full((num,), value)
+    return td
 
 
 def snapshot(env: BoatDockEnv) -> list[torch.Tensor]:
     return [column.clone() for column in env.state]
 
 
-def is_as(env: BoatDockEnv, before: list[torch.Tensor], rows=slice(None)) -> bool:
+def is_unchanged(env: BoatDockEnv, before: list[torch.Tensor], rows=slice(None)) -> bool:
     return all(torch.equal(now[rows], then[rows]) for now, then in zip(env.state, before, strict=True))
 
 
 def play(env: BoatDockEnv, num_presses: int, longest: float = 1.0) -> list[TensorDictBase]:
-    """Reset and press random keys, finished boats too; return every reading."""
+    """Reset and press random keys, also in finished episodes; return everything that was returned."""
     generator = torch.Generator().manual_seed(0)
-    return [env.reset(), *(env.step(random_action(env, generator, longest))["next"] for _ in range(num_presses))]
+    readings = [env.reset()]
+    for _ in range(num_presses):
+        readings.append(env.step(random_action(env, generator, longest))["next"])
+    return readings
 
 
 @pytest.mark.parametrize(("controller", "keymap", "reward", "observation"), MODES)
@@ -101,7 +107,9 @@ def test_global_generators_are_neither_moved_nor_read():
 
     with global_generators_unmoved():
         once = run()
-    torch.rand(3), np.random.rand(), random.random()
+    torch.rand(3)
+    np.random.rand()
+    random.random()
     assert (run() == once).all()
 
 
@@ -112,12 +120,13 @@ def test_a_partial_reset_leaves_the_other_boats_alone():
     before = snapshot(env)
     mask = torch.tensor([[False], [True], [False], [True]])
     reading = env.reset(TensorDict({"_reset": mask}, batch_size=[4]))
-    kept, fresh = ~mask[:, 0], mask[:, 0]
-    assert is_as(env, before, kept)
+    kept = ~mask[:, 0]
+    fresh = mask[:, 0]
+    assert is_unchanged(env, before, kept)
     assert env.state.episode.tolist() == [0, 1, 0, 1]
     assert (env.state.presses[fresh] == 0).all()
     assert not torch.isclose(env.state.start_x, before[0])[fresh].any()
-    assert (reading[keys.FUEL][fresh] == 1.0).all()
+    assert (reading[FUEL][fresh] == 1.0).all()
 
 
 def test_the_option_is_read_at_the_first_press_and_held():
@@ -144,7 +153,7 @@ def test_a_finished_episode_stays_finished_and_earns_nothing():
     assert 0 < over.sum() < 64
     before = snapshot(env)
     after = env.step(random_action(env, generator, 2.0))["next"]
-    assert is_as(env, before, over)
+    assert is_unchanged(env, before, over)
     assert after[keys.DONE][over].all()
     assert (after[keys.REWARD][over] == 0.0).all()
     assert (env.state.presses[~over] == 2).all()
@@ -153,7 +162,8 @@ def test_a_finished_episode_stays_finished_and_earns_nothing():
 def test_given_layouts_are_played_with_their_controllers_and_keymaps():
     env = BoatDockEnv(3, controller="random", keymap="random", observation="pixels")
     given = layout([-20.0, 10.0], [40.0, 50.0], 3)
-    given["controller"], given["keymap"] = torch.tensor([1, 0, 0]), torch.tensor([1, 1, 2])
+    given["controller"] = torch.tensor([1, 0, 0])
+    given["keymap"] = torch.tensor([1, 1, 2])
     reading = env.reset(given)
     assert reading["observation"][:, :4].tolist() == [[620.0, 522.0, 680.0, 562.0]] * 3
     press(env, [0, 0, 0], [0.5] * 3)
@@ -176,13 +186,13 @@ BAD_LAYOUTS = {
 
 
 @pytest.mark.parametrize("name", BAD_LAYOUTS)
-def test_a_bad_layout_is_refused_and_harms_nothing(name):
+def test_an_invalid_layout_is_refused_and_changes_nothing(name):
     env = BoatDockEnv(2, controller="random")
     env.reset()
     before = snapshot(env)
     with pytest.raises(ValueError, match="reset: "):
         env.reset(BAD_LAYOUTS[name].clone())
-    assert is_as(env, before)
+    assert is_unchanged(env, before)
 
 
 def test_a_controller_is_refused_where_the_agent_chooses_it():
@@ -191,7 +201,7 @@ def test_a_controller_is_refused_where_the_agent_chooses_it():
     before = snapshot(env)
     with pytest.raises(ValueError, match="option"):
         env.reset(layout([0.0, 0.0], [50.0, 0.0], 2, controller=1))
-    assert is_as(env, before)
+    assert is_unchanged(env, before)
 
 
 BAD_ACTIONS = {
@@ -210,19 +220,20 @@ BAD_ACTIONS = {
 
 
 @pytest.mark.parametrize("name", BAD_ACTIONS)
-def test_a_bad_action_is_refused_and_harms_nothing(name):
+def test_an_invalid_action_is_refused_and_changes_nothing(name):
     env = BoatDockEnv(2, controller="choose")
     env.reset()
     before = snapshot(env)
     with pytest.raises(ValueError, match="step: "):
         env.step(BAD_ACTIONS[name].clone())
-    assert is_as(env, before)
+    assert is_unchanged(env, before)
 
 
 @pytest.mark.parametrize("noise", [{}, NOISE])
-def test_what_was_returned_is_never_changed_later(noise):
+def test_returned_tensors_never_change_later(noise):
     env = BoatDockEnv(16, controller="choose", **noise)
-    returned, copies = [], []
+    returned = []
+    copies = []
 
     def keep(reading: TensorDictBase) -> None:
         returned.append(reading)
@@ -239,7 +250,7 @@ def test_what_was_returned_is_never_changed_later(noise):
     assert all((now == then).all() for now, then in zip(returned, copies, strict=True))
 
 
-def test_a_saved_state_goes_on_as_it_would_have():
+def test_a_restored_state_continues_as_the_original():
     env, copy = (BoatDockEnv(8, controller="congruent", **NOISE) for _ in range(2))
     play(env, 1, 0.3)
     copy.state = env.state
@@ -263,6 +274,6 @@ BAD_ARGUMENTS = [
 
 
 @pytest.mark.parametrize("arguments", BAD_ARGUMENTS, ids=str)
-def test_a_bad_argument_is_refused_by_name(arguments):
+def test_an_invalid_argument_is_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         BoatDockEnv(**arguments)

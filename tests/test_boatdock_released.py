@@ -1,4 +1,4 @@
-"""ReleasedBoatDockEnv as an environment: specs, batches, seeds, saved states, refusals, results."""
+"""ReleasedBoatDockEnv keeps the framework's contract: specs, batches, seeds, saved states, invalid inputs, results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env.boatdock.reference import references
 from hpamdp.env.boatdock_released.environment import ReleasedBoatDockEnv
 from hpamdp.env.boatdock_released.rules import OUT_OF_FUEL, SUCCESS, TIME_LIMIT, WALL
 
@@ -33,7 +32,7 @@ from hpamdp.env.boatdock_released.rules import OUT_OF_FUEL, SUCCESS, TIME_LIMIT,
 @pytest.mark.parametrize("observation", ["pixels", "scaled"])
 @pytest.mark.parametrize("controller", ["congruent", "incongruent"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_specs_are_kept(controller, observation, dtype):
+def test_specs_hold(controller, observation, dtype):
     check_env_specs(ReleasedBoatDockEnv(5, controller=controller, observation=observation, dtype=dtype))
 
 
@@ -42,7 +41,7 @@ def test_the_action_spec_has_durations_from_minus_one_to_one():
     assert (spec.space.low == -1.0).all() and (spec.space.high == 1.0).all()
 
 
-def test_scaled_observations_are_small_even_with_a_ship_full_of_fuel():
+def test_scaled_observations_stay_small_even_after_much_refuelling():
     env = ReleasedBoatDockEnv(300, observation="scaled")
     td = env.reset()
     for key in range(3):
@@ -57,7 +56,7 @@ def test_scaled_observations_are_small_even_with_a_ship_full_of_fuel():
 
 
 @pytest.mark.parametrize("frozen", [True, False])
-def test_a_batch_is_many_single_environments(frozen):
+def test_episodes_do_not_depend_on_the_number_of_environments(frozen):
     generator = torch.Generator().manual_seed(0)
     few = ReleasedBoatDockEnv(2, controller="incongruent", frozen_layouts=frozen, seed=3)
     many = ReleasedBoatDockEnv(9, controller="incongruent", frozen_layouts=frozen, seed=3)
@@ -77,11 +76,12 @@ def test_a_batch_is_many_single_environments(frozen):
 
 
 @pytest.mark.parametrize("seed", [0, 2**63 + 5])
-def test_a_seed_fixes_everything_and_no_global_generator_is_touched(seed):
+def test_a_seed_fixes_everything_and_global_generators_are_neither_moved_nor_read(seed):
     def states() -> tuple:
         return torch.get_rng_state().tolist(), str(np.random.get_state()), random.getstate()
 
-    env, before = ReleasedBoatDockEnv(30, controller="incongruent", seed=1), states()
+    env = ReleasedBoatDockEnv(30, controller="incongruent", seed=1)
+    before = states()
     env.set_seed(seed)
     first = [env.reset(), press(env, 0, -0.95), env.reset()]
     assert states() == before
@@ -102,7 +102,7 @@ def test_a_finished_episode_stays_as_it_is_and_earns_nothing():
     assert (after[keys.OBSERVATION] == last[keys.OBSERVATION]).all()
 
 
-def test_a_saved_state_goes_on_as_it_would_have():
+def test_a_restored_state_continues_as_the_original():
     env, copy = (ReleasedBoatDockEnv(6, controller="incongruent", frozen_layouts=False, seed=2) for _ in range(2))
     env.reset()
     press(env, 1, -0.95)
@@ -120,13 +120,13 @@ def test_a_saved_state_goes_on_as_it_would_have():
 @pytest.mark.parametrize(
     ("bad", "complaint"),
     [
-        (action([0, 3], [0.0, 0.0]), r"environment 1 got key=3 \(allowed 0, 1, 2\)"),
+        (action([0, 3], [0.0, 0.0]), r"environment 1 got key=3 \(allowed 0 to 2\), durations="),
         (action([0, 1], [0.0, math.nan]), "environment 1 got key=1 .*nan"),
         (action([[0], [1]], torch.zeros(2, 3)), "shape"),
         (action([0.5, 1.0], [0.0, 0.0]), "must be integer"),
     ],
 )
-def test_a_bad_action_is_refused_and_harms_nothing(bad, complaint):
+def test_an_invalid_action_is_refused_and_changes_nothing(bad, complaint):
     env = ReleasedBoatDockEnv(2)
     env.reset()
     before = env.env_state()
@@ -144,7 +144,7 @@ def test_a_bad_action_is_refused_and_harms_nothing(bad, complaint):
         ({"start": (640.0, 512.0), "goal": (600.0, 512.0), "keymap": 1}, "the congruent boat has none"),
     ],
 )
-def test_a_layout_that_cannot_be_is_refused(given, complaint):
+def test_an_invalid_layout_is_refused(given, complaint):
     with pytest.raises(ValueError, match=complaint):
         one().reset(TensorDict({name: torch.tensor([value]) for name, value in given.items()}, [1]))
 
@@ -154,12 +154,12 @@ def test_a_layout_that_cannot_be_is_refused(given, complaint):
     [{"num_envs": 0}, {"max_steps": 0}, {"controller": "choose"}, {"keymap": 2}, {"test_mode": 3}, {"dtype": "int"}],
     ids=str,
 )
-def test_a_bad_argument_is_refused_by_name(arguments):
+def test_an_invalid_argument_is_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         ReleasedBoatDockEnv(**arguments)
 
 
-def test_results_are_the_outcomes_and_the_score_is_the_return():
+def test_results_are_the_outcomes_without_a_score_of_their_own():
     env = ReleasedBoatDockEnv(5)
     outcome = torch.tensor([SUCCESS, WALL, WALL, OUT_OF_FUEL, TIME_LIMIT])
     results = env.results(TensorDict({keys.OUTCOME: outcome}, [5]))
@@ -168,6 +168,7 @@ def test_results_are_the_outcomes_and_the_score_is_the_return():
     assert means == pytest.approx({"wall": 0.4, "out_of_fuel": 0.2, "time_limit": 0.2})
 
 
-def test_neither_people_s_figures_nor_a_ceiling_are_shown_beside_it():
-    given = {"random": {"score": 0.1}}
-    assert list(references({"env": "boatdock_released", "controller": "congruent", "references": given})) == ["random"]
+def test_no_human_references_and_no_ceiling_are_shown_beside_it():
+    env = ReleasedBoatDockEnv(5)
+    measured = env.measure({"outcome": np.array([SUCCESS, WALL])})
+    assert env.references(measured) == {}

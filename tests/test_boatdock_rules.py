@@ -1,4 +1,4 @@
-"""BoatDockEnv plays the task's rules: rewards, ends of episodes, noise, and what is observed."""
+"""BoatDockEnv follows the rules of the task: rewards, ends of episodes, noise and observations."""
 
 from __future__ import annotations
 
@@ -17,28 +17,30 @@ CENTRE = torch.tensor(harbour.CENTRE)
 
 
 def press(env: BoatDockEnv, key, duration) -> TensorDictBase:
-    """Press a key in every boat; `duration` holds one number a boat or `[N, 3]`."""
-    key, duration = torch.as_tensor(key), torch.as_tensor(duration, dtype=torch.float32)
+    """Press a key in every boat; `duration` has a number for each boat or is `[N, 3]`."""
+    key = torch.as_tensor(key)
+    duration = torch.as_tensor(duration, dtype=torch.float32)
     duration = duration if duration.ndim == 2 else duration.reshape(-1, 1).expand(len(key), 3)
     leaves = TensorDict(discrete=key, parameters=duration, batch_size=[len(key)])
     return env.step(TensorDict({keys.ACTION: leaves}, batch_size=[len(key)]))["next"]
 
 
 def layout(start, goal, num: int = 1) -> TensorDict:
-    """Build a layout from px relative to the harbour's centre, the same for every boat."""
+    """Return a layout given in px from the harbour's centre, the same for every boat."""
     points = {"start": torch.tensor(start) + CENTRE, "goal": torch.tensor(goal) + CENTRE}
     return TensorDict({name: point.expand(num, 2) for name, point in points.items()}, batch_size=[num])
 
 
 def play(env: BoatDockEnv, num_presses: int) -> list[TensorDictBase]:
-    """Reset and press random keys, finished boats too; return what each press led to."""
+    """Reset and press random keys, also in finished episodes; return the result of each press."""
     generator = torch.Generator().manual_seed(0)
     env.reset()
-    draws = [
-        (torch.randint(3, (env.num_envs,), generator=generator), torch.rand(env.num_envs, 3, generator=generator))
-        for _ in range(num_presses)
-    ]
-    return [press(env, *sample) for sample in draws]
+    results = []
+    for _ in range(num_presses):
+        key = torch.randint(3, (env.num_envs,), generator=generator)
+        duration = torch.rand(env.num_envs, 3, generator=generator)
+        results.append(press(env, key, duration))
+    return results
 
 
 def test_only_the_pressed_keys_duration_counts():
@@ -64,7 +66,7 @@ def test_durations_are_clipped_before_noise_too(motor_noise):
     assert (results[3][2] == physics.TANK).all()
 
 
-def test_paper_rewards_sum_to_the_progress_and_the_final_term():
+def test_paper_rewards_sum_to_the_progress_plus_the_final_term():
     env, sparse = (BoatDockEnv(512, controller="congruent", reward=reward) for reward in ("paper", "sparse"))
     total, sparse_total = (torch.stack([r[keys.REWARD] for r in play(e, 25)]).sum(0)[:, 0] for e in (env, sparse))
     state = env.state
@@ -117,7 +119,7 @@ def test_motor_noise_is_lognormal_in_the_executed_duration():
     assert abs(torch.stack(logs).corrcoef()[0, 1]) < 0.03
 
 
-def test_each_boat_may_have_motor_noise_of_its_own():
+def test_motor_noise_may_differ_between_the_controllers():
     num = 20_000
     env = BoatDockEnv(num, controller="random", motor_noise=[0.1, 0.3])
     env.reset(layout([0.0, 0.0], [90.0, 0.0], num))
@@ -128,7 +130,7 @@ def test_each_boat_may_have_motor_noise_of_its_own():
         assert log[env.state.controller == controller].std().item() == pytest.approx(deviation, rel=0.05)
 
 
-def test_sensor_noise_blurs_every_position_anew_and_moves_no_boat():
+def test_sensor_noise_is_independent_at_every_observation_and_moves_no_boat():
     num = 20_000
     env, exact = (BoatDockEnv(num, controller="congruent", observation="pixels", sensor_noise=s) for s in (4.0, 0.0))
     errors = []
@@ -153,7 +155,7 @@ def test_slip_presses_a_uniformly_random_key():
     assert shares.tolist() == pytest.approx([0.1, 0.8, 0.1], abs=0.008)
 
 
-def test_the_pixel_observation_shows_the_paper_s_entries():
+def test_the_pixel_observation_has_the_entries_of_the_paper():
     env = BoatDockEnv(1, controller="incongruent", observation="pixels")
     env.reset(layout([-50.0, 20.0], [40.0, -30.0]))
     shown = dict(zip(OBSERVATION_NAMES, press(env, [2], [0.5])["observation"][0].tolist(), strict=True))
@@ -161,18 +163,29 @@ def test_the_pixel_observation_shows_the_paper_s_entries():
     travelled = 1.95 * (100.0 / 3.0 * 0.5**3 - 5.0 / 3.0 * 0.5**4)
     to_goal = math.hypot(90.0, -50.0 - travelled)
     expected = {
-        **{"start_x": 590.0, "start_y": 532.0, "goal_x": 680.0, "goal_y": 482.0, "centre_x": 640.0, "centre_y": 512.0},
-        **{"radius": 120.0, "controller": 0.0, "boat_x": 590.0, "boat_y": 532.0 + travelled},
-        **{"velocity_x": 0.0, "velocity_y": 25.0 - 20.0 / 3.0 * 0.125, "fuel": 5.5 / 6.0},
+        "start_x": 590.0,
+        "start_y": 532.0,
+        "goal_x": 680.0,
+        "goal_y": 482.0,
+        "centre_x": 640.0,
+        "centre_y": 512.0,
+        "radius": 120.0,
+        "controller": 0.0,
+        "boat_x": 590.0,
+        "boat_y": 532.0 + travelled,
+        "velocity_x": 0.0,
+        "velocity_y": 25.0 - 20.0 / 3.0 * 0.125,
+        "fuel": 5.5 / 6.0,
         "distance": to_goal / math.hypot(90.0, 50.0),
     }
     assert shown == pytest.approx(expected, abs=1e-3)
     assert state.presses.item() == 1
 
 
-def test_the_scaled_observation_is_the_same_in_units_of_radius_and_top_speed_with_the_way_to_the_goal():
+def test_the_scaled_observation_is_in_units_of_radius_and_top_speed_and_adds_the_vector_to_the_goal():
     pixels, scaled = (BoatDockEnv(64, controller="random", observation=kind) for kind in ("pixels", "scaled"))
-    seen, small = play(pixels, 3)[-1]["observation"], play(scaled, 3)[-1]["observation"]
+    seen = play(pixels, 3)[-1]["observation"]
+    small = play(scaled, 3)[-1]["observation"]
     points = (seen[:, [0, 1, 2, 3, 8, 9]].unflatten(-1, (3, 2)) - CENTRE).flatten(1) / 120.0
     torch.testing.assert_close(small[:, [0, 1, 2, 3, 8, 9]], points, atol=1e-5, rtol=0.0)
     torch.testing.assert_close(small[:, 10:12], seen[:, 10:12] / (400.0 - 160.0 / 3.0))

@@ -1,4 +1,4 @@
-"""ControllerChoiceEnv: the high level as an ordinary environment."""
+"""OptionChoiceEnv makes an ordinary environment of the high level."""
 
 import pytest
 import torch
@@ -25,7 +25,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class Presser(torch.nn.Module):
-    """Press key 0 for as long as the observation's goal lies away: a policy that draws nothing."""
+    """A deterministic policy: the fuel decides the key, the distance to the goal the duration."""
 
     def forward(self, td):
         distance = td[keys.OBSERVATION][..., -2:].norm(dim=-1)
@@ -38,7 +38,7 @@ def make(num_envs: int) -> OptionChoiceEnv:
     return OptionChoiceEnv(Presser(), BoatDockEnv(num_envs, seed=3))
 
 
-def test_specs_are_clean():
+def test_specs_hold():
     env = BoatDockEnv(4)
     check_env_specs(OptionChoiceEnv(RandomPolicy(PAMDPSpecs.from_env(env)), env))
     check_env_specs(with_decisions(OptionChoiceEnv(WholeStep(), Crossing(4, start=6.0))))
@@ -52,7 +52,7 @@ def test_every_step_is_one_whole_episode():
 
 
 @pytest.mark.parametrize("option", [0, 1])
-def test_reward_is_the_return_of_the_episode_played_press_by_press(option):
+def test_the_reward_is_the_return_of_the_same_episode_played_step_by_step(option):
     env = make(50)
     td = env.reset()
     reward = env.step(td.set(keys.OPTION, torch.full((50,), option)))["next", keys.REWARD]
@@ -63,7 +63,8 @@ def test_reward_is_the_return_of_the_episode_played_press_by_press(option):
     for _ in range(2):
         learner = Learner(specs)
         learner.policy = Presser()
-        learner.policy.in_keys, learner.policy.out_keys = [keys.OBSERVATION], [keys.DISCRETE, keys.PARAMETERS]
+        learner.policy.in_keys = [keys.OBSERVATION]
+        learner.policy.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         learners.append(learner)
     agent = HierarchicalAgent(Fixed(specs, option=option), learners, specs)
     rows = presses.rollout(25, agent.policy, break_when_any_done=False)
@@ -73,7 +74,7 @@ def test_reward_is_the_return_of_the_episode_played_press_by_press(option):
 
 
 @pytest.mark.parametrize("option", [0, 1])
-def test_any_environment_with_a_choice_will_do(option):
+def test_any_environment_with_options_will_do(option):
     class Hurried(Crossing):
         max_steps = 10
 
@@ -107,7 +108,7 @@ def test_the_low_level_acts_greedily_while_the_options_are_explored(outside):
     assert seen == {ExplorationType.DETERMINISTIC}
 
 
-def test_it_is_itself_a_problem_that_the_framework_takes():
+def test_it_keeps_the_frameworks_contract():
     env, boats = make(5), BoatDockEnv(5, seed=3)
     assert isinstance(env, PAMDPEnv) and env.has_choice and env.max_steps == 1
     assert env.option_names == boats.option_names and env.result_keys == boats.result_keys
@@ -117,7 +118,7 @@ def test_it_is_itself_a_problem_that_the_framework_takes():
     assert list(env.parameters()) == []
 
 
-def test_episodes_go_on_where_the_state_was_taken():
+def test_a_restored_state_continues_as_the_original():
     env, other = make(5), make(5)
     env.rollout(3, break_when_any_done=False)
     other.set_env_state(env.env_state())
@@ -135,7 +136,7 @@ def test_given_layouts_are_played():
 
 @pytest.mark.parametrize("controller", ["congruent", "random"])
 def test_an_environment_without_a_choice_is_refused(controller):
-    with pytest.raises(ValueError, match="choose"):
+    with pytest.raises(ValueError, match="no option to choose"):
         OptionChoiceEnv(Presser(), BoatDockEnv(2, controller=controller))
 
 
@@ -168,7 +169,8 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
             optimizer.step()
     collector.shutdown(close_env=False)
 
-    test, returns = planned(200), []
+    test = planned(200)
+    returns = []
     for chosen in (0, 1, None):
         td = test.reset(test.fixed_episodes(0))
         td = greedy(td) if chosen is None else td.set(keys.OPTION, torch.full((200,), chosen))

@@ -10,9 +10,9 @@ import time
 
 import pytest
 import torch
-from conftest import CONF, TRAINED, compose_config
+from conftest import CONF, TRAINED, compose_config, make_config
 
-from hpamdp.config import ConfigError, build, run_config
+from hpamdp.config import ConfigError
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.worker import EnvShard, PolicyCopy, packed
 from hpamdp.run.recorder import Recorder
@@ -34,16 +34,15 @@ WORKERS = [
 
 
 def make(folder, *overrides):
-    cfg = compose_config([*SMALL, *overrides])
-    settings = run_config(cfg)
-    parts = assemble(cfg, settings, folder)
-    return parts, build("collector", cfg.collector, cfg=cfg, settings=settings, parts=parts, frames=0)
+    config = make_config([*SMALL, *overrides])
+    parts = assemble(config, folder)
+    return parts, config.collector.build(config=config, parts=parts, frames=0)
 
 
 def share(folder, *overrides, first_env=0, num_envs=8, low=None, columns=None):
-    cfg = compose_config([*SMALL, *overrides])
-    specs = assemble(cfg, run_config(cfg), folder).agent.specs
-    return EnvShard(cfg, specs, first_env, num_envs, exploration_seed=0, columns=columns or {}, low=low)
+    config = make_config([*SMALL, *overrides])
+    specs = assemble(config, folder).agent.specs
+    return EnvShard(config, specs, first_env, num_envs, exploration_seed=0, columns=columns or {}, low=low)
 
 
 def leaves(batch):
@@ -109,11 +108,11 @@ def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
 def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
     warmup = ["low.warmup_frames=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
     warmup += ["low.codec_pretrain_updates=2"] if low == "hyar" else []
-    cfg = compose_config(["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "high=ucb", f"low={low}", *warmup])
-    parts = assemble(cfg, run_config(cfg), tmp_path)
-    collection = build("collector", cfg.collector, cfg=cfg, settings=run_config(cfg), parts=parts, frames=0)
+    config = make_config(["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "high=ucb", f"low={low}", *warmup])
+    parts = assemble(config, tmp_path)
+    collection = config.collector.build(config=config, parts=parts, frames=0)
     torch.manual_seed(1)
-    copy = EnvShard(cfg, parts.agent.specs, 0, 8, exploration_seed=1, columns={}, low=None).make_policy()
+    copy = EnvShard(config, parts.agent.specs, 0, 8, exploration_seed=1, columns={}, low=None).make_policy()
     for _ in range(2):
         parts.agent.learn(collection.next())
     assert copy.receive(packed(parts.policy)) > 0.0
@@ -161,8 +160,7 @@ def test_a_share_goes_on_where_its_environments_stood(tmp_path):
 
 
 def test_a_frozen_presser_goes_with_the_share(tmp_path):
-    cfg = compose_config([*SMALL, "high=ucb", "low.freeze=true"])
-    parts = assemble(cfg, run_config(cfg), tmp_path)
+    parts = assemble(make_config([*SMALL, "high=ucb", "low.freeze=true"]), tmp_path)
     torch.manual_seed(5)
     work = share(tmp_path, "high=ucb", "low.freeze=true", low=packed(parts.agent.router))
     env, policy = work.make_env(), work.make_policy()

@@ -1,16 +1,18 @@
 """The config: what is accepted, and that whatever is wrong ends in one line that says so."""
 
 import inspect
+import re
 from typing import Annotated, Literal
 
 import pytest
 import torch
-from conftest import CONF, choices, compose_config
+from conftest import CONF, choices, compose_config, make_config
 from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
-from hpamdp.config import GROUPS, ConfigError, build, load_class, name_of, run_config, validate
-from hpamdp.run.assemble import CONTEXT
+from hpamdp import config as config_module
+from hpamdp.config import GROUPS, ConfigError, component, compose_saved, load_class, read
+from hpamdp.run.train import run
 
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
 
@@ -47,19 +49,21 @@ SAMPLE = {"_target_": f"{__name__}.Sample", "size": 3, "rate": 0.5, "form": "pla
 def mistake_in(**options: object) -> str:
     node = {name: value for name, value in (SAMPLE | options).items() if value != "absent"}
     with pytest.raises(ConfigError) as raised:
-        build("low", OmegaConf.create(node), specs=None)
+        component("low", "sample", OmegaConf.create(node)).build(specs=None)
     assert "\n" not in str(raised.value)
     return str(raised.value)
 
 
 def test_build_passes_the_options_and_what_of_the_context_is_asked_for():
-    built = build("low", OmegaConf.create(SAMPLE | {"budget": {"num_envs": 1}}), specs="specs", device="not asked for")
+    node = OmegaConf.create(SAMPLE | {"budget": {"num_envs": 1}})
+    built = component("low", "sample", node).build(specs="specs", device="not asked for")
     assert built.specs == "specs"
     assert built.options["size"] == 3 and built.options["widths"] == [4, 4] and built.options["label"] == "a"
 
 
 def test_an_integer_is_a_float_and_a_list_a_tuple():
-    built = build("low", SAMPLE | {"rate": 1, "bounds": [1, 2.5], "depth": 2, "label": 7, "is_on": True}, specs=None)
+    node = SAMPLE | {"rate": 1, "bounds": [1, 2.5], "depth": 2, "label": 7, "is_on": True}
+    built = component("low", "sample", node).build(specs=None)
     assert isinstance(built.options["rate"], float)
     assert built.options["bounds"] == (1.0, 2.5)
     assert built.options["depth"] == 2 and built.options["label"] == 7 and built.options["is_on"] is True
@@ -68,12 +72,12 @@ def test_an_integer_is_a_float_and_a_list_a_tuple():
 @pytest.mark.parametrize(
     ("option", "value", "complaint"),
     [
-        ("size", 0, "low.size=0: must be greater than 0 (Sample, conf/low)"),
+        ("size", 0, "low.size=0: must be greater than 0 (Sample, conf/low/sample.yaml)"),
         ("size", True, "low.size=true: must be a valid integer"),
         ("size", "3", 'low.size="3": must be a valid integer'),
         ("size", 3.0, "low.size=3.0: must be a valid integer"),
         ("size", None, "low.size=null: must be a valid integer"),
-        ("size", "absent", "low.size: missing (Sample, conf/low)"),
+        ("size", "absent", "low.size: missing (Sample, conf/low/sample.yaml)"),
         ("rate", 1.5, "low.rate=1.5: must be less than or equal to 1"),
         ("rate", "1e-3x", 'low.rate="1e-3x": must be a valid number'),
         ("rate", float("nan"), "low.rate=NaN: must be a finite number"),
@@ -84,7 +88,7 @@ def test_an_integer_is_a_float_and_a_list_a_tuple():
         ("label", 1.5, "low.label=1.5: must be a valid string or must be a valid integer"),
         ("is_on", 1, "low.is_on=1: must be a valid boolean"),
         ("specs", 1, "low.specs: no such option of Sample"),
-        ("widths", [13], "low: widths: 13 is unlucky (Sample, conf/low)"),
+        ("widths", [13], "low: widths: 13 is unlucky (Sample, conf/low/sample.yaml)"),
         ("rate", "${nowhere}", "rate: Interpolation key 'nowhere' not found"),
         ("rate", "???", "rate: Missing mandatory value"),
         ("_target_", "absent", "low._target_=None: must be a class"),
@@ -99,8 +103,12 @@ def test_a_wrong_option_is_named_with_what_is_allowed(option, value, complaint):
 
 def test_an_unknown_option_gets_the_likely_one_first_and_then_all():
     line = mistake_in(siz=3)
-    assert line.startswith("low.siz: no such option of Sample (conf/low); did you mean size? It has bounds, depth, ")
-    assert mistake_in(xyz=3).startswith("low.xyz: no such option of Sample (conf/low); it has bounds, depth, ")
+    assert line.startswith(
+        "low.siz: no such option of Sample (conf/low/sample.yaml); did you mean size? It has bounds, depth, "
+    )
+    assert mistake_in(xyz=3).startswith(
+        "low.xyz: no such option of Sample (conf/low/sample.yaml); it has bounds, depth, "
+    )
 
 
 def test_all_problems_come_in_one_line():
@@ -110,7 +118,7 @@ def test_all_problems_come_in_one_line():
 
 def test_a_bug_in_a_constructor_is_no_mistake_of_the_users():
     with pytest.raises(ValueError, match="not enough values to unpack") as raised:
-        build("low", SAMPLE | {"widths": [14]}, specs=None)
+        component("low", "sample", SAMPLE | {"widths": [14]}).build(specs=None)
     assert not isinstance(raised.value, ConfigError)
 
 
@@ -121,36 +129,64 @@ def test_a_module_that_lacks_what_it_imports_is_no_mistake_of_the_users(tmp_path
         load_class("needy.Class")
 
 
-def test_only_the_selector_can_be_none():
-    assert build("high", {"_target_": None}, specs=None) is None
+def test_only_the_selector_and_the_data_can_be_none():
+    for group in ("high", "data"):
+        assert component(group, "none", {"_target_": None}).build(specs=None) is None
     with pytest.raises(ConfigError, match=r"high\.option: no such option of none"):
-        build("high", {"_target_": None, "option": 1}, specs=None)
+        component("high", "none", {"_target_": None, "option": 1})
     with pytest.raises(ConfigError, match=r"low\._target_"):
-        build("low", {"_target_": None}, specs=None)
+        component("low", "none", {"_target_": None})
 
 
 @pytest.mark.parametrize(("group", "name"), FILES)
 def test_a_yaml_and_its_class_have_the_same_options(group, name):
     cfg = compose_config([f"{group}={name}"])
-    run_config(cfg)
-    cls, options = validate(group, cfg[group], CONTEXT[group])
+    chosen = getattr(read(cfg), group)
     in_yaml = set(cfg[group]) - {"_target_", "budget", "checkpoint", "freeze"}
-    assert set(options) == in_yaml
-    if cls is not None:
-        arguments = set(list(inspect.signature(cls.__init__).parameters)[1:])
-        assert in_yaml == arguments - {*CONTEXT[group]}
-    if group in ("high", "low"):
-        assert name == name_of(cfg[group])
+    assert chosen.name == name and set(chosen.options) == in_yaml
+    if chosen.cls is not None:
+        arguments = set(list(inspect.signature(chosen.cls.__init__).parameters)[1:])
+        assert in_yaml == arguments - {*GROUPS[group]}
     assert ("budget" in cfg[group]) == (group == "low")
     assert group != "low" or set(cfg[group].budget) == {"num_envs", "steps_per_batch", "total_frames", "eval_every"}
 
 
 @pytest.mark.parametrize("experiment", choices("experiment"))
 def test_an_experiment_is_a_valid_config(experiment):
-    cfg = compose_config([f"experiment={experiment}"])
-    run_config(cfg)
-    for group in GROUPS:
-        validate(group, cfg[group], CONTEXT[group])
+    assert make_config([f"experiment={experiment}"])
+
+
+def module_paths(values: object) -> list[str]:
+    """Return the dotted names of modules and classes in a nested config."""
+    if isinstance(values, dict):
+        return [path for value in values.values() for path in module_paths(value)]
+    if isinstance(values, list):
+        return [path for value in values for path in module_paths(value)]
+    return [values] if isinstance(values, str) and values.startswith(("hpamdp.", "toy_")) else []
+
+
+@pytest.mark.parametrize("words", [[], ["high=none", "low=pdqn", "env=platform"]])
+def test_a_saved_config_has_names_instead_of_modules_and_is_read_back_the_same(words):
+    config = make_config([*words, "seed=3"])
+    saved = config.to_dict()
+    assert not module_paths(saved) and "_target_" not in str(saved)
+    assert read(*compose_saved(saved)) == config
+
+
+def test_a_name_of_a_saved_config_that_is_nowhere_is_told_in_one_line():
+    saved = make_config([]).to_dict()
+    saved["low"]["name"] = "gone"
+    with pytest.raises(ConfigError, match=r"the saved run chose low/gone, which is not there; is a --config-dir miss"):
+        compose_saved(saved)
+
+
+def test_one_run_checks_its_config_once(tmp_path, monkeypatch):
+    checked = []
+    known = config_module.component
+    monkeypatch.setattr(config_module, "component", lambda *given: checked.append(given[0]) or known(*given))
+    words = ["low=random", "num_envs=4", "eval.layouts=4", "total_frames=64", "eval.every=0"]
+    assert run(compose_config(words), tmp_path, words) == 0
+    assert sorted(checked) == sorted(GROUPS)
 
 
 def test_an_experiment_sets_groups_and_values(tmp_path, monkeypatch):
@@ -158,24 +194,50 @@ def test_an_experiment_sets_groups_and_values(tmp_path, monkeypatch):
     study = "# @package _global_\ndefaults:\n  - override /high: fixed\nseed: 7\nhigh:\n  option: incongruent\n"
     (tmp_path / "experiment/study.yaml").write_text(study)
     cfg = compose_config([f"hydra.searchpath=[{tmp_path}]", "experiment=study"])
-    assert (name_of(cfg.high), cfg.high.option, cfg.seed) == ("fixed", "incongruent", 7)
+    assert (cfg.hydra.runtime.choices.high, cfg.high.option, cfg.seed) == ("fixed", "incongruent", 7)
     assert compose_config([f"hydra.searchpath=[{tmp_path}]", "experiment=study", "seed=8"]).seed == 8
 
 
-def test_every_yaml_value_has_a_comment_and_every_group_a_folder():
-    for file in CONF.rglob("*.yaml"):
-        assert file.read_text().startswith("#"), f"{file} does not say what it is"
+def values_without_comment(text: str) -> list[str]:
+    """Return the keys of a yaml whose value no comment explains: above it, or above the values just before it."""
+    missing = []
+    is_explained = False
+    for line in text.splitlines():
+        key = re.match(r"\s*(\w+):", line)
+        if not line.strip():
+            is_explained = False
+        elif line.lstrip().startswith("#"):
+            is_explained = True
+        elif key and not is_explained and not line.rstrip().endswith(":"):
+            missing.append(key.group(1))
+    return missing
+
+
+def test_a_value_without_a_comment_is_found():
+    assert values_without_comment("# What it is.\n_target_: a.B\n\nlr: 1\n") == ["lr"]
+    assert values_without_comment("# Rates.\nlr: 1\ntau: 2\n\n# More.\nother: 3\n") == []
+
+
+@pytest.mark.parametrize("file", sorted(CONF.rglob("*.yaml")), ids=lambda file: file.relative_to(CONF).as_posix())
+def test_every_value_of_a_yaml_is_explained_by_a_comment(file):
+    text = file.read_text()
+    assert text.startswith("#"), f"{file} does not say what it is"
+    if file.parent.name != "experiment":  # whose values are explained where they are defined
+        assert not values_without_comment(text.partition("\nhydra:")[0].partition("\ndefaults:")[2] or text)
+
+
+def test_every_group_has_a_folder():
     assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, "experiment", "search"}
 
 
 def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="device=cuda:1: this machine has no usable CUDA device"):
-        run_config(compose_config(["device=cuda:1"])).resolve_device()
-    assert run_config(compose_config(["device=auto"])).resolve_device() == torch.device("cpu")
+        make_config(["device=cuda:1"]).run.resolve_device()
+    assert make_config(["device=auto"]).run.resolve_device() == torch.device("cpu")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    assert run_config(compose_config(["device=cuda:1"])).resolve_device() == torch.device("cuda:1")
-    assert run_config(compose_config(["device=auto"])).resolve_device().type == "cuda"
+    assert make_config(["device=cuda:1"]).run.resolve_device() == torch.device("cuda:1")
+    assert make_config(["device=auto"]).run.resolve_device().type == "cuda"
     with pytest.raises(ConfigError, match="has CUDA devices 0 to 1"):
-        run_config(compose_config(["device=cuda:2"])).resolve_device()
+        make_config(["device=cuda:2"]).run.resolve_device()

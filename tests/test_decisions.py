@@ -1,4 +1,4 @@
-"""DecisionTracker: the semi-MDP view of an episode, and what it is worth to choose anew within one."""
+"""DecisionTracker gives the semi-MDP view of episodes, and options that end inside an episode are worth choosing."""
 
 import pytest
 import torch
@@ -27,7 +27,7 @@ def random_agent(env):
 
 
 def collect(env, policy, num_envs: int, steps: int, batch_steps: int):
-    """Yield the batches `[num_envs, batch_steps]` that a collector gives."""
+    """Yield the batches `[num_envs, batch_steps]` of a collector."""
     collector = Collector(
         env,
         policy,
@@ -40,31 +40,38 @@ def collect(env, policy, num_envs: int, steps: int, batch_steps: int):
 
 
 @pytest.mark.parametrize("controller", ["choose", "congruent", "random"])
-def test_tracked_environment_has_clean_specs(controller):
+def test_specs_of_a_tracked_environment_hold(controller):
     check_env_specs(with_decisions(BoatDockEnv(3, controller=controller)))
 
 
-def test_tracked_environment_with_options_of_a_fixed_length_has_clean_specs():
+def test_specs_of_a_tracked_environment_with_options_of_a_fixed_length_hold():
     check_env_specs(with_decisions(Crossing(3, start=6.0), 0.9, 2))
 
 
-def account(rows: TensorDict, gamma: float, option_length: int | None = None) -> int:
-    """Follow one environment's rows and hold every key of the tracker against a count of our own.
+def check_accounts(rows: TensorDict, gamma: float, option_length: int | None = None) -> int:
+    """Compare every key of the tracker in one environment's rows with sums that are made here.
 
     Return how many options ended before their episode.
     """
-    is_due, is_first, total, steps, decided_at, num_cut = True, True, 0.0, 0, None, 0
+    is_due = True
+    is_first = True
+    num_cut = 0
     for row in rows:
         assert row[keys.IS_DECISION].item() == is_due
         if is_first:
-            episode_return, episode_steps = 0.0, 0
+            episode_return = 0.0
+            episode_steps = 0
         if is_due:
-            total, steps, decided_at, option = 0.0, 0, row[keys.OBSERVATION], row[keys.OPTION]
+            total = 0.0
+            steps = 0
+            decided_at = row[keys.OBSERVATION]
+            option = row[keys.OPTION]
         assert row[keys.OPTION] == option, "the option changed where no decision was due"
         reward = row["next", keys.REWARD].item()
         total += gamma**steps * reward
         episode_return += reward
-        steps, episode_steps = steps + 1, episode_steps + 1
+        steps += 1
+        episode_steps += 1
         is_first = row["next", keys.DONE].item()
         is_due = is_first or steps == option_length
         num_cut += is_due and not is_first
@@ -78,18 +85,18 @@ def account(rows: TensorDict, gamma: float, option_length: int | None = None) ->
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
-def test_options_are_accounted_right_across_collected_batches(gamma):
+def test_option_returns_are_right_across_collected_batches(gamma):
     torch.manual_seed(0)
     env = with_decisions(BoatDockEnv(4), gamma)
     rows = torch.cat([batch.clone() for batch in collect(env, random_agent(env).policy, 4, 60, 3)], 1)
     assert rows.shape == (4, 60)
     for environment in rows:
-        assert account(environment, gamma) == 0
+        assert check_accounts(environment, gamma) == 0
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9])
 @pytest.mark.parametrize(("option_length", "batch_steps"), [(1, 3), (4, 3), (5, 7), (100, 3)])
-def test_options_of_a_fixed_length_are_accounted_right_across_collected_batches(option_length, batch_steps, gamma):
+def test_returns_of_options_of_a_fixed_length_are_right_across_collected_batches(option_length, batch_steps, gamma):
     torch.manual_seed(0)
     env = with_decisions(Toll(4, start=6.0), gamma, option_length)
     specs = PAMDPSpecs.from_env(env)
@@ -97,19 +104,19 @@ def test_options_of_a_fixed_length_are_accounted_right_across_collected_batches(
     rows = torch.cat(rows, 1)
     assert rows["next", keys.DONE].sum() > 10
     for environment in rows:
-        assert (account(environment, gamma, option_length) > 5) == (option_length < 100)
+        assert (check_accounts(environment, gamma, option_length) > 5) == (option_length < 100)
 
 
-def test_decisions_of_one_environment_survive_the_resets_of_others():
+def test_resets_of_other_environments_leave_an_option_alone():
     torch.manual_seed(1)
     env = with_decisions(BoatDockEnv(5))
     rows = env.rollout(40, random_agent(env).policy, break_when_any_done=False)
     assert rows["next", keys.DONE].any(1).all()
     for environment in rows:
-        account(environment, 1.0)
+        check_accounts(environment, 1.0)
 
 
-@pytest.mark.parametrize("is_choice", [False, True], ids=["presses", "choice"])
+@pytest.mark.parametrize("is_choice", [False, True], ids=["both levels", "high level"])
 @pytest.mark.parametrize("mask", [None, [True, False, True]], ids=["whole", "part"])
 def test_layouts_given_to_a_reset_reach_the_boats(mask, is_choice):
     env = BoatDockEnv(3, seed=1)
@@ -125,14 +132,14 @@ def test_layouts_given_to_a_reset_reach_the_boats(mask, is_choice):
     given = BoatDockEnv(3, seed=1).reset(layout.exclude("_reset"))
     expected = torch.where(is_new.unsqueeze(-1), given[keys.OBSERVATION], before[keys.OBSERVATION])
     assert torch.equal(after[keys.OBSERVATION], expected)
-    assert not torch.equal(env.reset()[keys.OBSERVATION], after[keys.OBSERVATION])  # of that reset alone
+    assert not torch.equal(env.reset()[keys.OBSERVATION], after[keys.OBSERVATION])  # only in that reset
 
 
 def points(x):
     return torch.tensor([[x, 480.0 + 10.0 * i] for i in range(3)])
 
 
-def test_the_selector_learns_from_every_decision_once_oldest_first():
+def test_the_selector_learns_from_every_decision_once_and_the_oldest_first():
     class Listener(Uniform):
         heard = ()
 
@@ -143,32 +150,32 @@ def test_the_selector_learns_from_every_decision_once_oldest_first():
     torch.manual_seed(0)
     env = with_decisions(Toll(4, start=6.0), 0.9, 2)
     specs = PAMDPSpecs.from_env(env)
-    agent, rows = steppers(Listener(specs), specs), []
+    agent = steppers(Listener(specs), specs)
+    rows = []
     for batch in collect(env, agent.policy, 4, 60, 5):
         rows.append(batch.clone())
         agent.learn(batch)
-    rows, heard = torch.cat(rows, 1), torch.cat(agent.selector.heard)
+    rows = torch.cat(rows, 1)
+    heard = torch.cat(agent.selector.heard)
     is_end = rows["next", keys.IS_DECISION].squeeze(-1)
     assert len(heard) == is_end.sum() > 60
     expected = torch.cat([rows[:, t][is_end[:, t]]["next", keys.OPTION_RETURN] for t in range(60)])
     assert torch.equal(heard["next", keys.OPTION_RETURN], expected)
 
 
-# What it is worth to choose anew within an episode.
-
 GAMMA = 0.9
 
 
-def test_the_optimum_of_the_crossing_is_that_of_a_count_by_hand():
-    # Two steps: walk 2, walk 1.25, swim 2, arrive with the first. Three: walk 3, swim 3. An episode: 3 on the right
-    # side, 12 on the wrong one.
+def test_the_best_value_of_the_crossing_is_that_worked_out_by_hand():
+    # Options of two steps: walk 2, walk 1.25, swim 2, and arrive with the first step of the last. Of three steps: walk
+    # 3, swim 3. Of an episode: 3 steps where the option suits, 12 where it does not.
     assert best_value(GAMMA, 2) == pytest.approx(GAMMA**6)
     assert best_value(GAMMA, 3) == pytest.approx(GAMMA**5)
     assert best_value(GAMMA, Crossing.max_steps) == pytest.approx(GAMMA**14)
 
 
 def trained(selector: Selector, option_length: int | None, num_batches: int) -> float:
-    """Train a selector on the crossing; return the discounted return of its greedy choices."""
+    """Train a selector on Crossing and return the discounted return of its greedy choices."""
     env = with_decisions(Crossing(50, start=6.0), GAMMA, option_length)
     agent = steppers(selector, selector.specs)
     for batch in collect(env, agent.policy, 50, 10 * num_batches, 10):

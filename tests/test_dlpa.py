@@ -1,4 +1,4 @@
-"""DLPA: the planner in a true model, the forms of the learned one, its windows and loss, and a problem it solves."""
+"""DLPA: the planner in a true model, the learned model's forms, windows and loss, and a problem that it solves."""
 
 import pytest
 import torch
@@ -32,7 +32,7 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> DLPA:
 
 
 def boats(seen: torch.Tensor) -> episode.BoatState:
-    """Return the boats of scaled observations `[N, 16]`."""
+    """Return the boats' state from scaled observations `[N, 16]`."""
     lengths = seen[:, [0, 1, 2, 3, 8, 9]] * physics.HARBOUR_RADIUS
     zeros = torch.zeros(len(seen), dtype=torch.int32)
     still = torch.zeros(len(seen))
@@ -42,7 +42,7 @@ def boats(seen: torch.Tensor) -> episode.BoatState:
 
 
 def true_model(state: torch.Tensor, discrete: torch.Tensor, unit: torch.Tensor) -> Prediction:
-    """Predict a press of the boat task as it is."""
+    """Predict a step of the boat task with its own rules."""
     rules, seed, row = episode.Rules("congruent"), torch.zeros((), dtype=torch.int32), torch.arange(len(state)).int()
     before = boats(state)
     after, reward, _ = episode.step(before, before.controller, discrete, unit + 1.0, seed, row, rules)
@@ -68,7 +68,7 @@ def test_planning_in_the_true_model_comes_close_to_the_ceiling():
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_model_of_every_form_sees_the_pressed_keys_own_parameters_alone(form):
+def test_a_model_of_any_form_sees_only_the_chosen_actions_own_parameters(form):
     model = PAMDPModel(SPECS, form, [32, 32], 3)
     state, discrete, unit = torch.randn(90, 4), torch.arange(3).repeat(30), torch.rand(90, 3) * 2 - 1
     predicted = model(state, discrete, unit)
@@ -83,7 +83,7 @@ def test_a_model_of_every_form_sees_the_pressed_keys_own_parameters_alone(form):
     assert torch.equal(other.logit[:, ~has_parameters], predicted.logit[:, ~has_parameters])
 
 
-def test_the_h_step_loss_is_what_a_hand_computation_gives_with_an_end_inside_the_window():
+def test_the_h_step_loss_equals_a_hand_computation_with_an_episodes_end_inside_the_window():
     learner = make(horizon=3, num_members=2)
     learner.model.fit_scales(torch.randn(50, 4), torch.randn(50, 4))
     windows = TensorDict(
@@ -117,27 +117,44 @@ def test_the_h_step_loss_is_what_a_hand_computation_gives_with_an_end_inside_the
         torch.testing.assert_close(losses[name], value)
 
 
-def counting_batches(num_environments: int, num_batches: int, num_steps: int) -> list[TensorDict]:
-    """Return batches whose observations say environment, episode and step, and what comes next; options in turn."""
-    batches, clock = [], [[0, 0] for _ in range(num_environments)]
+def next_windows(learner: DLPA) -> TensorDict:
+    return next(iter(learner.sample_batches(1)))
+
+
+def counting_batches(num_environments: int, num_batches: int, num_steps: int, option_length: int = 100) -> list:
+    """Return batches whose observations say environment, episode, step and option.
+
+    Episodes have 1 to 5 steps. Options 0 and 1 alternate, over the decisions of all episodes of an environment.
+    """
+    batches = []
+    clock = [[0, 0, 0] for _ in range(num_environments)]  # episode, step and decision
     for _ in range(num_batches):
         batch = TensorDict({}, [num_environments, num_steps])
         seen = torch.zeros(2, num_environments, num_steps, 4)
-        over = torch.zeros(num_environments, num_steps, 1, dtype=torch.bool)
+        done = torch.zeros(num_environments, num_steps, 1, dtype=torch.bool)
+        is_decision = torch.zeros_like(done)
         option = torch.zeros(num_environments, num_steps, dtype=torch.long)
         for e in range(num_environments):
             for t in range(num_steps):
-                number, step = clock[e]
-                seen[0, e, t] = torch.tensor([e, number, step, 0.0])
-                seen[1, e, t] = torch.tensor([e, number, step + 1, 0.0])
-                over[e, t] = step == (number + e) % 5
-                option[e, t] = (number + e) % 2
-                clock[e] = [number + 1, 0] if over[e, t] else [number, step + 1]
-        batch[keys.OBSERVATION], batch[keys.OPTION] = seen[0], option
+                episode_number, step, decision = clock[e]
+                option[e, t] = (decision + e) % 2
+                seen[0, e, t] = torch.tensor([e, episode_number, step, option[e, t]])
+                seen[1, e, t] = torch.tensor([e, episode_number, step + 1, option[e, t]])
+                done[e, t] = step == (episode_number + e) % 5
+                is_decision[e, t] = done[e, t] or (step + 1) % option_length == 0
+                clock[e] = [episode_number + 1, 0, decision] if done[e, t] else [episode_number, step + 1, decision]
+                clock[e][2] += int(is_decision[e, t])
+        batch[keys.OBSERVATION] = seen[0]
+        batch[keys.OPTION] = option
         batch[keys.ACTION] = {"discrete": option, "parameters": torch.zeros(*batch.shape, 3)}
-        is_cut = over & (seen[0, ..., 1:2] % 3 == 0)
-        batch["next"] = {keys.OBSERVATION: seen[1], keys.REWARD: torch.zeros(over.shape), keys.DONE: over}
-        batch["next", keys.TERMINATED] = over & ~is_cut
+        is_cut = done & (seen[0, ..., 1:2] % 3 == 0)
+        batch["next"] = {
+            keys.OBSERVATION: seen[1],
+            keys.REWARD: torch.zeros(done.shape),
+            keys.DONE: done,
+            keys.TERMINATED: done & ~is_cut,
+            keys.IS_DECISION: is_decision,
+        }
         batches.append(batch)
     return batches
 
@@ -147,20 +164,51 @@ def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_o
     learner = make(horizon=3, buffer_size=buffer_size)
     for batch in counting_batches(4, 12, 3):
         learner.store(batch, batch[keys.OPTION] == 1)
-    windows = learner.windows()
+    windows = next_windows(learner)
     seen, valid = windows["state"], windows["valid"]
+    environment, episode_number, step = seen[..., :3].unbind(-1)
+    done = step == (episode_number + environment) % 5
     assert valid[:, 0].all() and (windows["discrete"] == 1).all()
     for h in (1, 2):
         follows = (seen[:, h] == seen[:, h - 1] + torch.tensor([0.0, 0.0, 1.0, 0.0])).all(-1)
         assert follows[valid[:, h]].all(), "a window left its episode or skipped a step"
-        assert not (valid[:, h] & windows["over"][:, h - 1]).any()
+        assert not (valid[:, h] & done[:, h - 1]).any()
         # What is known to follow is in the window; the newest steps have no successor yet.
         is_old = seen[:, h - 1, 1] < seen[..., 1].max() - 3
-        assert (valid[:, h] | windows["over"][:, h - 1] | ~valid[:, h - 1] | ~is_old).all()
+        assert (valid[:, h] | done[:, h - 1] | ~valid[:, h - 1] | ~is_old).all()
     assert valid[:, 2].any()
 
 
-def test_the_elites_make_the_next_distribution_key_by_key():
+@pytest.mark.parametrize("is_shared", [False, True])
+@pytest.mark.parametrize("buffer_size", [5000, 40, 20])
+@pytest.mark.parametrize("num_steps", [1, 2, 5])
+def test_windows_cross_no_option_that_changes_inside_an_episode(num_steps, buffer_size, is_shared):
+    option_length = 2
+    learner = make(horizon=4, buffer_size=buffer_size, batch_size=512, warmup_frames=1000)
+    for batch in counting_batches(4, 60 // num_steps, num_steps, option_length):
+        learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool) if is_shared else batch[keys.OPTION] == 1)
+    windows = next_windows(learner)
+    seen, valid = windows["state"], windows["valid"]
+    environment, episode_number, step, option = seen.unbind(-1)
+    decision = step.div(option_length, rounding_mode="floor")
+    for part in (environment, episode_number, option, decision):
+        assert (part == part[:, :1])[valid].all(), "a window left its environment, its episode or its option"
+    position = torch.arange(4.0).expand_as(step)
+    assert (step == step[:, :1] + position)[valid].all(), "a window skipped a step"
+    if buffer_size == 5000:
+        assert valid[:, 1].float().mean() > 0.25 and not valid[:, 2].any()
+
+
+def test_a_window_does_not_go_on_in_an_environment_that_was_started_anew():
+    learner = make(horizon=2, batch_size=512)
+    before, after = counting_batches(4, 4, 1)[-1], counting_batches(4, 1, 1)[0]
+    for batch in (before, after):
+        learner.store(batch, torch.ones(batch.shape, dtype=torch.bool))
+    windows = next_windows(learner)
+    assert not windows["valid"][:, 1].any()
+
+
+def test_the_elites_define_the_next_distribution_separately_for_each_discrete_action():
     planner = Planner(None, SPECS, **{**SEARCH, "horizon": 1, "num_samples": 5, "num_elites": 4, "temperature": 0.5})
     plan = Plan(torch.tensor([[[0.2, 0.3, 0.5]]]), torch.full((1, 1, 3), 0.1), torch.full((1, 1, 3), 0.7))
     discrete = torch.tensor([0, 0, 2, 0, 1]).view(1, 5, 1)
@@ -179,7 +227,7 @@ def test_the_elites_make_the_next_distribution_key_by_key():
     torch.testing.assert_close(new.deviation[0, 0], torch.tensor([0.1 * 0.7 + 0.9 * deviation, 0.7, 0.7]))
 
 
-def test_a_return_counts_what_comes_after_by_the_probability_of_getting_there():
+def test_a_return_weights_later_rewards_by_the_probability_of_reaching_them():
     def model(state, discrete, unit):
         one = torch.ones(2, len(state))
         return Prediction(state, 2.0 * one, torch.stack([3.0 * one[0], 5.0 * one[0]]), torch.zeros(2, len(state)))
@@ -191,14 +239,14 @@ def test_a_return_counts_what_comes_after_by_the_probability_of_getting_there():
 
 
 def one_step_rows(learner: DLPA, num: int) -> TensorDict:
-    """Play a problem of one step: only key 1 pays, the more the nearer its parameters are to (s0, -s1)."""
+    """Act in a one-step problem: only action 1 is rewarded, the more the nearer its parameters are to (s0, -s1)."""
     td = TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1])
     td = learner.policy(td)
     unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
     error = (unit[..., 1] - state[..., 0]).square() + (unit[..., 2] + state[..., 1]).square()
-    over = torch.ones(num, 1, 1, dtype=torch.bool)
+    done = torch.ones(num, 1, 1, dtype=torch.bool)
     reward = torch.where(td[keys.DISCRETE] == 1, 1.0 - error, -0.5).unsqueeze(-1)
-    td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.DONE: over, keys.TERMINATED: over}
+    td["next"] = {keys.OBSERVATION: state, keys.REWARD: reward, keys.DONE: done, keys.TERMINATED: done}
     return td
 
 
@@ -211,41 +259,41 @@ def trained() -> DLPA:
     return learner
 
 
-def test_the_learner_finds_the_key_and_parameters_that_pay(trained):
+def test_the_learner_finds_the_best_action_and_its_parameters(trained):
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(trained, 500)
     assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
-    assert rows["next", keys.REWARD].mean() > 0.85, "random presses earn about -0.4, the optimum 1"
+    assert rows["next", keys.REWARD].mean() > 0.85, "random actions earn about -0.4, the optimum 1"
 
 
-def test_a_greedy_press_is_a_function_of_the_seed_and_lies_in_bounds(trained):
+def test_a_greedy_action_is_determined_by_the_seed_and_lies_in_bounds(trained):
     td = TensorDict({keys.OBSERVATION: torch.randn(50, 4)}, [50])
-    pressed = []
+    actions = []
     for seed in (3, 3):
         torch.manual_seed(seed)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            pressed.append(trained.policy(td.clone()))
-    assert torch.equal(pressed[0][keys.DISCRETE], pressed[1][keys.DISCRETE])
-    assert torch.equal(pressed[0][keys.PARAMETERS], pressed[1][keys.PARAMETERS])
-    duration = trained.policy(td.clone())[keys.PARAMETERS]
-    assert (duration >= torch.tensor(SPECS.parameter_low)).all()
-    assert (duration <= torch.tensor(SPECS.parameter_high)).all()
+            actions.append(trained.policy(td.clone()))
+    assert torch.equal(actions[0][keys.DISCRETE], actions[1][keys.DISCRETE])
+    assert torch.equal(actions[0][keys.PARAMETERS], actions[1][keys.PARAMETERS])
+    parameters = trained.policy(td.clone())[keys.PARAMETERS]
+    assert (parameters >= torch.tensor(SPECS.parameter_low)).all()
+    assert (parameters <= torch.tensor(SPECS.parameter_high)).all()
 
 
-def test_no_plan_is_made_for_episodes_that_are_over_nor_before_anything_is_learned(trained, monkeypatch):
+def test_nothing_is_planned_for_finished_episodes_or_before_the_first_update(trained, monkeypatch):
     planned = []
     plan = trained.policy.planner.plan
     monkeypatch.setattr(trained.policy.planner, "plan", lambda state: planned.append(len(state)) or plan(state))
-    over = (torch.arange(50) < 20).unsqueeze(-1)
+    done = (torch.arange(50) < 20).unsqueeze(-1)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        trained.policy(TensorDict({keys.OBSERVATION: torch.randn(50, 4), keys.DONE: over}, [50]))
+        trained.policy(TensorDict({keys.OBSERVATION: torch.randn(50, 4), keys.DONE: done}, [50]))
         assert planned == [30]
         fresh = make()
         monkeypatch.setattr(fresh.policy.planner, "plan", None)
         fresh.policy(TensorDict({keys.OBSERVATION: torch.randn(50, 4)}, [50]))
 
 
-def test_the_state_change_is_scaled_by_its_own_deviation_over_the_warm_up():
+def test_the_state_change_is_scaled_by_its_standard_deviation_over_the_warm_up():
     learner = make(updates_per_frame=1e-3, warmup_frames=12 * 4)
     batches = counting_batches(4, 6, 3)
     for batch in batches:

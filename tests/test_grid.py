@@ -2,13 +2,14 @@
 
 import itertools
 import json
+from pathlib import Path
 
 import pytest
 import torch
-from conftest import TRAINED, choices, compose_config
+from conftest import TRAINED, choices, compose_config, make_config
 from tensordict import TensorDict
 
-from hpamdp.config import run_config
+from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
@@ -27,6 +28,8 @@ SHORT = {
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
+# What has nothing to learn.
+FIXED = ("planner", "random")
 SMALL = ["num_envs=16", "steps_per_batch=4", "total_frames=256", "eval.layouts=10", "eval.every=0", "log_every=0"]
 
 
@@ -36,16 +39,33 @@ def words(high: str, low: str) -> list[str]:
 
 
 def make(high: str, low: str, tmp_path):
-    cfg = compose_config(words(high, low))
     torch.manual_seed(0)
-    return assemble(cfg, run_config(cfg), tmp_path)
+    return assemble(make_config(words(high, low)), tmp_path)
+
+
+def weights(agent: HierarchicalAgent) -> dict[str, torch.Tensor]:
+    """Return what the learners have learned, without their counters and schedules."""
+    state = agent.learners.state_dict()
+    return {name: value.clone() for name, value in state.items() if value.is_floating_point() and value.ndim > 0}
+
+
+def assert_it_updated(given: list[str], folder: Path) -> None:
+    """Assert that the learners of a run in a folder are no longer those that the run began with."""
+    torch.manual_seed(0)
+    parts = assemble(make_config(given), folder)
+    before = weights(parts.agent)
+    checkpoint.load(folder / checkpoint.FILE_NAME, parts.agent, parts.device, with_training=False)
+    after = weights(parts.agent)
+    assert any(before[name].shape != value.shape or not before[name].equal(value) for name, value in after.items())
 
 
 @pytest.mark.parametrize(("high", "low"), list(itertools.product(choices("high"), TRAINED)))
 def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0
     assert (tmp_path / "summary.json").is_file()
+    if low not in FIXED:
+        assert_it_updated(words(high, low), tmp_path)
 
 
 # Keys with two, no and one parameter, in odd bounds; and the other built-in problems.
@@ -67,11 +87,13 @@ def test_every_learner_works_on_other_problems(low, env, tmp_path, monkeypatch):
     assert run(compose_config(given), tmp_path, given) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["env"] == env and not {"human", "human_normalised"} & {*summary, *summary["references"]}
+    if low not in FIXED:
+        assert_it_updated(given, tmp_path)
 
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])
 def test_learners_work_for_each_option_and_shared(sharing, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
     assert run(compose_config([*words("ucb", "hyar"), f"agent.sharing={sharing}"]), tmp_path) == 0
 
 

@@ -1,4 +1,4 @@
-"""Other people's environments get exactly the actions that are chosen, and are seen as every environment here is."""
+"""GymnasiumEnv passes on exactly the chosen actions and keeps the framework's contract."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 from toy_environments import ALL, FORMS, native_action
 
-from hpamdp.config import ConfigError, build
+from hpamdp.config import ConfigError, component
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.specs import PAMDPSpecs
@@ -22,7 +22,7 @@ def native(env: GymnasiumEnv, row: int = 0) -> list:
 
 
 def equal(one, other) -> bool:
-    """Tell whether two nested actions are equal, shapes and types included."""
+    """Return whether two nested actions are equal, with their shapes and dtypes."""
     if isinstance(one, dict):
         return isinstance(other, dict) and one.keys() == other.keys() and all(equal(one[k], other[k]) for k in one)
     if isinstance(one, tuple):
@@ -31,7 +31,7 @@ def equal(one, other) -> bool:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_what_arrives_is_what_was_chosen(form):
+def test_the_environment_receives_the_chosen_action(form):
     env = make(2, form=form, max_steps=1000)
     assert env.parameter_dims == ((2, 2, 2) if form == "shared" else (2, 0, 1))
     specs = PAMDPSpecs.from_env(env)
@@ -41,18 +41,18 @@ def test_what_arrives_is_what_was_chosen(form):
     env.reset()
     generator = torch.Generator().manual_seed(0)
     for _ in range(20):
-        pressed = torch.randint(3, (2,), generator=generator)
+        discrete = torch.randint(3, (2,), generator=generator)
         # Well inside the bounds, where nothing is clipped.
         unit = 0.9 * (2.0 * torch.rand(2, specs.num_parameters, generator=generator) - 1.0)
         parameters = specs.from_unit(unit)
-        step(env, pressed, parameters)
+        step(env, discrete, parameters)
         for row in range(2):
-            assert equal(native(env, row)[-1], native_action(form, int(pressed[row]), parameters[row].numpy()))
+            assert equal(native(env, row)[-1], native_action(form, int(discrete[row]), parameters[row].numpy()))
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_specs_hold(form):
-    # Toy refuses what its space does not contain, and the specs' samples come with rounded bounds.
+def test_specs_hold(form):
+    # Toy refuses actions outside its space, and samples of the specs have rounded bounds.
     check_env_specs(make(3, form=form, max_steps=2), return_contiguous=True)
 
 
@@ -70,7 +70,7 @@ def test_values_outside_their_bounds_are_clipped():
 
 
 @pytest.mark.parametrize(
-    ("pressed", "parameters", "complaint"),
+    ("discrete", "parameters", "complaint"),
     [
         ([0, 0], [[0.0, 20.0, 0.2], [0.0, np.nan, 0.2]], r"environment 1 got discrete=0 \(allowed 0 to 2\), .*nan"),
         ([0, 2], [[0.0, 20.0, 0.2], [0.0, 20.0, np.inf]], "environment 1 got discrete=2"),
@@ -81,17 +81,17 @@ def test_values_outside_their_bounds_are_clipped():
         ([[0], [0]], [[0.0, 20.0, 0.2]] * 2, r"'discrete'\) has shape \[2, 1\], but must be \[2\]"),
     ],
 )
-def test_a_wrong_action_is_refused_and_harms_nothing(pressed, parameters, complaint):
+def test_an_invalid_action_is_refused_and_changes_nothing(discrete, parameters, complaint):
     env = make(2)
     env.reset()
     with pytest.raises(ValueError, match=complaint) as raised:
-        step(env, pressed, parameters)
+        step(env, discrete, parameters)
     assert "\n" not in str(raised.value)
     assert not native(env, 0) and not native(env, 1)
 
 
 @pytest.mark.parametrize("action_format", ["tuple", "dict"])
-def test_our_own_task_goes_the_same_way_as_without_a_detour(action_format):
+def test_boats_move_through_gymnasium_as_in_their_own_environment(action_format):
     env = GymnasiumEnv(
         3,
         id="hpamdp/BoatDock-v0",
@@ -107,10 +107,10 @@ def test_our_own_task_goes_the_same_way_as_without_a_detour(action_format):
     generator = torch.Generator().manual_seed(0)
     episodes = 0
     for _ in range(90):
-        pressed = torch.randint(3, (3,), generator=generator)
+        key = torch.randint(3, (3,), generator=generator)
         seconds = 0.6 * torch.rand(3, 3, generator=generator) - 0.01
-        after = step(env, pressed, seconds)
-        others = torch.cat([step_one(boat, pressed[[i]], seconds[[i]]) for i, boat in enumerate(boats)])
+        after = step(env, key, seconds)
+        others = torch.cat([step_one(boat, key[[i]], seconds[[i]]) for i, boat in enumerate(boats)])
         for name in ("observation", "reward", "done", "terminated", "truncated"):
             assert torch.equal(after[name], others[name]), name
         if after["done"].all():
@@ -122,8 +122,8 @@ def test_our_own_task_goes_the_same_way_as_without_a_detour(action_format):
     assert episodes > 2
 
 
-def step_one(boat: BoatDockEnv, pressed: torch.Tensor, seconds: torch.Tensor) -> TensorDict:
-    press = TensorDict(discrete=pressed, parameters=seconds, batch_size=[1])
+def step_one(boat: BoatDockEnv, key: torch.Tensor, seconds: torch.Tensor) -> TensorDict:
+    press = TensorDict(discrete=key, parameters=seconds, batch_size=[1])
     after = boat.step(TensorDict(action=press, batch_size=[1]))["next"]
     return after.select("observation", "reward", "done", "terminated", "truncated")
 
@@ -151,7 +151,7 @@ def test_a_finished_episode_stays_and_earns_nothing_until_it_is_reset():
     assert seen["done"].squeeze(-1).tolist() == [True, False] and seen["observation"][1, 1] == 0.0
 
 
-def test_what_was_returned_is_never_changed_later():
+def test_returned_tensors_never_change_later():
     env = make(2)
     kept = [env.reset(), step(env)]
     copies = [td.clone() for td in kept]
@@ -160,7 +160,7 @@ def test_what_was_returned_is_never_changed_later():
     assert all((one == other).all() for one, other in zip(kept, copies, strict=True))
 
 
-def test_an_end_at_the_time_limit_is_no_truncation():
+def test_an_end_in_the_last_step_of_the_time_limit_is_no_truncation():
     env = make(kwargs={"length": 2}, max_steps=2)
     env.reset()
     step(env)
@@ -177,7 +177,7 @@ def test_a_partial_step_moves_only_its_rows():
     assert len(native(env, 0)) == 1 and not native(env, 1)
 
 
-def test_seeds_make_the_same_episodes_whatever_the_number_of_copies():
+def test_a_seed_fixes_the_episodes_whatever_the_number_of_copies():
     def first_three(env: GymnasiumEnv, **given) -> torch.Tensor:
         return torch.stack([env.reset(**(given if number == 0 else {}))["observation"] for number in range(3)])
 
@@ -195,7 +195,7 @@ def test_seeds_make_the_same_episodes_whatever_the_number_of_copies():
     assert torch.equal(fixed, first_three(make(2, seed=9), tensordict=one.fixed_episodes(5)))
 
 
-def test_given_seeds_concern_only_what_is_reset():
+def test_given_seeds_affect_only_the_copies_that_are_reset():
     env = make(2, seed=1)
     expected_row = make(2, seed=1).reset()["observation"][1]
     reset_rows(env, env.full_done_spec.zero().set("seed", torch.tensor([8, 9])), [True, False])
@@ -215,20 +215,21 @@ def test_the_time_limit_is_the_environments_own_or_the_one_given():
         assert [step(env)["truncated"].item() for _ in range(limit)] == [False] * (limit - 1) + [True]
 
 
-def test_success_is_what_the_infos_say():
-    silent, telling = make(2, kwargs={"length": 2}), make(2, kwargs={"length": 2, "success": True})
-    for env in (silent, telling):
+def test_success_comes_from_the_infos():
+    silent = make(2, kwargs={"length": 2})
+    reporting = make(2, kwargs={"length": 2, "success": True})
+    for env in (silent, reporting):
         env.reset()
         env.envs[1].unwrapped.length = 4
         for _ in range(2):
             last = step(env)
-        assert last["success"].tolist() == [env is telling, False]
+        assert last["success"].tolist() == [env is reporting, False]
     assert silent.results(last.clone().fill_("success", False)) == {}
-    assert telling.results(last)["success"].tolist() == [True, False]
-    assert step(telling)["success"].tolist() == [True, False]
-    assert telling.reset()["success"].tolist() == [False, False]
+    assert reporting.results(last)["success"].tolist() == [True, False]
+    assert step(reporting)["success"].tolist() == [True, False]
+    assert reporting.reset()["success"].tolist() == [False, False]
     assert set(GymnasiumEnv.result_keys) <= set(last.keys())
-    # What other processes' copies told: this one has never been stepped.
+    # As reported to copies in another process: this one was never stepped.
     assert make(2).results(last)["success"].tolist() == [True, False]
 
 
@@ -239,23 +240,23 @@ def test_closing_closes_every_copy():
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_an_old_environment_does_as_its_new_form_does(form):
-    one, other = make(2, form=form, kwargs={"length": 4}), make(2, form=form, entry_point="toy_environments:OldToy")
+def test_a_four_value_environment_behaves_like_its_gymnasium_form(form):
+    one = make(2, form=form, kwargs={"length": 4})
+    other = make(2, form=form, entry_point="toy_environments:OldToy")
     for env in other.envs:
         env.unwrapped.env.toy.length = 4
     assert torch.equal(one.reset()["observation"], other.reset()["observation"])
     assert one.parameter_dims == other.parameter_dims
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
-        pressed = torch.randint(3, (2,), generator=generator)
+        discrete = torch.randint(3, (2,), generator=generator)
         parameters = 30.0 * torch.rand(2, sum(one.parameter_dims), generator=generator)
-        after, others = step(one, pressed, parameters), step(other, pressed, parameters)
-        assert (after == others).all()
+        assert (step(one, discrete, parameters) == step(other, discrete, parameters)).all()
     old_actions = other.envs[1].unwrapped.env.toy.actions
     assert len(native(one, 1)) == 4 and all(map(equal, native(one, 1), old_actions))
 
 
-def test_an_old_time_limit_is_a_truncation():
+def test_the_time_limit_of_a_four_value_environment_is_a_truncation():
     for length, flags in ((0, (False, True)), (3, (True, False))):
         env = make(entry_point="toy_environments:OldToy", kwargs={"length": length, "limit": 3})
         env.reset()
@@ -266,7 +267,7 @@ def test_an_old_time_limit_is_a_truncation():
 def mistake_in(**options) -> str:
     node = OmegaConf.create({"_target_": "hpamdp.env.gymnasium.environment.GymnasiumEnv", **options})
     with pytest.raises(ConfigError) as raised:
-        build("env", node, num_envs=2, device="cpu", seed=0)
+        component("env", "gymnasium", node).build(num_envs=2, device="cpu", seed=0)
     assert "\n" not in str(raised.value) and "GymnasiumEnv" in str(raised.value)
     return str(raised.value)
 
@@ -289,18 +290,18 @@ def mistake_in(**options) -> str:
         ({"entry_point": "toy_environments:Nobody"}, "there is no class or function Nobody in toy_environments"),
         ({"entry_point": "toy_environments"}, "must be a class or function, as package.module:name"),
         ({"entry_point": "builtins:object", "max_steps": 5}, "is no environment"),
-        ({"id": "Toy-v0", "parameter_dims": [1, 1, 1]}, "goes with one Box for all keys, but there is a Box for each"),
+        ({"id": "Toy-v0", "parameter_dims": [1, 1, 1]}, "is for one Box for all discrete actions, but each has"),
         (
             {"entry_point": "toy_environments:Mixed", "max_steps": 5, "kwargs": {"is_text": True}},
             "observation space Text(1, 5, ",
         ),
     ],
 )
-def test_a_mistake_costs_one_line(options, complaint):
+def test_a_mistake_is_explained_in_one_line(options, complaint):
     assert complaint in mistake_in(**options)
 
 
-def test_a_bug_in_an_environment_is_no_mistake_of_the_users():
-    for made_by in ({"id": "Toy-v0"}, {"entry_point": TOY}):
+def test_a_bug_in_an_environment_is_not_reported_as_a_mistake_of_the_user():
+    for name in ({"id": "Toy-v0", "entry_point": None}, {"entry_point": TOY}):
         with pytest.raises(TypeError, match="has no len"):
-            make(**{"entry_point": None, **made_by}, kwargs={"broken": True})
+            make(**name, kwargs={"broken": True})

@@ -1,4 +1,4 @@
-"""The Gymnasium faces keep Gymnasium's contract and play the same task as BoatDockEnv."""
+"""The Gymnasium faces of the boats keep Gymnasium's contract and play the same task as BoatDockEnv."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def press(key: int, seconds: float, **option: int) -> dict:
 
 
 def same(one, other) -> bool:
-    """Tell whether nested infos or observations are equal, types included and floats but for rounding."""
+    """Return whether nested infos or observations are equal, with their types, and floats up to rounding."""
     if isinstance(one, dict):
         return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one)
     if isinstance(one, np.ndarray) and one.dtype == object:
@@ -48,7 +48,7 @@ def same(one, other) -> bool:
 @pytest.mark.parametrize("controller", ["choose", "congruent", "incongruent", "random"])
 @pytest.mark.parametrize("observation", ["scaled", "pixels"])
 @pytest.mark.parametrize("noise", [{}, NOISE], ids=["exact", "noisy"])
-def test_gymnasiums_checker_has_nothing_to_say(action_format, controller, observation, noise):
+def test_gymnasiums_checker_finds_nothing(action_format, controller, observation, noise):
     env = gymnasium.make(
         ID, controller=controller, keymap="random", observation=observation, action_format=action_format, **noise
     )
@@ -100,7 +100,7 @@ def test_a_seed_fixes_the_layouts_and_a_reset_without_one_goes_on_to_the_next():
     assert same(many[0], first)
 
 
-def test_unseeded_environments_differ_and_take_their_seed_from_np_random():
+def test_unseeded_environments_differ_and_seed_themselves_from_np_random():
     envs = [BoatDock() for _ in range(3)] + [BoatDockVector(1) for _ in range(2)]
     assert len({env.reset()[0].tobytes() for env in envs}) == 5
     twins = [BoatDock(), BoatDock()]
@@ -116,7 +116,7 @@ def test_global_generators_are_not_moved():
         env.step(press(0, 0.3, option=1))
 
 
-def test_info_tells_the_outcome_and_the_score_at_the_end():
+def test_the_info_has_the_outcome_and_at_the_end_the_score():
     env = BoatDock()
     _, info = env.reset(options={"start": START, "goal": GOAL})
     assert info == {"outcome": "sailing", "fuel": 1.0, "presses": 0, "controller": -1}
@@ -139,7 +139,7 @@ def test_the_25th_press_truncates():
     assert flags[-1][2]["score"] == -1.0
 
 
-def test_both_formats_and_the_vector_do_the_same():
+def test_both_action_formats_and_the_vector_give_the_same_results():
     layout = {"start": START, "goal": GOAL + 10.0}
     single, nested = BoatDock(), BoatDock(action_format="tuple")
     many, nested_many = BoatDockVector(2), BoatDockVector(2, action_format="tuple")
@@ -149,7 +149,8 @@ def test_both_formats_and_the_vector_do_the_same():
         env.reset(seed=0, options={name: np.stack([point, point]) for name, point in layout.items()})
     duration = np.array([0.1, 0.4, 0.9], np.float32)
     expected = single.step({"option": 1, "key": 1, "duration": duration})[0]
-    pairs, options = np.stack([duration, duration]), np.array([1, 0])
+    pairs = np.stack([duration, duration])
+    options = np.array([1, 0])
     columns = tuple(pairs[:, [k]] for k in range(3))
     assert same(nested.step((1, 1, tuple(duration[[k]] for k in range(3))))[0], expected)
     rows = many.step({"option": options, "key": np.array([1, 1]), "duration": pairs})[0]
@@ -190,7 +191,7 @@ BAD_TUPLES = {
     [("dict", a) for a in BAD_ACTIONS.values()] + [("tuple", a) for a in BAD_TUPLES.values()],
     ids=[*BAD_ACTIONS, *(f"tuple {name}" for name in BAD_TUPLES)],
 )
-def test_a_bad_action_is_refused_in_one_line_and_harms_nothing(action_format, action):
+def test_an_invalid_action_is_refused_in_one_line_and_changes_nothing(action_format, action):
     env, untouched = (BoatDock(action_format=action_format) for _ in range(2))
     good = press(1, 0.2, option=1) if action_format == "dict" else (1, 1, tuple(np.full((3, 1), 0.2)))
     for each in (env, untouched):
@@ -213,7 +214,7 @@ def test_a_bad_action_is_refused_in_one_line_and_harms_nothing(action_format, ac
     ],
 )
 @pytest.mark.parametrize("seed", [None, 9])
-def test_a_bad_reset_option_is_refused_in_one_line_and_harms_nothing(options, seed):
+def test_an_invalid_reset_option_is_refused_in_one_line_and_changes_nothing(options, seed):
     env, untouched = BoatDock(), BoatDock()
     for each in (env, untouched):
         each.reset(seed=0)
@@ -231,20 +232,20 @@ def test_stepping_and_rendering_before_the_first_reset_is_refused():
 
 
 @pytest.mark.parametrize("arguments", [{"action_format": "list"}, {"render_mode": "human"}, {"slip": 2.0}], ids=str)
-def test_a_bad_argument_is_refused_by_name(arguments):
+def test_an_invalid_argument_is_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         BoatDock(**arguments)
 
 
 def layouts(num: int) -> dict[str, np.ndarray]:
-    """Draw layouts from which boats reach different ends."""
+    """Return layouts in which boats have different outcomes."""
     angle = np.linspace(0.0, 6.0, num)[:, None]
     around = np.concatenate([np.cos(angle), np.sin(angle)], 1)
     return {"start": START + 20.0 * around, "goal": START + 90.0 * around[::-1]}
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
-def test_the_vector_does_what_gymnasium_makes_of_single_boats(mode):
+def test_the_vector_behaves_like_gymnasiums_vector_of_single_boats(mode):
     num = 12
     ours = gymnasium.make_vec(
         ID, num, vectorization_mode="vector_entry_point", controller="congruent", autoreset_mode=mode
@@ -258,12 +259,13 @@ def test_the_vector_does_what_gymnasium_makes_of_single_boats(mode):
         env.reset(options={name: points[row] for name, points in given.items()})
     ours.action_space.seed(0)
     fresh = ended = np.zeros(num, bool)
-    # New episodes are of other seeds, so that the comparison ends with the first of them.
+    # New episodes have other seeds, so the comparison ends with the first of them.
     while not fresh.any() and not (mode == "Disabled" and ended.any()):
         actions = ours.action_space.sample()
         actions["duration"] *= 0.6
         (seen, *flags, infos), (expected, *expected_flags, expected_infos) = ours.step(actions), theirs.step(actions)
-        fresh, ended = infos["presses"] == 0, flags[1] | flags[2]
+        fresh = infos["presses"] == 0
+        ended = flags[1] | flags[2]
         assert np.allclose(seen[~fresh], expected[~fresh], atol=1e-5)
         assert all(np.allclose(one, other, atol=1e-5) for one, other in zip(flags, expected_flags, strict=True))
         assert [flag.dtype for flag in flags] == [flag.dtype for flag in expected_flags]
@@ -271,7 +273,7 @@ def test_the_vector_does_what_gymnasium_makes_of_single_boats(mode):
     assert num > fresh.sum() + ended.sum() > 0
 
 
-def test_the_next_step_after_the_end_ignores_the_action_and_starts_anew():
+def test_the_next_step_after_the_end_ignores_the_action_and_starts_a_new_episode():
     env = BoatDockVector(2, controller="congruent")
     env.reset(seed=0, options={"start": np.stack([START] * 2), "goal": np.stack([GOAL] * 2)})
     actions = {"key": np.array([0, 1]), "duration": np.array([[0.1] * 3, [2.0] * 3])}
@@ -290,7 +292,7 @@ def test_the_next_step_after_the_end_ignores_the_action_and_starts_anew():
     assert same(again.reset()[0][1], observations[1])
 
 
-def test_a_reset_mask_starts_only_its_boats():
+def test_a_reset_mask_resets_only_its_boats():
     env = BoatDockVector(3, controller="congruent", autoreset_mode="Disabled")
     env.reset(seed=0)
     before = env.step({"key": np.zeros(3, int), "duration": np.full((3, 3), 0.1)})[0]
@@ -315,7 +317,7 @@ def test_frames_show_the_episode():
     assert not np.array_equal(after, env.render())
 
 
-def test_before_a_controller_is_chosen_no_key_has_a_direction():
+def test_no_directions_are_drawn_before_a_controller_is_chosen():
     chosen = [draw(Scene((-50, 0), (50, 0), (-50, 0), controller=number), 240) for number in (-1, 0, 1)]
     background = chosen[0][2, 2]
     corner = [frame[170:222, :60] for frame in chosen]

@@ -1,4 +1,4 @@
-"""Spaces of Gymnasium and of gym are read as documented, and what cannot be read is refused in one line."""
+"""Spaces of Gymnasium and of gym are read as documented, and all others are refused in one line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.four_value import FourValueEnv, to_gymnasium
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
 
-UNIT, TWO_BOXES = Box(0, 1, (1,)), Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
+UNIT = Box(0, 1, (1,))
+TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
 
 
 @pytest.mark.parametrize(
@@ -24,19 +25,19 @@ UNIT, TWO_BOXES = Box(0, 1, (1,)), Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
         (Dict(a=Discrete(2), b=TWO_BOXES, c=Discrete(2)), "not of these forms"),
         (
             Tuple([Box(np.zeros((2, 9)), np.ones((2, 9)) * np.arange(1.0, 10.0), dtype=np.float64), Discrete(3)]),
-            "no Discrete for the keys",
+            "no Discrete for the discrete actions",
         ),
-        (Dict(a=UNIT, b=UNIT), "no Discrete for the keys"),
-        (Tuple([Discrete(3), TWO_BOXES]), "3 keys, but 2 Boxes"),
-        (Tuple([Discrete(3), UNIT, UNIT]), "3 keys, but 2 Boxes"),
+        (Dict(a=UNIT, b=UNIT), "no Discrete for the discrete actions"),
+        (Tuple([Discrete(3), TWO_BOXES]), "3 discrete actions, but 2 Boxes"),
+        (Tuple([Discrete(3), UNIT, UNIT]), "3 discrete actions, but 2 Boxes"),
         (Tuple([Discrete(2), MultiDiscrete([2, 3])]), "parameters must be Boxes of floats"),
         (Tuple([Discrete(2), Discrete(2), Discrete(2)]), "parameters must be Boxes of floats"),
         (Dict(a=Discrete(2), b=Discrete(2)), "parameters must be Boxes of floats"),
         (Tuple([Discrete(2), Box(0, 9, (2,), dtype=np.int64)]), "parameters must be Boxes of floats"),
         (Tuple([Discrete(2), Box(0, np.inf, (40, 2))]), "parameters must have finite bounds"),
         (Tuple([Discrete(2), Box(-1e300, 1e300, (2,), dtype=np.float64)]), "parameters must have finite bounds"),
-        (Tuple([Discrete(2), Box(1, 1, (2,))]), "a parameter's lower bound must be less than its upper one"),
-        (Tuple([Discrete(2), Box(0, 1, (0,))]), "no key has a parameter"),
+        (Tuple([Discrete(2), Box(1, 1, (2,))]), "a parameter's lower bound must be less than its upper bound"),
+        (Tuple([Discrete(2), Box(0, 1, (0,))]), "no discrete action has a parameter"),
     ],
     ids=str,
 )
@@ -48,15 +49,15 @@ def test_another_action_space_is_refused_in_one_line(space, reason):
     assert f": {reason}; accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P" in line
 
 
-def test_how_a_box_is_split_must_add_up():
+def test_the_sizes_of_a_split_box_must_add_up():
     for wrong in ([1, 1, 2], [3], [4, -1, 0], []):
         with pytest.raises(ValueError, match=r"must be 3 numbers of at least 0 that add up to 3"):
             ActionSpace(FORMS["split"][0], wrong)
-    with pytest.raises(ValueError, match="goes with one Box for all keys"):
+    with pytest.raises(ValueError, match="is for one Box for all discrete actions"):
         ActionSpace(FORMS["nested"][0], [2, 0, 1])
 
 
-def test_boxes_in_a_dict_belong_to_the_keys_in_its_order_unless_all_are_numbered():
+def test_boxes_in_a_dict_belong_to_the_discrete_actions_in_its_order_unless_all_are_numbered():
     def sizes(**boxes: int) -> tuple[int, ...]:
         parts = [(name, spaces.Box(0.0, 1.0, (size,))) for name, size in boxes.items()]
         space = spaces.Dict(key=spaces.Discrete(3), of=spaces.Dict(parts))
@@ -86,28 +87,28 @@ def test_entries_without_bounds_stay_as_they_are():
     assert image.scaled(image.flat(np.array([[0, 255], [0, 255]], np.uint8))[None]).tolist() == [[-1.0, 1.0, -1.0, 1.0]]
 
 
-def test_running_statistics_leave_what_never_varied_and_clip():
+def test_running_statistics_keep_the_unit_of_constant_entries_and_clip():
     space = ObservationSpace(spaces.Box(-np.inf, np.inf, (2,)), "running")
     for _ in range(300):
         assert space.scaled(np.array([[3.0, 1e8]])).tolist() == [[0.0, 0.0]]
     assert space.scaled(np.array([[4.0, 1e8]]))[0].tolist() == [10.0, 0.0]
 
 
-def test_old_spaces_are_told_by_their_attributes():
+def test_spaces_of_gym_are_recognised_by_their_attributes():
     parts = [spaces.Discrete(3, start=2), spaces.MultiDiscrete([2, 3]), spaces.MultiBinary(4), TWO, ONE, PAIR]
     parts += [spaces.Dict([("b", TWO), ("a", ONE)]), spaces.Box(0.0, 1.0, ())]
     space = spaces.Tuple(parts)
     assert to_gymnasium(old_space(space)) == space
     assert list(to_gymnasium(old_space(parts[6])).spaces) == ["b", "a"]
-    with pytest.raises(ValueError, match="is no space that is known"):
+    with pytest.raises(ValueError, match="is no known space"):
         to_gymnasium(object())
 
 
 class Halfway(Toy):
-    """Has Gymnasium's interface, but is passed on as if it had the old one."""
+    """An environment with Gymnasium's interface that is wrapped as if it had that of gym."""
 
 
-def test_what_has_not_the_old_interface_is_refused():
+def test_an_environment_without_the_interface_of_gym_is_refused():
     env = FourValueEnv(Halfway())
     with pytest.raises(ValueError, match=r"Halfway returned an info, too; .* must inherit"):
         env.reset()

@@ -1,4 +1,4 @@
-"""Layouts, controllers and the counters behind them."""
+"""Layouts and controllers are as specified, and so are the counter-based random numbers behind them."""
 
 from __future__ import annotations
 
@@ -20,14 +20,13 @@ def counter(num: int) -> torch.Tensor:
 
 
 def keys_for(num: int, stream: int = counter_rng.TRAINING, seed: int = 0, episode: int = 0) -> torch.Tensor:
-    """Return the keys of the environments 0 to num - 1, `[num]`."""
-    return counter_rng.key_for(
-        counter_rng.seed_tensor(seed), stream, counter(num), torch.full_like(counter(num), episode)
-    )
+    """Return the random keys of the environments 0 to num - 1, `[num]`."""
+    episodes = torch.full_like(counter(num), episode)
+    return counter_rng.key_for(counter_rng.seed_tensor(seed), stream, counter(num), episodes)
 
 
 def distance_between_distributions(a: np.ndarray, b: np.ndarray) -> float:
-    """Return the Kolmogorov-Smirnov statistic; under 0.006 in 99.9 % of cases when 200,000 are alike."""
+    """Return the Kolmogorov-Smirnov statistic; with 200,000 samples of the same distribution 99.9 % are under 0.006."""
     both = np.sort(np.concatenate([a, b]))
     cumulative = [np.searchsorted(np.sort(x), both, side="right") / len(x) for x in (a, b)]
     return float(np.abs(cumulative[0] - cumulative[1]).max())
@@ -35,12 +34,12 @@ def distance_between_distributions(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def layouts() -> Layout:
-    return harbour.draw_layout(keys_for(NUM))
+    return harbour.sample_layout(keys_for(NUM))
 
 
 @pytest.fixture(scope="module")
-def redrawn_layouts() -> np.ndarray:
-    """Draw pairs in the square, keep those in the disc and 30 px apart: `[NUM, 4]`."""
+def rejection_sampled_layouts() -> np.ndarray:
+    """Sample pairs in the square and keep those in the disc and 30 px apart, `[NUM, 4]`."""
     rng = np.random.default_rng(1)
     pairs = rng.uniform(-110.0, 110.0, (3 * NUM, 2, 2))
     pairs = pairs[(np.hypot(*pairs.T).T < 110.0).all(1)]
@@ -54,30 +53,32 @@ def test_starts_and_goals_lie_in_the_disc_and_30_px_apart(layouts):
     assert harbour.separation(layouts).min() > 30.0 - 1e-3
 
 
-def test_layouts_are_distributed_as_pairs_redrawn_until_far_enough_apart(layouts, redrawn_layouts):
-    for ours, theirs in zip(layouts, redrawn_layouts.T, strict=True):
+def test_layouts_have_the_distribution_of_rejection_sampling(layouts, rejection_sampled_layouts):
+    for ours, theirs in zip(layouts, rejection_sampled_layouts.T, strict=True):
         assert distance_between_distributions(ours.numpy(), theirs) < 0.006
-    drawn = [layout.numpy() for layout in layouts], redrawn_layouts.T
+    both = [column.numpy() for column in layouts], rejection_sampled_layouts.T
     for measure in (
         lambda x, y, *_: np.hypot(x, y),
         lambda *point: np.hypot(*point[2:]),
         lambda x, y, goal_x, goal_y: np.hypot(goal_x - x, goal_y - y),
         lambda x, y, goal_x, goal_y: np.arctan2(goal_y - y, goal_x - x),
     ):
-        assert distance_between_distributions(*(measure(*points) for points in drawn)) < 0.006
+        assert distance_between_distributions(*(measure(*points) for points in both)) < 0.006
 
 
 @pytest.mark.parametrize("keymap", [1, 2])
 @pytest.mark.parametrize("key", [0, 1, 2])
 def test_direction_follows_the_table(key, keymap):
-    key, keymap = torch.tensor([key]), torch.tensor([keymap])
+    key = torch.tensor([key])
+    keymap = torch.tensor([keymap])
     for controller, row in ((INCONGRUENT, keymap.item() - 1), (CONGRUENT, 2)):
         direction = torch.cat(harbour.direction(torch.tensor([controller]), keymap, key))
         assert direction.tolist() == pytest.approx(harbour.DIRECTIONS[row][key.item()], abs=1e-6)
 
 
-def test_an_environments_layouts_depend_neither_on_the_batch_nor_on_the_others_resets():
-    seed, rules = counter_rng.seed_tensor(5), episode.Rules(controller="random", keymap="random")
+def test_the_layouts_of_an_environment_depend_neither_on_the_batch_nor_on_other_resets():
+    seed = counter_rng.seed_tensor(5)
+    rules = episode.Rules(controller="random", keymap="random")
 
     def blank(num: int) -> episode.BoatState:
         return episode.BoatState(
@@ -112,18 +113,19 @@ def test_bearing_offset_is_0_along_a_congruent_direction_and_60_along_an_incongr
             assert harbour.bearing_offset(layout).item() == pytest.approx(offset, abs=1e-3)
 
 
-def test_evaluation_layouts_are_fixed_by_their_seed_and_met_in_no_training_of_that_seed():
+def test_evaluation_layouts_are_fixed_by_their_seed_and_absent_from_training_with_that_seed():
     evaluation = torch.stack(harbour.fixed_layouts(1000, seed=3), -1)
     assert torch.equal(evaluation[:10], torch.stack(harbour.fixed_layouts(10, seed=3), -1))
     assert not torch.equal(evaluation, torch.stack(harbour.fixed_layouts(1000, seed=4), -1))
-    training = {
-        tuple(row) for e in range(20) for row in torch.stack(harbour.draw_layout(keys_for(1000, 0, 3, e)), -1).tolist()
-    }
+    training = set()
+    for e in range(20):
+        layouts = harbour.sample_layout(keys_for(1000, seed=3, episode=e))
+        training |= {tuple(row) for row in torch.stack(layouts, -1).tolist()}
     assert len(training) == 20_000
     assert not training & {tuple(row) for row in evaluation.tolist()}
 
 
-def test_a_controller_and_a_keymap_are_drawn_evenly_and_apart_from_the_layout():
+def test_random_controllers_and_key_maps_are_uniform_and_independent_of_the_layout():
     rules = episode.Rules(controller="random", keymap="random")
     num = 100_000
     blank = episode.BoatState(*[torch.zeros(num)] * 9, *[counter(num)] * 4, episode=torch.full_like(counter(num), -1))
@@ -137,9 +139,9 @@ def test_a_controller_and_a_keymap_are_drawn_evenly_and_apart_from_the_layout():
     assert columns.corrcoef()[:2].sub(torch.eye(2, 6)).abs().max() < 0.012
 
 
-def test_uniform_numbers_are_even_and_independent_of_every_counter():
+def test_uniform_numbers_are_uniform_and_independent_of_every_counter():
     key = keys_for(NUM)
-    numbers = [counter_rng.uniform(key, sample) for sample in (0, 1, 2, 15, 400)]
+    numbers = [counter_rng.uniform(key, index) for index in (0, 1, 2, 15, 400)]
     numbers += [counter_rng.uniform(keys_for(NUM, *at), 0) for at in ((1,), (2,), (0, 1), (0, 0, 1), (0, 0, 2))]
     for number in numbers:
         assert number.dtype == torch.float32
@@ -153,7 +155,7 @@ def test_uniform_numbers_are_even_and_independent_of_every_counter():
 
 
 @pytest.mark.parametrize("bits", [0, -1])
-def test_uniform_numbers_stay_inside_the_open_interval_even_at_the_ends(bits, monkeypatch):
+def test_uniform_numbers_lie_inside_the_open_interval_even_for_extreme_bits(bits, monkeypatch):
     monkeypatch.setattr(counter_rng, "_mix", lambda h: torch.full_like(h, bits))
     assert 0.0 < counter_rng.uniform(counter(1), 0).item() < 1.0
     assert abs(counter_rng.normal(counter(1), 0).item()) < 5.8
@@ -170,7 +172,7 @@ def test_normal_numbers_have_the_moments_of_the_normal_distribution():
     assert torch.stack([first, second]).corrcoef()[0, 1].abs() < 0.012
 
 
-def test_seeds_of_any_size_fit_and_those_of_32_bits_differ():
+def test_seeds_of_any_size_are_accepted_and_those_of_32_bits_differ():
     for seed in (-1, 2**32, 2**63 - 1, 12345678901234567890):
         assert counter_rng.seed_tensor(seed).dtype == torch.int32
     seeds = [0, 1, 2**16, 2**31 - 1, 2**31, 2**32 - 1]

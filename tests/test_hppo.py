@@ -1,4 +1,4 @@
-"""H-PPO: the ratios, the advantages, whose rows count, and that the whole learns a problem with a known optimum."""
+"""H-PPO: ratios, advantages, which rows count, and learning a problem with a known optimum."""
 
 import pytest
 import torch
@@ -27,7 +27,10 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> HPPO:
 
 
 def one_step_rows(learner: HPPO, num: int) -> TensorDict:
-    """Play a problem of one step, `[num, 1]`: only key 1 pays, most where its parameters are (s0, -s1)/2."""
+    """Play `num` episodes of one step, `[num, 1]`.
+
+    Discrete action 1 earns the more, the nearer its parameters are to (s0, -s1) / 2, at most 1; the others lose 0.5.
+    """
     td = learner.policy(TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1]))
     unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
     error = (unit[..., 1] - 0.5 * state[..., 0]).square() + (unit[..., 2] + 0.5 * state[..., 1]).square()
@@ -42,7 +45,7 @@ def one_step_rows(learner: HPPO, num: int) -> TensorDict:
 
 
 def random_rows(learner: HPPO, num: int, steps: int) -> TensorDict:
-    """Draw transitions `[num, steps]`; the policy pressed the keys, the rest is noise."""
+    """Return random transitions `[num, steps]` with actions of the policy."""
     td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(num, steps, 4)}, [num, steps]))
     done = torch.rand(num, steps, 1) < 0.3
     td["next"] = {
@@ -58,7 +61,7 @@ def everything(td: TensorDict) -> torch.Tensor:
     return torch.ones(td.shape, dtype=torch.bool)
 
 
-def test_the_log_ratios_are_those_of_the_key_and_of_its_own_parameters():
+def test_the_log_ratios_are_those_of_the_discrete_action_and_of_its_own_parameters():
     learner = make()
     td = random_rows(learner, 50, 2)
     discrete, raw = td[keys.DISCRETE], td[RAW]
@@ -66,17 +69,17 @@ def test_the_log_ratios_are_those_of_the_key_and_of_its_own_parameters():
         learner.actor.discrete_head.bias.add_(torch.tensor([0.3, -0.2, 0.1]))
         learner.actor.parameter_head.bias.add_(0.2 * torch.arange(6))
         now = learner.actor(td[keys.OBSERVATION])
-        of_discrete, of_parameters = now.log_prob(discrete, raw)
-    torch.testing.assert_close(of_discrete, Categorical(logits=now.discrete_log_probs).log_prob(discrete))
+        discrete_log_prob, parameter_log_prob = now.log_prob(discrete, raw)
+    torch.testing.assert_close(discrete_log_prob, Categorical(logits=now.discrete_log_probs).log_prob(discrete))
     single = Normal(now.mean, now.log_scale.exp()).log_prob(raw)
     own = {0: single[..., 0], 1: single[..., 1] + single[..., 2], 2: torch.zeros(50, 2)}
     for k, expected in own.items():
-        torch.testing.assert_close(of_parameters[discrete == k], expected[discrete == k])
+        torch.testing.assert_close(parameter_log_prob[discrete == k], expected[discrete == k])
     before = td[PARAMETER_LOG_PROB]
-    assert (before[discrete == 2] == 0).all() and (of_parameters - before)[discrete != 2].abs().min() > 0
+    assert (before[discrete == 2] == 0).all() and (parameter_log_prob - before)[discrete != 2].abs().min() > 0
 
 
-def test_the_parameters_of_other_keys_move_nothing():
+def test_the_parameters_of_other_actions_do_not_change_the_likelihood():
     learner = make()
     td = random_rows(learner, 50, 2)
     other = ~SPECS.parameter_mask[td[keys.DISCRETE]]
@@ -88,11 +91,11 @@ def test_the_parameters_of_other_keys_move_nothing():
 def test_the_ratios_are_one_before_the_first_update():
     learner = make()
     td = random_rows(learner, 50, 4)
-    of_discrete, of_parameters = learner.actor(td[keys.OBSERVATION].flatten(0, 1)).log_prob(
+    discrete_log_prob, parameter_log_prob = learner.actor(td[keys.OBSERVATION].flatten(0, 1)).log_prob(
         td[keys.DISCRETE].flatten(), td[RAW].flatten(0, 1)
     )
-    torch.testing.assert_close(of_discrete, td[DISCRETE_LOG_PROB].flatten(), atol=1e-5, rtol=0)
-    torch.testing.assert_close(of_parameters, td[PARAMETER_LOG_PROB].flatten(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(discrete_log_prob, td[DISCRETE_LOG_PROB].flatten(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(parameter_log_prob, td[PARAMETER_LOG_PROB].flatten(), atol=1e-5, rtol=0)
 
 
 def test_the_surrogate_stops_rewarding_beyond_the_clip():
@@ -104,9 +107,11 @@ def test_the_surrogate_stops_rewarding_beyond_the_clip():
 def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():
     learner = make()
     td = random_rows(learner, 3, 4)
-    # Terminated in the middle; truncated there; going on. The second half of row 0 is another option's.
+    # Row 0 terminates at its second step, row 1 is truncated there, row 2 goes on. What follows in row 0 is another
+    # learner's.
     done = torch.tensor([[0, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=torch.bool).unsqueeze(-1)
-    td["next", keys.DONE], td["next", keys.TERMINATED] = done, done.clone()
+    td["next", keys.DONE] = done
+    td["next", keys.TERMINATED] = done.clone()
     td["next", keys.TERMINATED][1:] = False
     mask = everything(td)
     mask[0, 2:] = False
@@ -118,7 +123,8 @@ def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():
     for row in range(3):
         trace = 0.0
         for t in (3, 2, 1, 0):
-            is_terminated, is_done = (td["next", name][row, t, 0] for name in (keys.TERMINATED, keys.DONE))
+            is_terminated = td["next", keys.TERMINATED][row, t, 0]
+            is_done = td["next", keys.DONE][row, t, 0]
             delta = reward[row, t] + 0.9 * next_value[row, t] * ~is_terminated - value[row, t]
             trace = delta + 0.9 * 0.8 * trace * ~is_done
             if mask[row, t]:
@@ -126,7 +132,7 @@ def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():
                 torch.testing.assert_close(target[row, t], trace + value[row, t])
 
 
-def test_what_others_did_changes_nothing():
+def test_rows_of_other_learners_change_nothing():
     learners = make(minibatch_size=64), make(minibatch_size=64)
     td = random_rows(learners[0], 64, 6)
     starts = td["next", keys.DONE].squeeze(-1).cumsum(1).roll(1, 1)
@@ -144,7 +150,7 @@ def test_what_others_did_changes_nothing():
         assert one.isfinite().all() and torch.equal(one, two)
 
 
-def test_the_learner_finds_the_key_and_parameters_that_pay():
+def test_the_learner_finds_the_best_discrete_action_and_its_parameters():
     learner = make()
     for _ in range(40):
         td = one_step_rows(learner, 1000)
@@ -152,16 +158,16 @@ def test_the_learner_finds_the_key_and_parameters_that_pay():
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         td = one_step_rows(learner, 1000)
     assert (td[keys.DISCRETE] == 1).float().mean() > 0.99
-    assert td["next", keys.REWARD].mean() > 0.98, "random presses earn about -0.3, the optimum 1"
+    assert td["next", keys.REWARD].mean() > 0.98, "random actions earn about -0.3, the optimum 1"
     assert scalars["scale"] < 0.5
 
 
-def test_parameters_stay_in_bounds_and_the_greedy_policy_draws_nothing():
+def test_parameters_stay_in_bounds_and_the_greedy_policy_samples_nothing():
     learner = make()
     td = TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500])
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    duration = learner.policy(td.clone())[keys.PARAMETERS]
-    assert (duration >= low).all() and (duration <= high).all()
+    parameters = learner.policy(td.clone())[keys.PARAMETERS]
+    assert (parameters >= low).all() and (parameters <= high).all()
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         acted = learner.policy(td.clone())
     with torch.no_grad():
@@ -170,17 +176,17 @@ def test_parameters_stay_in_bounds_and_the_greedy_policy_draws_nothing():
     assert set(learner.policy.out_keys) <= set(acted.keys(include_nested=True, leaves_only=True))
 
 
-def test_keys_are_drawn_with_their_probability_and_parameters_with_their_deviation():
+def test_the_policy_samples_from_its_distribution():
     learner = make()
     with torch.no_grad():
         learner.actor.discrete_head.bias.copy_(torch.tensor([0.6, 0.3, 0.1]).log())
     td = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(20_000, 4)}, [20_000]))
-    share = td[keys.DISCRETE].bincount(minlength=3) / 20_000
-    torch.testing.assert_close(share, torch.tensor([0.6, 0.3, 0.1]), atol=0.02, rtol=0)
+    frequency = td[keys.DISCRETE].bincount(minlength=3) / 20_000
+    torch.testing.assert_close(frequency, torch.tensor([0.6, 0.3, 0.1]), atol=0.02, rtol=0)
     torch.testing.assert_close(td[RAW].std(0), torch.full((3,), 0.5), atol=0.02, rtol=0)
 
 
-def test_keys_without_parameters_are_learned_like_others():
+def test_discrete_actions_without_parameters_are_learned_too():
     learner = make(PAMDPSpecs(4, (), (0, 0), (), ()))
     for _ in range(15):
         td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(512, 1, 4)}, [512, 1]))
@@ -192,7 +198,7 @@ def test_keys_without_parameters_are_learned_like_others():
     assert td[keys.PARAMETERS].shape == (512, 1, 0) and reward.mean() > 0.95
 
 
-def test_rates_fall_with_the_presses_of_the_whole_run():
+def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():
     learner = make(anneal_frames=200, minibatch_size=2)
     td = random_rows(learner, 50, 2)
     mask = everything(td)
@@ -206,7 +212,7 @@ def test_rates_fall_with_the_presses_of_the_whole_run():
     assert scales == pytest.approx([0.05, 0.0005**0.5, 0.01, 0.01])
 
 
-def test_too_few_rows_wait_for_more_and_survive_a_state_dict():
+def test_too_few_rows_wait_for_more_and_are_part_of_the_state_dict():
     learner, other = make(minibatch_size=150), make(minibatch_size=150)
     first, second = random_rows(learner, 50, 2), random_rows(learner, 50, 2)
     before = learner.actor.discrete_head.weight.clone()

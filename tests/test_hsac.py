@@ -1,4 +1,4 @@
-"""Hybrid SAC: densities, soft targets, actor loss, temperatures, and a problem with a known optimum."""
+"""Hybrid SAC: densities, soft targets, actor loss, temperatures, and learning a problem with a known optimum."""
 
 import math
 
@@ -8,17 +8,18 @@ from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import TanhNormal
-from toy_presses import SPECS, one_step_rows, sample, states
+from toy_steps import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
-from hpamdp.policies.low_level.hsac import HSAC, HybridDistribution
+from hpamdp.policies.low_level.hsac import HSAC
+from hpamdp.policies.shared.hybrid_actor import HybridDistribution
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
     hidden_dims=[64, 64], min_scale=0.01, max_scale=1.0, discrete_temperature=0.05, parameter_temperature=0.03,
-    tune_discrete_temperature=True, tune_parameter_temperature=True, discrete_target_entropy=0.1, parameter_target_entropy=-1.5,
-    temperature_lr=3e-3, warmup_frames=1000, buffer_size=20_000, batch_size=64, updates_per_frame=0.12,
-    policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
+    tune_discrete_temperature=True, tune_parameter_temperature=True, discrete_target_entropy=0.1,
+    parameter_target_entropy=-1.5, temperature_lr=3e-3, warmup_frames=1000, buffer_size=20_000, batch_size=64,
+    updates_per_frame=0.12, policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
 )  # fmt: skip
 
 
@@ -27,8 +28,9 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> HSAC:
 
 
 def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Tensor) -> float:
-    """Return the value of a single state `[1, 4]` for the parameters that the generator as it stands would draw."""
-    discrete_log_probs, mean, scale = learner.actor(state)
+    """Return the value of a single state `[1, 4]` for the parameters sampled with the generator's current state."""
+    discrete_log_probs, mean, log_scale, _ = learner.actor(state)
+    scale = log_scale.exp()
     raw = mean + scale * torch.randn_like(mean)
     pi, unit = discrete_log_probs.exp()[0], raw.tanh()[0].tolist()
     gaussian = torch.distributions.Normal(mean, scale).log_prob(raw)[0].tolist()
@@ -43,7 +45,7 @@ def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Ten
     return value
 
 
-def test_the_learner_finds_the_key_and_parameters_that_pay():
+def test_the_learner_finds_the_best_discrete_action_and_its_parameters():
     torch.manual_seed(0)
     learner = make()
     for _ in range(40):
@@ -51,16 +53,17 @@ def test_the_learner_finds_the_key_and_parameters_that_pay():
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)
     assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
-    assert rows["next", keys.REWARD].mean() > 0.9, "random presses earn about -0.2, key 2 alone 0.2, the optimum 1"
+    assert rows["next", keys.REWARD].mean() > 0.9, "random actions earn about -0.2, action 2 alone 0.2, the optimum 1"
 
 
 def test_densities_are_those_of_torchrls_squashed_gaussian_and_finite_at_the_bounds():
     mean, scale = torch.randn(64, 3), torch.rand(64, 3) + 0.1
-    unit, log_density = HybridDistribution(torch.zeros(64, 2), mean, scale).sample_parameters()
+    mask = SPECS.parameter_mask.float()
+    unit, log_density = HybridDistribution(torch.zeros(64, 3), mean, scale.log(), mask).sample_squashed()
     expected = TanhNormal(mean, scale, event_dims=0).log_prob(unit)
     torch.testing.assert_close(log_density, expected, rtol=1e-3, atol=1e-3)
-    far = HybridDistribution(torch.zeros(1, 2), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1))
-    assert far.sample_parameters()[1].isfinite().all()
+    far = HybridDistribution(torch.zeros(1, 3), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1).log(), mask)
+    assert far.sample_squashed()[1].isfinite().all()
 
 
 def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone():
@@ -75,7 +78,7 @@ def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone
     torch.testing.assert_close(learner._target(batch), batch["reward"])
 
 
-def test_stored_rows_are_discounted_by_0_at_termination_alone_and_those_of_others_dropped():
+def test_the_stored_discount_is_0_at_termination_alone_and_rows_of_other_learners_are_dropped():
     learner = make(warmup_frames=10_000)
     rows = one_step_rows(learner, 4).squeeze(-1)
     rows["next", keys.TERMINATED] = torch.tensor([[True], [False], [False], [True]])
@@ -86,7 +89,7 @@ def test_stored_rows_are_discounted_by_0_at_termination_alone_and_those_of_other
     torch.testing.assert_close(learner.buffer[:]["discount"], torch.tensor([0.0, 0.9, 0.9]))
 
 
-def test_the_actor_loss_equals_that_computed_by_hand_and_leaves_the_critics_alone():
+def test_the_actor_loss_equals_one_computed_by_hand_and_leaves_the_critics_alone():
     learner, state = make(), torch.randn(1, 4)
     torch.manual_seed(4)
     expected = -soft_value_by_hand(learner, learner.critics, state)
@@ -100,12 +103,12 @@ def test_the_actor_loss_equals_that_computed_by_hand_and_leaves_the_critics_alon
 
 
 @pytest.mark.parametrize("discrete", [0, 1, 2])
-def test_only_the_executed_keys_parameters_count_in_the_entropy(discrete):
+def test_only_the_executed_actions_own_parameters_count_in_the_entropy(discrete):
     learner, state = make(), torch.randn(64, 4)
     with torch.no_grad():
         learner.actor.net[-1].bias[:3] = 50.0 * torch.eye(3)[discrete]
     torch.manual_seed(5)
-    log_density = learner.actor(state).sample_parameters()[1]
+    log_density = learner.actor(state).sample_squashed()[1]
     torch.manual_seed(5)
     _, discrete_excess, parameter_excess = learner.soft_value(learner.critics, state)
     own = [[0], [1, 2], []][discrete]
@@ -116,7 +119,7 @@ def test_only_the_executed_keys_parameters_count_in_the_entropy(discrete):
 
 @pytest.mark.parametrize("excess", [0.5, -0.5])
 @pytest.mark.parametrize("is_tuned", [True, False])
-def test_a_temperature_falls_above_its_target_rises_below_and_stays_where_it_is_fixed(excess, is_tuned):
+def test_a_temperature_falls_above_its_target_rises_below_and_stays_if_fixed(excess, is_tuned):
     learner = make(tune_parameter_temperature=is_tuned)
     learner._update_temperatures(torch.tensor(-excess), torch.tensor(excess))
     discrete_weight, parameter_weight = (weight.item() for weight in learner.temperatures())
@@ -125,14 +128,14 @@ def test_a_temperature_falls_above_its_target_rises_below_and_stays_where_it_is_
     assert change * excess < -1e-6 if is_tuned else abs(change) < 1e-6
 
 
-def test_with_both_temperatures_fixed_updates_leave_them_as_they_are():
+def test_updates_leave_fixed_temperatures_unchanged():
     learner = make(tune_discrete_temperature=False, tune_parameter_temperature=False, policy_delay=1)
     before = learner.temperatures()
     learner.train_step(sample())
     assert learner.temperatures() == before
 
 
-def test_the_greedy_policy_draws_nothing_and_the_exploring_one_is_uniform_in_the_warm_up_alone():
+def test_the_greedy_policy_samples_nothing_and_the_exploring_one_is_uniform_in_the_warm_up_alone():
     learner, td = make(), states(2000)
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(td.clone())
@@ -144,11 +147,11 @@ def test_the_greedy_policy_draws_nothing_and_the_exploring_one_is_uniform_in_the
     learner.policy.is_random.fill_(False)
     with torch.no_grad():
         learner.actor.net[-1].bias[-3:] = -50.0  # the smallest deviation
-    drawn = SPECS.to_unit(learner.policy(td.clone())[keys.PARAMETERS])
-    assert (drawn - SPECS.to_unit(greedy[keys.PARAMETERS])).std() < 0.02
+    sampled = SPECS.to_unit(learner.policy(td.clone())[keys.PARAMETERS])
+    assert (sampled - SPECS.to_unit(greedy[keys.PARAMETERS])).std() < 0.02
 
 
-def test_keys_without_parameters_work():
+def test_discrete_actions_without_parameters_work():
     learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
     td = learner.policy(states(200))
     assert td[keys.PARAMETERS].shape == (200, 0)
@@ -168,11 +171,11 @@ def test_a_policy_takes_any_batch_shape_and_stays_in_bounds(is_random):
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
     for shape in ((), (3,), (3, 200)):
         td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(*shape, 4) * 30}, shape))
-        duration = td[keys.PARAMETERS]
-        assert td[keys.DISCRETE].shape == shape and duration.shape == (*shape, 3)
-        assert (duration >= low).all() and (duration <= high).all()
+        parameters = td[keys.PARAMETERS]
+        assert td[keys.DISCRETE].shape == shape and parameters.shape == (*shape, 3)
+        assert (parameters >= low).all() and (parameters <= high).all()
 
 
-def test_a_range_of_deviations_that_is_empty_is_refused():
+def test_an_empty_range_of_scales_is_refused():
     with pytest.raises(ValueError, match="min_scale"):
         make(min_scale=1.0)

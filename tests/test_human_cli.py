@@ -1,4 +1,4 @@
-"""`python -m hpamdp.data.human`: what it tells, what it writes, and how it refuses."""
+"""`python -m hpamdp.data.human`: what it prints, what it writes, and its errors."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ import pytest
 import synthetic_human
 from tensordict import TensorDict
 
-from hpamdp.data.human import cli as human
+from hpamdp.data.errors import DataError
+from hpamdp.data.human import cli
 from hpamdp.data.human.download import download
-from hpamdp.data.human.errors import HumanDataError
 from hpamdp.data.human.released_file import PATH_VARIABLE, read
 from hpamdp.data.human.transitions import transitions
 
@@ -31,16 +31,18 @@ def path(tmp_path_factory) -> Path:
     return synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat")
 
 
-def told(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    assert human.main([str(a) for a in arguments]) == 0
+def printed(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run the command line, which must succeed, and return its stdout."""
+    assert cli.main([str(a) for a in arguments]) == 0
     output = capsys.readouterr()
     assert not output.err
     return output.out
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Run the command line, which must fail in one line, and return that line."""
     try:
-        code = human.main([str(a) for a in arguments])
+        code = cli.main([str(a) for a in arguments])
     except SystemExit as end:
         code = end.code
     output = capsys.readouterr()
@@ -48,18 +50,18 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return output.err
 
 
-def test_check_and_summary_tell_what_is_in_a_file(capsys, path):
-    output = told(capsys, "check", path, "--any-file")
+def test_check_and_summary_print_what_a_file_holds(capsys, path):
+    output = printed(capsys, "check", path, "--any-file")
     assert "3 people, 210 episodes" in output and "the boat may still have been gliding" in output
-    output = told(capsys, "summary", path, "--any-file")
+    output = printed(capsys, "summary", path, "--any-file")
     assert re.search(r"^all +210 ", output, re.MULTILINE)
-    figures = json.loads(told(capsys, "summary", path, "--any-file", "--json"))
+    figures = json.loads(printed(capsys, "summary", path, "--any-file", "--json"))
     assert figures["all"]["episodes"] == 210 and len(figures["person"]) == 3
 
 
 @pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")
-def test_check_and_summary_of_the_released_file_are_the_tasks_facts(capsys):
-    output = told(capsys, "check")
+def test_check_and_summary_of_the_released_file_print_its_known_figures(capsys):
+    output = printed(capsys, "check")
     for line in (
         "40 people, 14400 episodes, 46757 presses",
         "without a press 15, with a single one 1823, completely logged 675",
@@ -69,7 +71,7 @@ def test_check_and_summary_of_the_released_file_are_the_tasks_facts(capsys):
         "98.1% of 427",
     ):
         assert line in output
-    output = told(capsys, "summary")
+    output = printed(capsys, "summary")
     for name, score, success in (
         ("all", "1.970", "86.0%"),
         ("congruent", "2.012", "86.5%"),
@@ -82,7 +84,7 @@ def test_check_and_summary_of_the_released_file_are_the_tasks_facts(capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (["check", "none.mat"], "there is no such file"),
         (["chek"], "invalid choice: 'chek'"),
@@ -90,18 +92,18 @@ def test_check_and_summary_of_the_released_file_are_the_tasks_facts(capsys):
         (["download"], "required: --url"),
     ],
 )
-def test_mistakes_cost_one_line(capsys, arguments, says):
-    assert says in refused(capsys, *arguments)
+def test_usage_errors_are_one_line(capsys, arguments, message):
+    assert message in error_of(capsys, *arguments)
 
 
-def test_altered_files_are_refused_in_one_line(capsys, path):
-    assert "truncated, altered or another file" in refused(capsys, "summary", path)
+def test_an_altered_file_is_refused_in_one_line(capsys, path):
+    assert "truncated, altered or another file" in error_of(capsys, "summary", path)
 
 
 def test_csv_and_npz_hold_both_tables(capsys, path, tmp_path):
     data = read(path, checksum=None)
-    told(capsys, "export", path, "--any-file", "--format", "csv", "--to", tmp_path / "tables")
-    told(capsys, "export", path, "--any-file", "--format", "npz", "--to", tmp_path / "tables.npz")
+    printed(capsys, "export", path, "--any-file", "--format", "csv", "--to", tmp_path / "tables")
+    printed(capsys, "export", path, "--any-file", "--format", "npz", "--to", tmp_path / "tables.npz")
     arrays = np.load(tmp_path / "tables.npz")
     for name, table in data._asdict().items():
         rows = list(csv.DictReader((tmp_path / "tables" / f"{name}.csv").open()))
@@ -112,9 +114,9 @@ def test_csv_and_npz_hold_both_tables(capsys, path, tmp_path):
             assert np.array_equal(written.reshape(values.shape), values.numpy().astype(np.float32), equal_nan=True)
 
 
-def test_memmap_holds_the_transitions_that_were_asked_for(capsys, path, tmp_path):
+def test_memmap_holds_the_selected_transitions(capsys, path, tmp_path):
     wanted = ("--complete", "--reward", "sparse", "--observation", "pixels")
-    told(capsys, "export", path, "--any-file", "--format", "memmap", "--to", tmp_path / "batch", *wanted)
+    printed(capsys, "export", path, "--any-file", "--format", "memmap", "--to", tmp_path / "batch", *wanted)
     data = read(path, checksum=None, one_frame=True)
     kept = data.episodes["complete"][data.presses["episode"]]
     batch = transitions(data, reward="sparse", observation="pixels")[kept]
@@ -127,7 +129,7 @@ def test_memmap_holds_the_transitions_that_were_asked_for(capsys, path, tmp_path
 def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, path, tmp_path, monkeypatch):
     target = tmp_path / "tables.npz"
     target.write_text("mine")
-    assert "exists" in refused(capsys, "export", path, "--any-file", "--format", "npz", "--to", target)
+    assert "exists" in error_of(capsys, "export", path, "--any-file", "--format", "npz", "--to", target)
     assert target.read_text() == "mine"
     (tmp_path / "full").mkdir()
 
@@ -136,9 +138,9 @@ def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, path, tmp_pa
 
     monkeypatch.setattr(np, "savez_compressed", fail)
     to = tmp_path / "full" / "tables.npz"
-    assert "No space left" in refused(capsys, "export", path, "--any-file", "--format", "npz", "--to", to)
+    assert "No space left" in error_of(capsys, "export", path, "--any-file", "--format", "npz", "--to", to)
     assert not list((tmp_path / "full").iterdir())
-    assert "best_people=4" in refused(
+    assert "best_people=4" in error_of(
         capsys, "export", path, "--any-file", "--format", "npz", "--to", to, "--best-people", 4
     )
 
@@ -146,8 +148,9 @@ def test_exports_overwrite_nothing_and_leave_nothing_behind(capsys, path, tmp_pa
 class Server(ThreadingHTTPServer):
     """Serves `body`; the first answer breaks off after `breaks_after` bytes."""
 
-    body, breaks_after, honours_range = b"", None, True
-    asked: list[str | None]
+    body: bytes
+    breaks_after: int | None = None
+    num_requests = 0
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -155,28 +158,27 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         server = self.server
-        asked = self.headers.get("Range")
-        server.asked.append(asked)
-        start = int(re.findall(r"\d+", asked)[0]) if asked and server.honours_range else 0
-        if start >= len(server.body):
-            self.send_error(416)
-            return
-        self.send_response(206 if start else 200)
-        self.send_header("Content-Length", str(len(server.body) - start))
+        server.num_requests += 1
+        is_broken = server.breaks_after is not None and server.num_requests == 1
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(server.body)))
         self.end_headers()
-        end = server.breaks_after if server.breaks_after and len(server.asked) == 1 else len(server.body)
-        self.wfile.write(server.body[start:end])
+        self.wfile.write(server.body[: server.breaks_after] if is_broken else server.body)
 
     def log_message(self, *_: object) -> None:
         pass
 
 
 @pytest.fixture
-def server(monkeypatch) -> Iterator[Server]:
+def without_proxies(monkeypatch) -> None:
     for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
         monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def server(without_proxies) -> Iterator[Server]:
     with Server(("127.0.0.1", 0), Handler) as server:
-        server.body, server.asked = np.random.default_rng(0).bytes(300_000), []
+        server.body = np.random.default_rng(0).bytes(300_000)
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         yield server
@@ -188,32 +190,44 @@ def address(server: Server) -> str:
     return f"http://127.0.0.1:{server.server_address[1]}/people.mat"
 
 
-@pytest.mark.parametrize("honours_range", [True, False])
-def test_an_interrupted_download_goes_on_where_it_stopped(server, tmp_path, honours_range):
-    server.breaks_after, server.honours_range = 100_000, honours_range
+def test_a_download_is_kept_and_not_fetched_again(server, tmp_path, capfd):
     target, checksum = tmp_path / "cache" / "people.mat", hashlib.sha256(server.body).hexdigest()
-    with pytest.raises(HumanDataError, match=r"broke after 100000 of 300000 bytes.*; 100000 bytes are kept"):
-        download(address(server), target, checksum=checksum)
-    assert not target.exists()
     assert download(address(server), target, checksum=checksum) == target
-    assert server.asked == [None, "bytes=100000-"]
     assert target.read_bytes() == server.body and list(target.parent.iterdir()) == [target]
     download(address(server), target, checksum=checksum)
-    assert len(server.asked) == 2
+    assert server.num_requests == 1
+    assert capfd.readouterr() == ("", "")  # no progress bar outside a terminal
 
 
-def test_a_download_of_another_file_is_thrown_away(server, tmp_path):
-    with pytest.raises(HumanDataError, match="truncated, altered or another file"):
-        download(address(server), tmp_path / "people.mat")
+def test_an_interrupted_download_leaves_nothing_and_the_next_one_fetches_the_whole_file(server, tmp_path):
+    server.breaks_after = 100_000
+    target, checksum = tmp_path / "cache" / "people.mat", hashlib.sha256(server.body).hexdigest()
+    with pytest.raises(DataError, match=r"cannot be fetched \(.*100000 bytes read, 200000 more expected"):
+        download(address(server), target, checksum=checksum)
+    assert not list(target.parent.iterdir())
+    assert download(address(server), target, checksum=checksum) == target
+    assert server.num_requests == 2
+    assert target.read_bytes() == server.body and list(target.parent.iterdir()) == [target]
+
+
+def test_a_download_of_another_file_is_thrown_away(server, tmp_path, capsys):
+    message = error_of(capsys, "download", "--url", address(server), "--to", tmp_path / "people.mat")
+    assert "does not match the known hash" in message
     assert not list(tmp_path.iterdir())
+
+
+def test_another_file_at_the_target_is_refused_and_kept(server, tmp_path):
+    target = tmp_path / "people.mat"
+    target.write_text("mine")
+    with pytest.raises(DataError, match="truncated, altered or another file"):
+        download(address(server), target)
+    assert target.read_text() == "mine" and server.num_requests == 0
 
 
 @pytest.mark.parametrize(
     "url", ["http://127.0.0.1:9/people.mat", "http://nowhere.invalid/a.mat", "nonsense", "http://"]
 )
-def test_a_download_without_a_network_says_so_in_one_line(capsys, tmp_path, monkeypatch, url):
-    for name in ("http_proxy", "HTTP_PROXY", "all_proxy", "ALL_PROXY"):
-        monkeypatch.delenv(name, raising=False)
-    message = refused(capsys, "download", "--url", url, "--to", tmp_path / "people.mat")
+def test_a_download_without_a_network_fails_in_one_line(capsys, tmp_path, without_proxies, url):
+    message = error_of(capsys, "download", "--url", url, "--to", tmp_path / "people.mat")
     assert "cannot be fetched" in message
     assert not (tmp_path / "people.mat").exists()

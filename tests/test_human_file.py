@@ -1,4 +1,4 @@
-"""The reader gives exactly what the recording holds, and of anything else one clear line."""
+"""The reader returns exactly what the recording holds, and refuses any other file in one line."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import scipy.io
 import synthetic_human
 import torch
 
+from hpamdp.data.errors import DataError
 from hpamdp.data.human import released_file
-from hpamdp.data.human.errors import HumanDataError
 from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.env.boatdock import harbour, physics
 
@@ -76,7 +76,7 @@ def test_tables_hold_what_scipy_reads(tmp_path):
 
 
 @needs_real
-def test_tables_hold_what_scipy_reads_of_the_released_file_and_it_takes_under_five_seconds():
+def test_tables_of_the_released_file_hold_what_scipy_reads_and_take_under_five_seconds():
     start = time.process_time()
     data = read(REAL)
     assert time.process_time() - start < 5.0
@@ -84,7 +84,7 @@ def test_tables_hold_what_scipy_reads_of_the_released_file_and_it_takes_under_fi
 
 
 @needs_real
-def test_released_file_is_as_described():
+def test_released_file_has_the_published_counts():
     episodes, presses = read(REAL)
     assert len(episodes) == 14_400 and len(presses) == 46_757
     assert (episodes["person"].bincount() == 360).all() and len(episodes["person"].unique()) == 40
@@ -109,7 +109,7 @@ def test_one_frame_moves_every_point_to_the_environments_centre(tmp_path):
 
 
 def refusal(path: Path, **arguments: str | None) -> str:
-    with pytest.raises(HumanDataError) as caught:
+    with pytest.raises(DataError) as caught:
         read(path, **arguments)
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 1000
     return str(caught.value)
@@ -122,7 +122,7 @@ def test_a_file_that_is_not_the_released_one_is_refused_by_its_checksum(tmp_path
     assert "Is a directory" in refusal(tmp_path)
 
 
-def test_default_path_is_the_environment_variables_then_the_caches(monkeypatch, tmp_path):
+def test_default_path_is_that_of_the_environment_variable_or_in_the_cache(monkeypatch, tmp_path):
     monkeypatch.setenv(released_file.PATH_VARIABLE, str(tmp_path / "mine.mat"))
     assert released_file.default_path() == tmp_path / "mine.mat"
     monkeypatch.delenv(released_file.PATH_VARIABLE)
@@ -146,15 +146,15 @@ def damaged(data: bytes, case: int, rng: np.random.Generator) -> bytes:
 
 
 @pytest.mark.parametrize("form", ["compressed", "plain"])
-def test_damaged_files_are_refused_or_still_fit_together(small, tmp_path, form):
-    """300 cases a form; where the damage falls on what the file says but once, the tables are still well formed."""
+def test_damaged_files_are_refused_or_still_consistent(small, tmp_path, form):
+    """300 cases of each form. Where the damaged values are not redundant, the tables are still well formed."""
     data, path = small[form == "plain"], tmp_path / "damaged.mat"
     rng, refused = np.random.default_rng(0), 0
     for case in range(300):
         path.write_bytes(damaged(data, case, rng))
         try:
             episodes, presses = read(path, checksum=None)
-        except HumanDataError as error:
+        except DataError as error:
             assert "\n" not in str(error)
             refused += 1
             continue
@@ -236,7 +236,7 @@ def test_foreign_files_are_refused(tmp_path, data):
 WRONG = {
     "R": ("R is not the harbour's radius", lambda v: v - 1),
     "outcome": ("outcome is not 1, 2, 3 or 4", lambda v: v + 4),
-    "tank": ("tank is no number of frames", lambda v: v + 361),
+    "tank": ("tank is not a number of frames", lambda v: v + 361),
     "boatchoice": ("boatchoice is not 0 or 1", lambda v: v + 2),
     "incongkm": ("incongkm is not 1 or 2", lambda v: v + 2),
     "boatdir": ("boatdir are not the directions", lambda v: -v),
@@ -246,14 +246,14 @@ WRONG = {
     "gas": ("gas does not follow", lambda v: v - 0.01),
     "velocity": ("velocity does not follow", lambda v: v * 1.01),
     "obs": ("does not follow from its position", lambda v: v + 0.01),
-    "actions": ("has not exactly one key", lambda v: v + 0.01),
+    "actions": ("does not have exactly one key", lambda v: v + 0.01),
     "next_obs": ("", lambda v: v + 0.01),
     "terminals": ("terminals does not mark the final press", lambda v: v[:, ::-1]),
 }
 
 
 @pytest.mark.parametrize("field", WRONG)
-def test_a_field_that_does_not_fit_is_named_with_its_episode(tmp_path, field):
+def test_a_field_that_breaks_a_rule_is_named_with_its_episode(tmp_path, field):
     people = synthetic_human.recording()
     index = next(i for i, episode in enumerate(people[1]) if episode["gas"].size > 2)
     rule, alter = WRONG[field]
@@ -270,7 +270,9 @@ def test_missing_fields_and_wrong_sizes_are_named(tmp_path):
     )
     people = synthetic_human.recording()
     people[0][2]["SG"] = np.zeros((1, 3))
-    assert "SG has 3 numbers, but 4" in refusal(synthetic_human.write(tmp_path / "a.mat", people), checksum=None)
+    assert "SG has 3 numbers, but must have 4" in refusal(
+        synthetic_human.write(tmp_path / "a.mat", people), checksum=None
+    )
 
 
 def test_people_who_never_pressed_a_key_are_read(tmp_path):

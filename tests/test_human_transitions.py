@@ -1,4 +1,4 @@
-"""People's presses as a batch are what BoatDockEnv would have given for the same layouts and actions."""
+"""The recorded presses as transitions are those of BoatDockEnv for the same layouts and actions."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
+from hpamdp.data.demonstrations import TRAJECTORY
+from hpamdp.data.errors import DataError
 from hpamdp.data.human import minari
 from hpamdp.data.human.dataset import HumanExperienceReplay, slices, whole_episodes
-from hpamdp.data.human.episodes import keep, scores_of_people, select
-from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.human.episodes import keep, scores_by_person, select
 from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
-from hpamdp.data.human.transitions import TRAJECTORY, transitions
+from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.episode import FUEL
 from hpamdp.env.decisions import with_decisions
 
 REAL = os.environ.get(PATH_VARIABLE)
@@ -37,7 +39,7 @@ def data(path) -> HumanData:
 
 
 def replayed(data: HumanData, **arguments) -> list[TensorDict]:
-    """Play the logged presses of the episodes through the environment; return one batch `[rows]` a press number."""
+    """Play the logged presses in the environment; return a batch of those with each number in their episodes."""
     episodes = data.episodes
     env = BoatDockEnv(len(episodes), **arguments)
     names = ("start", "goal", "keymap") if env.has_choice else ("start", "goal", "keymap", "controller")
@@ -57,14 +59,14 @@ def replayed(data: HumanData, **arguments) -> list[TensorDict]:
 
 
 def is_fully_logged(data: HumanData) -> torch.Tensor:
-    # Of a short press too little is missing to tell by the tank.
+    # Where the missing press is short, the tank does not show it.
     return (data.episodes["index"] % 7 != 3) & data.episodes["complete"]
 
 
 @pytest.mark.parametrize("reward", ["paper", "sparse"])
 @pytest.mark.parametrize("observation", ["scaled", "pixels"])
 @pytest.mark.parametrize("controller", ["choose", "random"])
-def test_batch_is_what_the_environment_gives_for_the_same_presses(data, reward, observation, controller):
+def test_transitions_are_those_of_the_environment_for_the_same_presses(data, reward, observation, controller):
     data = keep(data, is_fully_logged(data))
     batch = transitions(data, reward=reward, observation=observation, has_choice=controller == "choose")
     for number, rows in enumerate(replayed(data, controller=controller, reward=reward, observation=observation)):
@@ -80,7 +82,7 @@ def test_batch_is_what_the_environment_gives_for_the_same_presses(data, reward, 
             assert torch.equal(ours["next", name], rows["next", name]), name
 
 
-def test_batch_has_the_environments_keys_shapes_and_types(data):
+def test_transitions_have_the_environments_keys_shapes_and_types(data):
     env = with_decisions(BoatDockEnv(2))
     rollout = env.rollout(2, auto_reset=True)
     batch = transitions(data)
@@ -91,7 +93,7 @@ def test_batch_has_the_environments_keys_shapes_and_types(data):
         assert batch[name].dtype == value.dtype and batch[name].shape[1:] == value.shape[2:], name
 
 
-def test_decisions_options_and_trajectories_mark_the_episodes(data):
+def test_decisions_options_and_trajectories_follow_the_episodes(data):
     batch = transitions(data)
     episode = data.presses["episode"]
     assert torch.equal(batch[TRAJECTORY], episode)
@@ -108,7 +110,7 @@ def test_decisions_options_and_trajectories_mark_the_episodes(data):
     assert torch.equal(batch[keys.PARAMETERS].count_nonzero(1), torch.ones(len(batch), dtype=torch.long))
 
 
-def test_fuel_counts_logged_presses_until_the_recorded_tank_says_what_was_left(data):
+def test_fuel_is_a_tank_less_the_logged_presses_and_at_the_end_the_recorded_tank(data):
     batch = transitions(data)
     for number in range(len(data.episodes)):
         rows = batch[batch[TRAJECTORY] == number]
@@ -116,20 +118,20 @@ def test_fuel_counts_logged_presses_until_the_recorded_tank_says_what_was_left(d
             assert data.episodes["presses"][number] == 0
             continue
         spent = rows[keys.PARAMETERS].sum(1).cumsum(0)
-        torch.testing.assert_close(rows["next", keys.FUEL][:-1, 0], 1 - spent[:-1] / physics.TANK, atol=1e-5, rtol=0)
-        assert rows[keys.FUEL][0] == 1.0
-        assert rows["next", keys.FUEL][-1, 0] == pytest.approx(data.episodes["tank"][number].item() / 360)
+        torch.testing.assert_close(rows["next", FUEL][:-1, 0], 1 - spent[:-1] / physics.TANK, atol=1e-5, rtol=0)
+        assert rows[FUEL][0] == 1.0
+        assert rows["next", FUEL][-1, 0] == pytest.approx(data.episodes["tank"][number].item() / 360)
 
 
-def test_only_one_frame_and_known_forms_are_taken(path, data):
-    with pytest.raises(HumanDataError, match="one_frame=True"):
+def test_two_frames_and_unknown_rewards_are_refused(path, data):
+    with pytest.raises(DataError, match="one_frame=True"):
         transitions(read(path, checksum=None))
-    with pytest.raises(HumanDataError, match="reward='dense', but must be one of paper, sparse"):
+    with pytest.raises(DataError, match="reward='dense', but must be one of paper, sparse"):
         transitions(data, reward="dense")
 
 
 @needs_real
-def test_people_see_the_environments_first_observation_and_glide_near_its_later_ones():
+def test_first_observations_are_the_environments_and_second_ones_are_near_it():
     data = read(REAL, one_frame=True)
     data = select(data, complete=True)
     batch = transitions(data)
@@ -138,19 +140,19 @@ def test_people_see_the_environments_first_observation_and_glide_near_its_later_
         ours = batch[data.presses["press"] == number]
         if number == 0:
             assert torch.equal(ours[keys.OBSERVATION], rows[keys.OBSERVATION])
-        if number == 1:  # both boats began at the start; the next press cuts people's glide short
+        if number == 1:  # both boats began at the start, but the recorded glide was cut short by the next press
             near.append((ours[keys.OBSERVATION][:, 8:10] - rows[keys.OBSERVATION][:, 8:10]).norm(dim=1))
     near = torch.cat(near) * physics.HARBOUR_RADIUS
     assert near.median() < 8.0 and near.quantile(0.9) < 20.0
 
 
 @needs_real
-def test_all_of_peoples_transitions_are_finite_and_start_as_the_environment_starts():
+def test_all_recorded_transitions_are_finite_and_start_as_the_environment_does():
     data = read(REAL, one_frame=True)
     batch = transitions(data)
     assert len(batch) == 46_757
     assert all(value.isfinite().all() for value in batch.values(True, True))
-    # Of five episodes not even the first press was logged: the boat is already on its way.
+    # In five episodes not even the first press was logged, so the boat is already on its way.
     first = batch[batch[keys.IS_DECISION].squeeze(-1)][keys.OBSERVATION]
     assert (first[:, :2] != first[:, 8:10]).any(1).sum() == 5
     success = batch["next", keys.OUTCOME] == physics.SUCCESS
@@ -160,25 +162,25 @@ def test_all_of_peoples_transitions_are_finite_and_start_as_the_environment_star
 
 def test_selected_episodes_meet_every_condition_and_keep_their_presses(data):
     chosen = select(data, complete=True, successes=True, best_people=1, controller="congruent")
-    best = int(scores_of_people(data).argmax())
+    best = int(scores_by_person(data).argmax())
     assert (chosen.episodes["person"] == best).all() and chosen.episodes["complete"].all()
     assert (chosen.episodes["outcome"] == physics.SUCCESS).all() and (chosen.episodes["controller"] == 1).all()
     assert torch.equal(chosen.presses["episode"].bincount(minlength=len(chosen.episodes)), chosen.episodes["presses"])
     of = data.episodes[data.presses["episode"]]
     kept = (of["person"] == best) & of["complete"] & (of["outcome"] == physics.SUCCESS) & (of["controller"] == 1)
     assert torch.equal(chosen.presses["duration"], data.presses["duration"][kept])
-    with pytest.raises(HumanDataError, match="best_people=9, but must be 1 to 3"):
+    with pytest.raises(DataError, match="best_people=9, but must be 1 to 3"):
         select(data, best_people=9)
 
 
-def test_replay_buffer_is_memory_mapped_shared_and_whole(path, tmp_path, data):
+def test_replay_buffer_is_memory_mapped_and_complete(path, tmp_path, data):
     arguments = dict(path=path, root=tmp_path, checksum=None)
     buffer = HumanExperienceReplay(32, reward="sparse", **arguments)
     assert len(buffer) == len(data.presses) and buffer.sample().shape == (32,)
     assert buffer[:].exclude("index")[keys.OBSERVATION].equal(transitions(data)[keys.OBSERVATION])
     assert (buffer.data_path / "observation.memmap").exists()
     assert [folder.name for folder in tmp_path.iterdir()] == [buffer.data_path.name]
-    with pytest.raises(HumanDataError):
+    with pytest.raises(DataError):
         HumanExperienceReplay(32, best_people=9, **arguments)
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -188,7 +190,7 @@ def test_replay_buffer_made_once_is_found_again(path, tmp_path):
     made = HumanExperienceReplay(4, path=path, root=tmp_path, checksum=checksum, complete=True)
     found = HumanExperienceReplay(4, path="nowhere", root=tmp_path, checksum=checksum, complete=True)
     assert found.data_path == made.data_path and len(found) == len(made)
-    with pytest.raises(HumanDataError, match="no such file"):
+    with pytest.raises(DataError, match="no such file"):
         HumanExperienceReplay(4, path="nowhere", root=tmp_path, checksum=checksum, complete=False)
 
 
@@ -207,7 +209,7 @@ def test_replay_buffer_samples_whole_episodes_and_slices(path, tmp_path, data):
 
 
 @pytest.mark.parametrize("has_choice", [True, False])
-def test_minari_gives_back_what_it_was_given(data, tmp_path, monkeypatch, has_choice):
+def test_minari_returns_the_exported_transitions(data, tmp_path, monkeypatch, has_choice):
     library = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     batch = transitions(select(data, complete=True, best_people=1), has_choice=has_choice)
@@ -219,12 +221,14 @@ def test_minari_gives_back_what_it_was_given(data, tmp_path, monkeypatch, has_ch
     assert library.load_dataset("hpamdp/people-v0").recover_environment().unwrapped.spec.id == "hpamdp/BoatDock-v0"
     loaded = minari.load("hpamdp/people-v0")
     assert set(loaded.keys(True, True)) == set(batch.keys(True, True))
-    loaded[TRAJECTORY] = batch[TRAJECTORY].unique()[loaded[TRAJECTORY]]  # episodes without a press have no number there
+    loaded[TRAJECTORY] = batch[TRAJECTORY].unique()[
+        loaded[TRAJECTORY]
+    ]  # episodes without a press are not counted there
     for name, value in batch.items(True, True):
         assert loaded[name].dtype == value.dtype and torch.equal(loaded[name], value), name
-    with pytest.raises(HumanDataError, match="minari delete hpamdp/people-v0"):
+    with pytest.raises(DataError, match="minari delete hpamdp/people-v0"):
         minari.export(batch, "hpamdp/people-v0")
-    with pytest.raises(HumanDataError, match="no data set of people's presses"):
+    with pytest.raises(DataError, match="hpamdp/nobody-v0: cannot be read as transitions"):
         minari.load("hpamdp/nobody-v0")
-    with pytest.raises(HumanDataError, match="it must be like hpamdp/people-v0"):
+    with pytest.raises(DataError, match="it must be like namespace/name-v0"):
         minari.export(batch, "people")

@@ -1,4 +1,4 @@
-"""Linear contextual bandits: features, predictions and their deviations, and what they learn of who pays where."""
+"""Linear contextual bandits: features, predictions, and that they learn which option is better where."""
 
 import itertools
 
@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_bandits import SPECS, against_sign, by_sign, constant, due, ended, play
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, build
+from hpamdp.config import ConfigError, component
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
 from hpamdp.policies.shared.context import ContextFeatures, LinearBandit
@@ -17,7 +17,14 @@ from hpamdp.specs import PAMDPSpecs
 MEMORIES = ("all", "discounted", "sliding_window")
 BANDITS = {"linucb": LinUCB, "lin_thompson": LinThompson}
 OPTIONS = dict(
-    exploration=1.0, inputs=None, features="polynomial", degree=2, ridge=1.0, memory="all", discount=0.998, window=500
+    exploration=1.0,
+    inputs=None,
+    features="polynomial",
+    degree=2,
+    ridge=1.0,
+    memory="all",
+    discount=0.998,
+    window=500,
 )
 every_bandit = pytest.mark.parametrize("name", BANDITS)
 every_memory = pytest.mark.parametrize("memory", MEMORIES)
@@ -32,9 +39,11 @@ def wide(observation_dim: int) -> PAMDPSpecs:
 
 
 def teach(bandit: LinearBandit, num: int, at_once: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Let the bandit learn `num` random decisions; return their observations, options and payoffs."""
+    """Let the bandit learn `num` random decisions; return their observations, options and rewards."""
     torch.manual_seed(0)
-    observation, option, reward = torch.rand(num, 2) * 2 - 1, torch.randint(2, (num,)), torch.randn(num)
+    observation = torch.rand(num, 2) * 2 - 1
+    option = torch.randint(2, (num,))
+    reward = torch.randn(num)
     for rows in torch.arange(num).split(at_once):
         bandit.learn(ended(due(observation[rows], option=option[rows]), reward[rows]))
     return observation, option, reward
@@ -56,19 +65,19 @@ def test_polynomial_features_are_all_monomials_up_to_the_degree(num_inputs, degr
     torch.testing.assert_close(found.pow(2).sum(-1), expected.pow(2).sum(-1))
 
 
-def test_random_fourier_features_are_cosines_and_a_constant_and_the_same_in_every_run():
+def test_random_fourier_features_approximate_the_gaussian_kernel_and_are_the_same_in_every_run():
     torch.manual_seed(0)
     first = ContextFeatures(wide(3), None, "random_fourier", 200)
     torch.manual_seed(1)
     second = ContextFeatures(wide(3), None, "random_fourier", 200)
     x, y = torch.zeros(1, 3), torch.tensor([[0.6, 0.0, 0.0]])
     assert torch.equal(first(x), second(x)) and first(x).shape == (1, 201) and first(x)[0, -1] == 1.0
-    # The product of two feature vectors stands for the Gaussian kernel, exp(-|x - y|^2 / 2).
+    # Twice the mean product of two cosines approximates the Gaussian kernel exp(-|x - y|^2 / 2).
     kernel = (first(x)[0, :-1] * first(y)[0, :-1]).mean() * 2
     assert kernel.item() == pytest.approx(torch.tensor(-(0.6**2) / 2).exp().item(), abs=0.15)
 
 
-def test_only_the_inputs_are_seen():
+def test_features_use_only_the_inputs():
     features = ContextFeatures(wide(4), [2, 0], "polynomial", 1)
     assert features(torch.tensor([5.0, 6.0, 7.0, 8.0])).tolist() == [7.0, 5.0, 1.0]
 
@@ -84,10 +93,10 @@ def test_only_the_inputs_are_seen():
         ({"features": "cubic"}, "high.features=\"cubic\": must be 'polynomial' or 'random_fourier'"),
     ],
 )
-def test_features_that_cannot_be_are_refused_in_one_line(changes, complaint):
+def test_impossible_features_are_refused_in_one_line(changes, complaint):
     target = {"_target_": "hpamdp.policies.high_level.linucb.LinUCB"}
     with pytest.raises(ConfigError) as error:
-        build("high", target | OPTIONS | changes, specs=SPECS)
+        component("high", "linucb", target | OPTIONS | changes).build(specs=SPECS)
     assert complaint in str(error.value) and "\n" not in str(error.value)
 
 
@@ -96,7 +105,7 @@ def test_features_that_cannot_be_are_refused_in_one_line(changes, complaint):
 
 @every_memory
 @pytest.mark.parametrize("at_once", [1, 7, 60])
-def test_predictions_and_deviations_are_those_of_a_ridge_regression(memory, at_once):
+def test_predictions_and_their_deviations_are_those_of_a_ridge_regression(memory, at_once):
     bandit = make("linucb", ridge=0.5, memory=memory, discount=0.9, window=25)
     observation, option, reward = teach(bandit, 60, at_once)
     weight = torch.ones(60).double()
@@ -107,7 +116,8 @@ def test_predictions_and_deviations_are_those_of_a_ridge_regression(memory, at_o
     x, y = bandit.features(observation), reward.double()
     probe = torch.rand(9, 2) * 2 - 1
     mean, deviation = bandit.predict(probe)
-    squares, spread = 0.0, []
+    squares = 0.0
+    spread = []
     for i in (0, 1):
         w = weight * (option == i)
         a = x.T @ (w.unsqueeze(-1) * x) + 0.5 * torch.eye(6).double()
@@ -121,12 +131,13 @@ def test_predictions_and_deviations_are_those_of_a_ridge_regression(memory, at_o
 
 @every_bandit
 @pytest.mark.parametrize("degree", [1, 3])
-def test_observations_in_pixels_are_no_trouble(name, degree):
+def test_observations_may_be_in_pixels(name, degree):
     torch.manual_seed(0)
     bandit = BANDITS[name](wide(6), **{**OPTIONS, "degree": degree})
     observation = torch.rand(2000, 6) * torch.tensor([1280.0, 1024.0, 1280.0, 1024.0, 0.0, 0.0])
-    observation[:, 4:] = torch.tensor([640.0, 512.0])  # the harbour's centre, in every observation
-    option, right = torch.randint(2, (2000,)), (observation[:, 0] - observation[:, 2]) / 300.0
+    observation[:, 4:] = torch.tensor([640.0, 512.0])  # the same in every observation
+    option = torch.randint(2, (2000,))
+    right = (observation[:, 0] - observation[:, 2]) / 300.0
     bandit.learn(ended(due(observation, option=option), torch.where(option == 1, right, -right)))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         chosen = bandit.select(due(observation))
@@ -136,7 +147,7 @@ def test_observations_in_pixels_are_no_trouble(name, degree):
 # Choices.
 
 
-def test_linucb_adds_the_width_and_greedily_does_not():
+def test_linucb_adds_the_width_only_if_it_explores():
     bandit = make("linucb", exploration=3.0)
     teach(bandit, 20, 20)
     probe = torch.rand(500, 2) * 2 - 1
@@ -158,7 +169,7 @@ def test_lin_thompson_chooses_an_option_as_often_as_it_is_likely_to_be_the_best(
 
 
 @every_bandit
-def test_options_without_payoffs_come_first_and_are_shared_evenly(name):
+def test_untried_options_come_first_and_in_random_order(name):
     torch.manual_seed(0)
     bandit = make(name)
     assert 20 <= bandit.select(due(torch.rand(100, 2))).sum().item() <= 80
@@ -167,15 +178,15 @@ def test_options_without_payoffs_come_first_and_are_shared_evenly(name):
 
 
 @every_bandit
-def test_who_pays_where_is_learned_where_either_option_alone_is_worth_nothing(name):
+def test_bandits_learn_which_option_is_better_where(name):
     torch.manual_seed(0)
     _, regret = play(make(name, degree=3), by_sign, 3000, 8, noise=0.5)
-    # Always the same option costs 1.
+    # The regret of always the same option is 1.
     assert regret[-500:].mean() < 0.15
 
 
 @every_bandit
-def test_forgetting_bandits_follow_a_flip_of_who_pays_where_and_others_lag(name):
+def test_bandits_that_forget_follow_a_swap_of_the_better_options_and_others_lag(name):
     after = {}
     for memory in MEMORIES:
         torch.manual_seed(0)
@@ -188,19 +199,21 @@ def test_forgetting_bandits_follow_a_flip_of_who_pays_where_and_others_lag(name)
 
 
 @every_bandit
-def test_regret_on_a_linear_problem_grows_far_slower_than_time(name):
-    weights, horizon, curves = torch.tensor([[0.5, 0.0], [-0.5, 0.3]]), 2000, []
+def test_regret_on_a_linear_problem_grows_far_more_slowly_than_time(name):
+    weights = torch.tensor([[0.5, 0.0], [-0.5, 0.3]])
+    horizon = 2000
+    curves = []
     for seed in range(3):
         torch.manual_seed(seed)
         curves.append(play(make(name, degree=1), lambda x: x @ weights.T, 4 * horizon, 16, noise=0.5)[1].cumsum(0))
     regret = torch.stack(curves).mean(0)
     assert regret[horizon - 1] < 0.02 * horizon
-    assert regret[-1] / regret[horizon - 1] < 2.4  # of sqrt(T) log T: 2.4
+    assert regret[-1] / regret[horizon - 1] < 2.4  # sqrt(T) log(T) grows by 2.4
 
 
 @every_bandit
 @every_memory
-def test_a_copy_made_of_a_state_dict_goes_on_identically(name, memory):
+def test_a_copy_made_from_a_state_dict_continues_identically(name, memory):
     torch.manual_seed(0)
     source, target = make(name, memory=memory), make(name, memory=memory)
     play(source, constant(0.0, 1.0), 50)
@@ -214,6 +227,6 @@ def test_a_copy_made_of_a_state_dict_goes_on_identically(name, memory):
 def test_the_context_is_the_observation_at_which_the_option_was_chosen():
     bandit = make("linucb", degree=1)
     decisions = ended(due(torch.ones(4, 2), option=torch.zeros(4, dtype=torch.long)), torch.ones(4))
-    decisions[keys.OBSERVATION] = torch.full((4, 2), 9.0)  # of the option's last step
+    decisions[keys.OBSERVATION] = torch.full((4, 2), 9.0)  # at the option's last step
     bandit.learn(decisions)
     torch.testing.assert_close(bandit.gram[0], torch.full((3, 3), 4.0).double())

@@ -1,20 +1,16 @@
 import csv
 import io
-import time
 
 import pytest
 import wandb
 
-from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised, references
-from hpamdp.run.metrics import (
-    CSVLogger,
-    MetricsFile,
-    TensorboardLogger,
-    WandbLogger,
-    closing_table,
-    duration,
-    read_rows,
-)
+from hpamdp.env.base import Metric, PAMDPEnv
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised, human_references
+from hpamdp.messages import duration
+from hpamdp.run.closing_table import closing_table
+from hpamdp.run.loggers import CSVLogger, TensorboardLogger, WandbLogger
+from hpamdp.run.metrics import MetricsFile, read_rows
 
 
 @pytest.fixture
@@ -137,11 +133,9 @@ def test_every_logger_takes_a_run(tmp_path, without_login):
 
 
 def test_wandb_auto_without_login_makes_an_offline_run_under_the_output_folder(tmp_path, without_login, capfd):
-    began = time.monotonic()
     logger = wandb_logger(tmp_path, "auto")
     assert logger.is_offline
     log_a_run(logger, tmp_path)
-    assert time.monotonic() - began < 30
     assert list(tmp_path.glob("wandb/offline-run-*/*.wandb"))
     assert capfd.readouterr() == ("", "")
 
@@ -168,25 +162,32 @@ def test_wandb_finds_a_key_in_netrc_and_goes_offline_when_nobody_answers(tmp_pat
     (tmp_path / "netrc").write_text(f"machine 127.0.0.1:9 login user password {'0' * 40}\n")
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
-    monkeypatch.setattr("hpamdp.run.metrics._WANDB_START", 2.0)
-    began = time.monotonic()
+    monkeypatch.setattr("hpamdp.run.loggers._WANDB_START", 2.0)
     logger = wandb_logger(tmp_path, "auto")
-    assert logger.is_offline and time.monotonic() - began < 20
+    assert logger.is_offline
     (warning,) = capsys.readouterr().err.splitlines()
     assert "could not start online" in warning and "Timed out" in warning
     logger.close()
 
 
-def test_the_closing_table_sets_this_agent_beside_random_people_and_the_ceiling():
+def test_an_unknown_wandb_mode_is_refused_by_its_name(tmp_path, without_login, monkeypatch):
+    monkeypatch.setenv("WANDB_MODE", "foo")
+    with pytest.raises(ValueError, match="WANDB_MODE=foo: must be one of online, offline, disabled"):
+        wandb_logger(tmp_path, "auto")
+
+
+def test_the_closing_table_sets_this_agent_beside_the_references_in_their_order():
+    ceiling = {"score": 3.6, "success": 1.0, "oracle_agreement": 1.0}
     table = closing_table(
         {
             "score": 3.2,
             "success": 0.97,
             "oracle_agreement": 0.9,
-            "references": {"random": {"score": -0.93}, "ceiling": 3.6},
+            "references": {"ceiling": ceiling, **human_references("chosen"), "random": {"score": -0.93}},
             "frames": 1_000_000,
             "wall_s": 754.2,
-        }
+        },
+        BoatDockEnv.table_metrics,
     )
     head, score, success, agreement, effort = table.splitlines()
     assert head.split("   ")[-5:] == ["this agent", "random", "people", "best person", "ceiling"]
@@ -204,32 +205,32 @@ def test_human_normalised_is_0_for_random_presses_and_1_for_people_with_the_same
     assert human_normalised(3.0, "random") == human_normalised(3.0)
 
 
-def test_the_closing_table_normalises_the_references_where_the_agent_is():
-    figures = {"score": 3.2, "controller": "congruent", "references": {"random": -0.925}}
-    assert "people 1" not in closing_table(figures)
-    row = closing_table(figures | {"human_normalised": 1.4}).splitlines()[2]
-    assert row.split() == ["random", "0,", "people", "1", "1.400", "0.000", "1.000", "1.344", "1.479"]
+def test_the_closing_table_shows_what_the_environment_asks_for_and_any_reference():
+    metrics = [Metric("laps", "laps", "count"), Metric("score", "score")]
+    table = closing_table({"score": 0.5, "laps": 2.0, "references": {"record": {"laps": 3.0}}}, metrics)
+    assert [line.split() for line in table.splitlines()] == [
+        ["this", "agent", "record"],
+        ["laps", "2.00", "3.00"],
+        ["score", "0.500"],
+    ]
 
 
 def test_the_closing_table_leaves_out_what_is_not_known():
-    table = closing_table(
-        {"score": 0.5, "oracle_agreement": float("nan"), "references": {"human": None, "ceiling": None}}
-    )
+    table = closing_table({"score": 0.5, "success": float("nan"), "references": {}}, PAMDPEnv.table_metrics)
     assert table.splitlines() == ["        this agent", "score        0.500"]
-    assert closing_table({}) == ""
-    assert closing_table({"option_congruent": 1.0, "controller": "congruent"}) == ""
+    assert closing_table({}, PAMDPEnv.table_metrics) == ""
 
 
 def test_numbers_in_the_table_are_never_minus_zero_and_times_are_in_words():
-    assert closing_table({"optimality_gap": -1e-5, "references": {"human": None, "ceiling": None}}).endswith(" 0.000")
+    assert closing_table({"optimality_gap": -1e-5}, PAMDPEnv.table_metrics).endswith(" 0.000")
     assert [duration(s) for s in (0.51, 59.97, 754.2, 7230.0)] == ["0.5 s", "1 min 00 s", "12 min 34 s", "2 h 00 min"]
 
 
-def test_references_follow_the_controller_and_give_way_to_the_run_s_own():
-    assert references({"controller": "congruent"})["ceiling"]["score"] == 3.42
-    assert references({"controller": "random"})["human"].items() >= HUMAN["chosen"].items()
-    own = references({"references": {"human": 1.5, "ceiling": {"score": 3.7}}})
-    assert own["human"].items() >= {**HUMAN["chosen"], "score": 1.5}.items()
-    assert own["ceiling"] == {"score": 3.7, "human_normalised": human_normalised(3.7)}
-    with pytest.raises(ValueError, match="controller"):
-        references({"controller": "both"})
+def test_the_references_of_boats_follow_the_controller():
+    chosen, held = BoatDockEnv(2), BoatDockEnv(2, controller="congruent")
+    ceiling = chosen.references({"ceiling": 3.6})["ceiling"]
+    assert ceiling["oracle_agreement"] == 1.0 and ceiling["human_normalised"] == human_normalised(3.6)
+    beside = held.references({"ceiling": 3.4})
+    assert list(beside) == ["human", "best_person", "ceiling"]
+    assert beside["human"].items() >= HUMAN["congruent"].items() and "oracle_agreement" not in beside["ceiling"]
+    assert human_references("random")["human"].items() >= HUMAN["chosen"].items()

@@ -1,16 +1,16 @@
-"""Learners that learn from people's presses: what they make of them, and what a run makes of the settings."""
+"""Learning from data sets: what the learners and selectors make of human data, and which configs are refused."""
 
 import json
 
 import pytest
 import synthetic_human
 import torch
-from conftest import compose_config
+from conftest import compose_config, make_config
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, run_config
+from hpamdp.config import ConfigError
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.released_file import read
 from hpamdp.data.human.rest_to_rest import TAP, to_rest_to_rest
@@ -31,25 +31,25 @@ SMALL += ["eval.layouts=10", "low.batch_size=16"]
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory) -> str:
-    return str(synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat"))
+    return str(synthetic_human.write(tmp_path_factory.mktemp("human") / "human.mat"))
 
 
-def presses(path: str, rest_to_rest: bool = False, **env):
+def human_batch(path: str, rest_to_rest: bool = False, **env):
     return HumanDemonstrations(BoatDockEnv(**env), path=path, rest_to_rest=rest_to_rest, **ALL).batch
 
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder: [])
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
 
 
-def words(path: str, low: str, high: str = "human") -> list[str]:
+def overrides(path: str, low: str, high: str = "human") -> list[str]:
     return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}"]
 
 
 @pytest.mark.parametrize("low", ["bc", "iql", "td3_bc", "pdqn", "hsac"])
-def test_a_learner_trains_on_a_data_set_without_a_press(low, path, tmp_path, no_pictures):
-    given = words(path, low)
+def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, path, tmp_path, no_pictures):
+    given = overrides(path, low)
     assert run(compose_config(given), tmp_path, given) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["frames"] == 6
@@ -59,30 +59,26 @@ def test_a_learner_trains_on_a_data_set_without_a_press(low, path, tmp_path, no_
 
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])
 def test_a_selector_learns_from_the_decisions_in_the_data(high, path, tmp_path):
-    cfg = compose_config(words(path, "iql", high))
-    parts = assemble(cfg, run_config(cfg), tmp_path)
+    parts = assemble(make_config(overrides(path, "iql", high)), tmp_path)
     parts.agent.add_demonstrations(parts.data)
     num_episodes = int((parts.data["next", keys.DONE]).sum())
     selector = parts.agent.selector
-    if high == "ucb" or high == "linucb":
-        assert selector.rewards.num_decisions == num_episodes
+    if high in ("ucb", "linucb"):
+        assert selector.statistics.num_decisions == num_episodes
     else:
         assert len(selector.buffer) == num_episodes
 
 
-def test_decision_sums_are_those_of_the_decision_tracker(path):
-    batch = presses(path)[0]
+def test_decision_sums_match_those_of_the_decision_tracker(path):
+    batch = human_batch(path)[0]
     data = read(path, checksum=None, one_frame=True)
     ends = batch["next", keys.DONE].squeeze(-1)
-    returns = torch.zeros(len(data.episodes)).index_add(
-        0, batch["collector", "traj_ids"], batch["next", keys.REWARD].squeeze(-1)
-    )
-    assert torch.allclose(
-        batch["next", keys.OPTION_RETURN][ends].squeeze(-1), returns[batch["collector", "traj_ids"][ends]], atol=1e-4
-    )
-    assert (
-        batch["next", keys.OPTION_STEPS][ends].squeeze(-1) == data.episodes["presses"][data.episodes["presses"] > 0]
-    ).all()
+    episode = batch["collector", "traj_ids"]
+    returns = torch.zeros(len(data.episodes)).index_add(0, episode, batch["next", keys.REWARD].squeeze(-1))
+    option_return = batch["next", keys.OPTION_RETURN][ends].squeeze(-1)
+    assert torch.allclose(option_return, returns[episode[ends]], atol=1e-4)
+    num_presses = data.episodes["presses"]
+    assert (batch["next", keys.OPTION_STEPS][ends].squeeze(-1) == num_presses[num_presses > 0]).all()
     firsts = batch[keys.IS_DECISION].squeeze(-1)
     assert (batch["next", keys.DECISION_OBSERVATION][firsts] == batch[keys.OBSERVATION][firsts]).all()
     tracked = with_decisions(BoatDockEnv(2)).rollout(2)["next"]
@@ -91,21 +87,22 @@ def test_decision_sums_are_those_of_the_decision_tracker(path):
         assert tracked[name].shape[2:] == batch["next", name].shape[1:]
 
 
-def test_keys_are_those_of_the_environments_key_map(path):
-    batch, data = presses(path, keymap=1)[0], read(path, checksum=None, one_frame=True)
-    of = data.episodes[data.presses["episode"]]
-    assert (of["keymap"] == 2).any()
+def test_recorded_keys_are_translated_to_the_environments_key_map(path):
+    batch = human_batch(path, keymap=1)[0]
+    data = read(path, checksum=None, one_frame=True)
+    episodes = data.episodes[data.presses["episode"]]
+    assert (episodes["keymap"] == 2).any()
 
-    def heading(keymap, key):
-        return torch.stack(harbour.direction(of["controller"].int(), keymap.int(), key.int()), -1)
+    def direction(keymap, key):
+        return torch.stack(harbour.direction(episodes["controller"].int(), keymap.int(), key.int()), -1)
 
-    there = heading(torch.ones_like(of["keymap"]), batch[keys.DISCRETE])
-    torch.testing.assert_close(there, heading(of["keymap"], data.presses["key"]))
+    translated = direction(torch.ones_like(episodes["keymap"]), batch[keys.DISCRETE])
+    torch.testing.assert_close(translated, direction(episodes["keymap"], data.presses["key"]))
     pressed = batch[keys.PARAMETERS].gather(-1, batch[keys.DISCRETE].unsqueeze(-1)).squeeze(-1)
     torch.testing.assert_close(pressed, data.presses["duration"])
 
 
-def test_a_settled_press_brings_a_gliding_boat_to_where_the_next_one_began(path):
+def test_a_rest_to_rest_press_brings_a_gliding_boat_to_where_the_next_one_began(path):
     data = read(path, checksum=None, one_frame=True)
     # As if the second press of each episode had stopped the boat half-way.
     presses, is_cut = data.presses.clone(), ~data.presses["is_final"]
@@ -117,13 +114,13 @@ def test_a_settled_press_brings_a_gliding_boat_to_where_the_next_one_began(path)
     distance = physics.total_distance(moved_presses["duration"][kept])
     assert (distance >= TAP - 1e-3).all()
     assert (moved_presses["duration"] <= physics.MAX_DURATION).all()
-    # Both ways of recording give the same episodes in the same order, numbered from 0.
+    # The presses of each episode are numbered from 0 in order.
     first = torch.searchsorted(moved_presses["episode"], moved_presses["episode"])
     assert (moved_presses["press"] == torch.arange(len(first)) - first).all()
 
 
-def test_an_episode_whose_final_press_is_gone_is_cut_and_not_over(path):
-    batch = presses(path, rest_to_rest=True)[0]
+def test_an_episode_without_its_final_press_is_truncated_and_not_terminated(path):
+    batch = human_batch(path, rest_to_rest=True)[0]
     trajectory = batch["collector", "traj_ids"]
     is_last = torch.cat([trajectory[1:] != trajectory[:-1], torch.ones(1, dtype=torch.bool)])
     done = batch["next", keys.DONE].squeeze(-1)
@@ -133,12 +130,12 @@ def test_an_episode_whose_final_press_is_gone_is_cut_and_not_over(path):
 
 
 REFUSED = [
-    (["low=bc"], "low=bc learns from data sets only; use mode=offline data=human"),
-    (["low=hppo", "mode=offline", "data=human"], "low=hppo learns from its own presses only; use data=none"),
-    (["low=iql", "mode=offline"], "mode=offline: data=none leaves nothing to learn from; use data=human"),
+    (["low=bc"], "low=bc learns from data sets only; use mode=offline and a data set"),
+    (["low=hppo", "mode=offline", "data=human"], "low=hppo learns from its own steps only; use data=none"),
+    (["low=iql", "mode=offline"], "mode=offline: data=none leaves nothing to learn from; choose a data set"),
     (["low=iql", "mode=offline", "data=human", "data.path=/nowhere.mat"], "/nowhere.mat: there is no such file"),
     (["low=iql", "high=none", "env=platform", "mode=offline", "data=human"], "people docked boats; use env=boatdock"),
-    (["low=iql", "data=human", "mode=offline", "collector=multi"], "mode=offline presses nothing"),
+    (["low=iql", "data=human", "mode=offline", "collector=multi"], "mode=offline takes no steps"),
     (["low=iql", "data=human", "mode=offline", "low.freeze=true"], "mode=offline trains the learners"),
 ]
 
@@ -146,15 +143,15 @@ REFUSED = [
 @pytest.mark.parametrize(
     ("given", "line"), REFUSED, ids=lambda value: " ".join(value) if isinstance(value, list) else ""
 )
-def test_what_cannot_be_is_refused_in_one_line(given, line, tmp_path):
-    cfg = compose_config([*given, "eval.layouts=4", "num_envs=4"])
+def test_impossible_configs_are_refused_in_one_line(given, line, tmp_path):
+    config = make_config([*given, "eval.layouts=4", "num_envs=4"])
     with pytest.raises(ConfigError, match=line) as refusal:
-        assemble(cfg, run_config(cfg), tmp_path)
+        assemble(config, tmp_path)
     assert "\n" not in str(refusal.value)
 
 
-def test_an_offline_run_goes_on_and_is_fine_tuned(path, tmp_path, no_pictures):
-    given = words(path, "iql")
+def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path, no_pictures):
+    given = overrides(path, "iql")
     assert run(compose_config(given), tmp_path / "a", given) == 0
     longer = ["mode=offline", f"resume={tmp_path / 'a'}", "offline.updates=9"]
     assert run(compose_config(longer), tmp_path / "b", longer) == 0
@@ -166,37 +163,36 @@ def test_an_offline_run_goes_on_and_is_fine_tuned(path, tmp_path, no_pictures):
     assert run(compose_config(tuned), tmp_path / "d", tuned) == 0
 
 
-def test_demonstrations_lie_in_the_replay_beside_own_presses(path, tmp_path):
+def test_demonstrations_are_stored_in_the_replay_buffers(path, tmp_path):
     given = ["low=pdqn", "data=human", "data.checksum=null", f"data.path={path}", "eval.layouts=4", "num_envs=4"]
-    cfg = compose_config(given)
-    parts = assemble(cfg, run_config(cfg), tmp_path)
+    parts = assemble(make_config(given), tmp_path)
     parts.agent.add_demonstrations(parts.data)
     assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.numel()
 
 
-# One step, three keys: the best press is key 1 for half its range, and the data holds worse ones three times as often.
+# One step, three discrete actions with a parameter each. The best is action 1 with half its range; in the data three in
+# four actions have a worse parameter.
 SPECS = PAMDPSpecs(1, (), (1, 1, 1), (0.0, 0.0, 0.0), (2.0, 2.0, 2.0))
 
 
-def one_step_data(num: int = 6000) -> tuple[torch.Tensor, ...]:
+def one_step_batch(num: int = 6000) -> TensorDict:
+    """Return a data set of one-step episodes, `[1, num]`."""
     generator = torch.Generator().manual_seed(0)
-    key = torch.randint(0, 2, (num,), generator=generator)  # key 2 is never pressed
-    duration = torch.where(
+    discrete = torch.randint(0, 2, (num,), generator=generator)  # never action 2
+    parameter = torch.where(
         torch.rand(num, generator=generator) < 0.75,
         0.4 + 0.1 * torch.randn(num, generator=generator),
         1.0 + 0.1 * torch.randn(num, generator=generator),
     ).clamp(0.0, 2.0)
-    reward = torch.where(key == 1, 1.0, 0.5) - (duration - 1.0).square()
-    return key, duration, reward
-
-
-def one_step_batch():
-    key, duration, reward = one_step_data()
-    num = len(key)
-    zeros, ends = torch.zeros(num, 1), torch.ones(num, 1, dtype=torch.bool)
-    durations = torch.zeros(num, 3).scatter(1, key.unsqueeze(1), duration.unsqueeze(1))
-    after = {"observation": zeros, "reward": reward.unsqueeze(1), "done": ends, "terminated": ends}
-    rows = {"observation": zeros, "action": {"discrete": key, "parameters": durations}, "next": after}
+    reward = torch.where(discrete == 1, 1.0, 0.5) - (parameter - 1.0).square()
+    parameters = torch.zeros(num, 3).scatter(1, discrete.unsqueeze(1), parameter.unsqueeze(1))
+    zeros = torch.zeros(num, 1)
+    ends = torch.ones(num, 1, dtype=torch.bool)
+    rows = {
+        "observation": zeros,
+        "action": {"discrete": discrete, "parameters": parameters},
+        "next": {"observation": zeros, "reward": reward.unsqueeze(1), "done": ends, "terminated": ends},
+    }
     return TensorDict(rows, batch_size=[num]).unsqueeze(0)
 
 
@@ -211,26 +207,26 @@ TD3BC_OPTIONS = COMMON | dict(
 )  # fmt: skip
 
 
-def practised(learner, num_updates: int) -> tuple[int, float]:
-    """Let a learner learn from the one-step data; return its greedy key and duration."""
+def greedy_action(learner, num_updates: int) -> tuple[int, float]:
+    """Return the greedy discrete action and its parameter after updates from the one-step data."""
     torch.manual_seed(0)
     batch = one_step_batch()
     learner.add_demonstrations(batch, torch.ones(batch.shape, dtype=torch.bool))
     learner.update(num_updates)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acted = learner.policy(batch[0, :1].select("observation"))
-    key = acted["action", "discrete"].item()
-    return key, acted["action", "parameters"][0, key].item()
+    discrete = acted["action", "discrete"].item()
+    return discrete, acted["action", "parameters"][0, discrete].item()
 
 
-def test_behaviour_cloning_takes_the_mean_of_what_it_sees():
+def test_behaviour_cloning_finds_the_mean_parameter_of_the_data():
     options = COMMON | dict(min_scale=0.02, max_scale=1.0, lr=3e-3, weight_decay=0.0)
-    _, duration = practised(BC(SPECS, torch.device("cpu"), **options), 400)
-    assert duration == pytest.approx(0.55, abs=0.05)
+    _, parameter = greedy_action(BC(SPECS, torch.device("cpu"), **options), 400)
+    assert parameter == pytest.approx(0.55, abs=0.05)
 
 
 @pytest.mark.parametrize(("learner", "options"), [(IQL, IQL_OPTIONS), (TD3BC, TD3BC_OPTIONS)], ids=["iql", "td3_bc"])
-def test_offline_learners_find_the_better_press_of_the_data(learner, options):
-    key, duration = practised(learner(SPECS, torch.device("cpu"), **options), 600)
-    assert key == 1
-    assert duration == pytest.approx(0.95, abs=0.12)
+def test_offline_learners_find_the_better_actions_of_the_data(learner, options):
+    discrete, parameter = greedy_action(learner(SPECS, torch.device("cpu"), **options), 600)
+    assert discrete == 1
+    assert parameter == pytest.approx(0.95, abs=0.12)

@@ -1,4 +1,4 @@
-"""The learned option policies, MetaCritic and Actor: their targets by hand, and that they learn who pays where."""
+"""The learned option policies, MetaCritic and Actor: their targets by hand, and that they learn the better options."""
 
 import pytest
 import torch
@@ -13,14 +13,33 @@ from hpamdp.policies.high_level.meta_critic import MetaCritic
 
 OPTIONS = {
     MetaCritic: dict(
-        hidden_dims=[32, 32], num_members=3, exploration="epsilon", epsilon_final=0.1, epsilon_decisions=1000,
-        ucb_width=2.0, gamma=1.0, bootstrap=0.0, buffer_size=4000, batch_size=64, updates_per_decision=0.1,
-        max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
+        hidden_dims=[32, 32],
+        num_members=3,
+        exploration="epsilon",
+        epsilon_final=0.1,
+        epsilon_decisions=1000,
+        ucb_width=2.0,
+        gamma=1.0,
+        bootstrap=0.0,
+        buffer_size=4000,
+        batch_size=64,
+        updates_per_decision=0.1,
+        max_updates=64,
+        warmup_decisions=200,
+        lr=3e-3,
+        tau=0.05,
     ),
     Actor: dict(
-        hidden_dims=[32, 32], gamma=1.0, epochs=4, minibatch_size=64, clip=0.2, entropy=0.0, lr=3e-3, max_grad_norm=0.5,
+        hidden_dims=[32, 32],
+        gamma=1.0,
+        epochs=4,
+        minibatch_size=64,
+        clip=0.2,
+        entropy=0.0,
+        lr=3e-3,
+        max_grad_norm=0.5,
     ),
-}  # fmt: skip
+}
 
 
 def make(cls: type, seed: int = 0, **changes: object) -> MetaCritic | Actor:
@@ -29,7 +48,7 @@ def make(cls: type, seed: int = 0, **changes: object) -> MetaCritic | Actor:
 
 
 def greedy_regret(selector: MetaCritic | Actor) -> float:
-    """Return what greedy choices lose on `by_sign`, where the right ones lose 0 and any single option 1."""
+    """Return the mean regret of greedy choices on `by_sign`, where that of a single option is 1."""
     observation = torch.rand(1000, 2) * 2 - 1
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         option = selector(due(observation))[keys.OPTION]
@@ -37,13 +56,13 @@ def greedy_regret(selector: MetaCritic | Actor) -> float:
 
 
 def mid_episode(selector: MetaCritic | Actor) -> TensorDict:
-    """Return two decisions of 3 steps that paid 0.7: after the first one the episode goes on, after the second not."""
+    """Return two decisions of 3 steps with the return 0.7; the episode goes on after the first, but not the second."""
     decisions = ended(selector(due(torch.tensor([[0.1, 0.2], [0.3, 0.4]]))), torch.tensor([0.7, 0.7]))
     after = decisions["next"]
     after[keys.OBSERVATION] = torch.tensor([[0.5, 0.6], [0.7, 0.8]])
     after[keys.TERMINATED] = torch.tensor([[False], [True]])
     after[keys.OPTION_STEPS] = torch.tensor([[3], [3]])
-    decisions[keys.OBSERVATION] = torch.full((2, 2), 9.0)  # of the last step, which nobody should look at
+    decisions[keys.OBSERVATION] = torch.full((2, 2), 9.0)  # at the last step, which nobody should use
     return decisions
 
 
@@ -51,7 +70,7 @@ def mid_episode(selector: MetaCritic | Actor) -> TensorDict:
 
 
 @pytest.mark.parametrize("changes", [{}, {"exploration": "ucb"}, {"num_members": 1}])
-def test_meta_critic_learns_who_pays_where(changes):
+def test_meta_critic_learns_which_option_is_better_where(changes):
     critic = make(MetaCritic, **changes)
     play(critic, by_sign, 3000, 30, noise=0.5)
     assert greedy_regret(critic) < 0.2
@@ -66,7 +85,7 @@ def test_meta_critic_learns_from_options_that_others_chose():
     assert greedy_regret(critic) < 0.2
 
 
-def test_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
+def test_the_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
     critic = make(MetaCritic, gamma=0.9, num_members=1)
     with torch.no_grad():
         for layer in critic.target_critics.layers:
@@ -76,8 +95,8 @@ def test_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
     torch.testing.assert_close(rows["discount"], torch.tensor([0.9**3, 0.0]))
     torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
     q = critic.critics(rows["state"])[0].detach()
-    following = critic.target_critics(torch.tensor([[0.5, 0.6]]))[0, 0].max().item()
-    targets = [0.7 + 0.9**3 * following, 0.7]
+    next_value = critic.target_critics(torch.tensor([[0.5, 0.6]]))[0, 0].max().item()
+    targets = [0.7 + 0.9**3 * next_value, 0.7]
     chosen = decisions[keys.OPTION].tolist()
     expected = sum((q[i, chosen[i]].item() - targets[i]) ** 2 for i in (0, 1)) / 2
     assert critic._update(rows).item() == pytest.approx(expected, rel=1e-5)
@@ -92,7 +111,7 @@ def test_without_bootstrap_only_the_chosen_option_has_a_target():
 
 
 @pytest.mark.parametrize("bootstrap", [1.0, 0.5])
-def test_values_of_the_learners_also_teach_of_options_that_were_never_chosen(bootstrap):
+def test_the_learners_values_teach_about_options_that_were_never_chosen(bootstrap):
     critic = make(MetaCritic, bootstrap=bootstrap, updates_per_decision=0.2)
     assert critic.needs_values
     for _ in range(30):
@@ -103,7 +122,7 @@ def test_values_of_the_learners_also_teach_of_options_that_were_never_chosen(boo
     assert greedy_regret(critic) < 0.2
 
 
-def test_targets_mix_payoff_and_values_by_the_bootstrap_share():
+def test_targets_mix_returns_and_values_by_the_bootstrap_weight():
     critic = make(MetaCritic, bootstrap=0.25, num_members=1)
     decisions = mid_episode(critic).set(keys.OPTION, torch.tensor([1, 0]))[1:]  # the terminated one
     decisions.set(keys.OPTION_VALUES, torch.tensor([[2.0, 3.0]]))
@@ -112,18 +131,18 @@ def test_targets_mix_payoff_and_values_by_the_bootstrap_share():
     assert critic._update(critic._rows(decisions)).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_the_share_of_random_options_falls_from_1_after_the_warm_up():
+def test_the_probability_of_a_random_option_falls_from_1_after_the_warm_up():
     critic = make(MetaCritic, warmup_decisions=200, epsilon_decisions=1000, epsilon_final=0.1)
-    shares = []
+    epsilons = []
     for _ in range(14):
-        shares.append(critic.epsilon)
+        epsilons.append(critic.epsilon)
         critic.learn(ended(due(100, option=torch.zeros(100, dtype=torch.long)), torch.zeros(100)))
-    assert shares == pytest.approx([1.0, 1.0, *(1.0 - 0.09 * i for i in range(11)), 0.1])
+    assert epsilons == pytest.approx([1.0, 1.0, *(1.0 - 0.09 * i for i in range(11)), 0.1])
     assert make(MetaCritic, exploration="ucb", warmup_decisions=0).epsilon == 0.0
 
 
 @pytest.mark.parametrize(("width", "chosen"), [(0.7, 0), (0.8, 1)])
-def test_ucb_exploration_adds_the_deviation_between_the_members(width, chosen):
+def test_ucb_exploration_adds_the_standard_deviation_over_the_members(width, chosen):
     critic = make(MetaCritic, exploration="ucb", warmup_decisions=0, ucb_width=width)
     with torch.no_grad():
         critic.critics.layers[-1].weight.zero_()
@@ -137,13 +156,13 @@ def test_ucb_exploration_adds_the_deviation_between_the_members(width, chosen):
 # Actor.
 
 
-def test_actor_learns_who_pays_where():
+def test_actor_learns_which_option_is_better_where():
     actor = make(Actor)
     play(actor, by_sign, 4000, 50, noise=0.5)
     assert greedy_regret(actor) < 0.2
 
 
-def test_actor_draws_options_by_its_probabilities_and_tells_them():
+def test_actor_samples_options_by_its_probabilities_and_writes_them():
     actor = make(Actor)
     observation = torch.tensor([[0.5, -0.5]]).expand(40_000, 2)
     td = actor(due(observation))
@@ -166,16 +185,16 @@ def test_the_ratio_is_1_in_the_first_minibatch(monkeypatch):
     assert len(seen) == 4 and seen[0] < 1e-6 and max(seen[1:]) > 1e-4
 
 
-def test_targets_of_the_actor_are_discounted_by_the_options_length_and_end_with_the_episode():
+def test_the_targets_of_the_actor_are_discounted_by_the_options_length_and_end_with_the_episode():
     actor = make(Actor, gamma=0.9)
     decisions = mid_episode(actor)
     rows = actor._rows(decisions)
-    following = actor.critic(torch.tensor([[0.5, 0.6]])).item()
-    assert rows["target"].tolist() == pytest.approx([0.7 + 0.9**3 * following, 0.7])
+    next_value = actor.critic(torch.tensor([[0.5, 0.6]])).item()
+    assert rows["target"].tolist() == pytest.approx([0.7 + 0.9**3 * next_value, 0.7])
     torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
 
 
-def test_decisions_that_wait_for_an_update_survive_a_state_dict():
+def test_decisions_that_wait_for_an_update_are_part_of_the_state_dict():
     actor = make(Actor)
     play(actor, by_sign, 40, 20)
     assert sum(len(rows) for rows in actor.waiting) == 40
@@ -191,7 +210,7 @@ def test_decisions_that_wait_for_an_update_survive_a_state_dict():
 
 
 @pytest.mark.parametrize("cls", [MetaCritic, Actor])
-def test_greedy_choices_draw_nothing(cls):
+def test_greedy_choices_use_no_random_numbers(cls):
     selector = make(cls)
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         selector(due(torch.rand(20, 2, generator=torch.Generator().manual_seed(0))))

@@ -1,11 +1,11 @@
-"""P-DQN and MP-DQN: who sees which parameters, targets, n-step returns, and a problem with a known optimum."""
+"""P-DQN and MP-DQN: multi-pass critics, targets, n-step returns, and learning a problem with a known optimum."""
 
 import pytest
 import torch
 from conftest import global_generators_unmoved
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from toy_presses import SPECS, one_step_rows, sample, states
+from toy_steps import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
 from hpamdp.policies.low_level.pdqn import PDQN, InvertingGradients
@@ -30,18 +30,18 @@ def learn(learner: PDQN, num_batches: int, size: int = 200) -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, PUBLISHED, {"bounding": "inverting_gradients", "double_q": True}])
-def test_the_learner_finds_the_key_and_parameters_that_pay(changes):
+def test_the_learner_finds_the_best_discrete_action_and_its_parameters(changes):
     torch.manual_seed(0)
     learner = make(**changes)
     learn(learner, 40)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)
     assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
-    assert rows["next", keys.REWARD].mean() > 0.9, "random presses earn about -0.2, key 2 alone 0.2, the optimum 1"
+    assert rows["next", keys.REWARD].mean() > 0.9, "random actions earn about -0.2, action 2 alone 0.2, the optimum 1"
 
 
 @pytest.mark.parametrize("multipass", [True, False])
-def test_a_keys_value_depends_on_its_own_parameters_alone_only_with_multipass(multipass):
+def test_a_value_depends_on_its_own_parameters_alone_only_with_multipass(multipass):
     learner = make(multipass=multipass)
     unit = (torch.rand(8, 3) * 2 - 1).requires_grad_()
     q = learner.critics(torch.randn(8, 4), unit)
@@ -52,14 +52,14 @@ def test_a_keys_value_depends_on_its_own_parameters_alone_only_with_multipass(mu
 
 
 @pytest.mark.parametrize("multipass", [True, False])
-def test_the_value_of_the_pressed_key_is_that_of_the_full_pass(multipass):
+def test_the_value_of_a_given_action_is_that_of_the_full_pass(multipass):
     learner, batch = make(multipass=multipass), sample()
     full = learner.critics(batch["state"], batch["unit"])
     expected = full[:, torch.arange(32), batch["discrete"]]
     torch.testing.assert_close(learner.critics.of_discrete(batch["state"], batch["discrete"], batch["unit"]), expected)
 
 
-def test_the_parameter_update_moves_the_actor_and_leaves_the_critics_alone():
+def test_the_actor_update_leaves_the_critics_alone():
     learner = make()
     before = {name: value.clone() for name, value in learner.state_dict().items()}
     learner._update_actor(torch.randn(32, 4))
@@ -81,14 +81,17 @@ def test_targets_equal_those_computed_by_hand(twin_q, double_q):
     for i in range(200):
         state = batch["next_state"][i : i + 1]
         unit = learner.target_actor(state)
-        # `[E][K]`: every member's value of every key.
-        online, slow = (net(state, unit)[:, 0].tolist() for net in (learner.critics, learner.target_critics))
-        lowest = [min(values) for values in zip(*slow, strict=True)]
-        judge = [min(values) for values in zip(*online, strict=True)] if double_q else lowest
-        choices.add(judge.index(max(judge)) == lowest.index(max(lowest)))
-        expected = batch["reward"][i] + batch["discount"][i] * lowest[judge.index(max(judge))]
+        # Each member's value of each discrete action, `[E][num_discrete]`.
+        learned = learner.critics(state, unit)[:, 0].tolist()
+        slow = learner.target_critics(state, unit)[:, 0].tolist()
+        learned_q = [min(values) for values in zip(*learned, strict=True)]
+        target_q = [min(values) for values in zip(*slow, strict=True)]
+        choosing_q = learned_q if double_q else target_q
+        chosen = choosing_q.index(max(choosing_q))
+        choices.add(chosen == target_q.index(max(target_q)))
+        expected = batch["reward"][i] + batch["discount"][i] * target_q[chosen]
         torch.testing.assert_close(target[i], expected)
-    assert choices == ({True, False} if double_q else {True}), "the two choices of the key must differ somewhere"
+    assert choices == ({True, False} if double_q else {True}), "the two choices of the action must differ somewhere"
 
 
 def test_target_smoothing_is_bounded():
@@ -101,9 +104,9 @@ def test_target_smoothing_is_bounded():
     assert not torch.allclose(learner._target(batch), smooth)
 
 
-def test_returns_over_several_steps_end_with_episodes_and_bootstrap_where_they_should():
+def test_n_step_returns_end_with_episodes_and_bootstrap_unless_terminated():
     learner = make(n_step=3, warmup_frames=10_000)
-    # Environment 0: an episode terminated by its third step, then another; environment 1: truncated by its second.
+    # Environment 0: an episode that terminates at its third step, then another; environment 1: truncated at its second.
     reward = torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0], [1.0, 2.0, 4.0, 8.0, 16.0]])
     terminated = torch.tensor([[0, 0, 1, 0, 0], [0, 0, 0, 0, 0]], dtype=torch.bool)
     done = terminated | torch.tensor([[0, 0, 0, 0, 0], [0, 1, 0, 0, 0]], dtype=torch.bool)
@@ -121,7 +124,7 @@ def test_returns_over_several_steps_end_with_episodes_and_bootstrap_where_they_s
         },
         [2, 5],
     )
-    # Another option's learner has environment 1's first episode.
+    # The first episode of environment 1 is another learner's.
     mask = torch.ones(2, 5, dtype=torch.bool)
     mask[1, :2] = False
     learner.learn(batch, mask)
@@ -142,7 +145,7 @@ def test_inverting_gradients_follow_the_formula_and_turn_back_past_the_bounds():
     raw = torch.tensor([-1.5, -1.0, 0.0, 0.5, 1.0, 1.5], requires_grad=True)
     clipped = InvertingGradients.apply(raw)
     assert clipped.tolist() == [-1.0, -1.0, 0.0, 0.5, 1.0, 1.0]
-    # Ascending 2x: the gradient times (upper - x) / (upper - lower); descending: times (x - lower) / (upper - lower).
+    # Upwards the gradient is multiplied by (high - x) / (high - low), downwards by (x - low) / (high - low).
     (up,) = torch.autograd.grad(-2.0 * clipped.sum(), raw, retain_graph=True)
     torch.testing.assert_close(-up, 2.0 * (1.0 - raw.detach()) / 2.0)
     (down,) = torch.autograd.grad(2.0 * clipped.sum(), raw)
@@ -154,11 +157,11 @@ def test_parameters_stay_in_bounds(bounding):
     learner = make(bounding=bounding, parameter_noise=1.0)
     learner.policy.epsilon.fill_(0.1)
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    duration = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500]))[keys.PARAMETERS]
-    assert (duration >= low).all() and (duration <= high).all()
+    td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(500, 4) * 30}, [500]))
+    assert (td[keys.PARAMETERS] >= low).all() and (td[keys.PARAMETERS] <= high).all()
 
 
-def test_the_greedy_policy_draws_nothing_and_the_exploring_one_moves_key_and_parameters():
+def test_the_greedy_policy_samples_nothing_and_the_exploring_one_varies_the_whole_action():
     learner, td = make(), states(500)
     with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(td.clone())
@@ -171,7 +174,7 @@ def test_the_greedy_policy_draws_nothing_and_the_exploring_one_moves_key_and_par
     assert 0.08 < moved.std() < 0.12
 
 
-def test_keys_without_parameters_work():
+def test_discrete_actions_without_parameters_work():
     learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
     td = learner.policy(states(200))
     assert td[keys.PARAMETERS].shape == (200, 0)
@@ -192,7 +195,7 @@ def test_a_policy_takes_any_batch_shape():
         assert td[keys.DISCRETE].shape == shape and td[keys.PARAMETERS].shape == (*shape, 3)
 
 
-def test_clipped_gradients_have_at_most_the_norm_asked_for():
+def test_gradients_are_clipped_to_the_given_norm():
     learner = make(max_grad_norm=1e-3)
     learner.train_step(sample())
     norm = torch.stack([p.grad.norm() for p in learner.critics.parameters()]).norm()

@@ -1,4 +1,4 @@
-"""The closed forms of a press, held against a simulation in small time steps and against the task's own symmetries."""
+"""The closed forms of a press agree with a simulation in small time steps and have the symmetries of the task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EACH = settings(deadline=None, max_examples=50, derandomize=True)
 
 
 class Case(NamedTuple):
-    """One press to be; px from the harbour's centre, seconds, radians."""
+    """A press to make; px from the harbour's centre, seconds, radians."""
 
     x: float
     y: float
@@ -31,7 +31,7 @@ class Case(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """What small time steps make of a case; `margin` is how far (px, px/s) the outcome is from another one."""
+    """The result of a simulation; `margin` is the distance (px, px/s) from another outcome."""
 
     outcome: int
     travelled: float
@@ -41,11 +41,15 @@ class Simulated(NamedTuple):
 
 @st.composite
 def cases(sample):
-    """Boats anywhere in the harbour with a dock in any direction, about half of them steering towards it."""
-    radius, angle = sample(st.floats(0, 118)), sample(st.floats(0, 2 * math.pi))
-    x, y = radius * math.cos(angle), radius * math.sin(angle)
-    distance, bearing = sample(st.floats(15.6, 200)), sample(st.floats(0, 2 * math.pi))
-    goal_x, goal_y = x + distance * math.cos(bearing), y + distance * math.sin(bearing)
+    """Sample boats anywhere in the harbour with a dock in any direction, about half of them heading for it."""
+    radius = sample(st.floats(0, 118))
+    angle = sample(st.floats(0, 2 * math.pi))
+    x = radius * math.cos(angle)
+    y = radius * math.sin(angle)
+    distance = sample(st.floats(15.6, 200))
+    bearing = sample(st.floats(0, 2 * math.pi))
+    goal_x = x + distance * math.cos(bearing)
+    goal_y = y + distance * math.sin(bearing)
     heading = bearing + sample(st.floats(-0.3, 0.3) | st.floats(-math.pi, math.pi))
     return Case(x, y, goal_x, goal_y, heading, sample(st.floats(0.1, 2)), sample(st.floats(0.05, 6)))
 
@@ -57,16 +61,17 @@ def press(batch: list[Case], function=physics.press) -> physics.Press:
 
 
 def simulate(case: Case) -> Simulated:
-    """Run one press in small time steps from its acceleration alone (numpy, float64)."""
+    """Simulate one press in small time steps, given only its acceleration (NumPy, float64)."""
     pressed_for = min(case.duration, case.fuel)
-    # The glide runs the speed back down the same curve, GLIDE times as long.
+    # In the glide the speed falls along the same curve, in GLIDE times the time.
     dt = pressed_for / NUM_STEPS
     middle = (np.arange(NUM_STEPS) + 0.5) * dt
     rising = 100.0 * middle**2 - 20.0 / 3.0 * middle**3
     speeds = np.concatenate([rising, rising[::-1]])
     steps = np.concatenate([rising * dt, rising[::-1] * dt * 0.95])
     way = np.cumsum(steps)
-    x, y = case.x + way * math.cos(case.heading), case.y + way * math.sin(case.heading)
+    x = case.x + way * math.cos(case.heading)
+    y = case.y + way * math.sin(case.heading)
     to_dock = np.hypot(x - case.goal_x, y - case.goal_y) - 15.0
     to_rim = 120.0 - np.hypot(x, y)
     docked, left = (np.flatnonzero(gap <= 0.0) for gap in (to_dock, to_rim))
@@ -82,7 +87,7 @@ def simulate(case: Case) -> Simulated:
     return Simulated(outcome, way[-1], burnt, min(to_dock.min(), to_rim.min(), abs(case.fuel - case.duration)))
 
 
-def agrees(case: Case, expected: Simulated) -> None:
+def assert_agrees(case: Case, expected: Simulated) -> None:
     after = press([case])
     assert after.outcome.item() == expected.outcome
     travelled = math.hypot(after.x.item() - case.x, after.y.item() - case.y)
@@ -92,13 +97,13 @@ def agrees(case: Case, expected: Simulated) -> None:
 
 @EACH
 @given(cases())
-def test_the_first_event_is_the_one_that_small_time_steps_meet_first(case):
+def test_a_press_ends_at_the_event_that_small_time_steps_meet_first(case):
     expected = simulate(case)
     assume(expected.margin > 0.1)
-    agrees(case, expected)
+    assert_agrees(case, expected)
 
 
-def test_small_time_steps_agree_where_every_outcome_is_met():
+def test_small_time_steps_agree_on_many_presses_of_every_outcome():
     rng = np.random.default_rng(0)
     met = dict.fromkeys((SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL), 0)
     for _ in range(300):
@@ -109,7 +114,7 @@ def test_small_time_steps_agree_where_every_outcome_is_met():
         case = Case(x, y, goal_x, goal_y, heading, rng.uniform(0.3, 1.6), rng.uniform(0.3, 4.0))
         expected = simulate(case)
         if expected.margin > 0.1:
-            agrees(case, expected)
+            assert_agrees(case, expected)
             met[expected.outcome] += 1
     assert min(met.values()) >= 10, met
 
@@ -119,7 +124,8 @@ def test_small_time_steps_agree_where_every_outcome_is_met():
 def test_the_boat_stops_on_the_circle_that_it_met(batch):
     after = press(batch)
     goal_x, goal_y = torch.tensor([[case.goal_x, case.goal_y] for case in batch]).unbind(-1)
-    from_goal, from_centre = torch.hypot(after.x - goal_x, after.y - goal_y), torch.hypot(after.x, after.y)
+    from_goal = torch.hypot(after.x - goal_x, after.y - goal_y)
+    from_centre = torch.hypot(after.x, after.y)
     docks = (after.outcome == SUCCESS) | (after.outcome == TOO_FAST)
     leaves = after.outcome == OUT_OF_BOUNDS
     assert (from_goal[docks] - physics.DOCK_RADIUS).abs().lt(1e-3).all()
@@ -130,7 +136,7 @@ def test_the_boat_stops_on_the_circle_that_it_met(batch):
 
 @EACH
 @given(st.lists(cases(), min_size=20, max_size=20))
-def test_fuel_never_rises_nor_falls_below_zero_nor_by_more_than_the_press(batch):
+def test_fuel_never_rises_and_falls_by_at_most_the_duration_and_never_below_zero(batch):
     after = press(batch)
     fuel, duration = (torch.tensor([getattr(case, name) for case in batch]) for name in ("fuel", "duration"))
     assert (after.fuel >= 0.0).all()
@@ -179,10 +185,10 @@ def test_the_distance_is_the_integral_of_the_measured_speed():
 
 @EACH
 @given(st.lists(cases(), min_size=20, max_size=20))
-def test_turning_the_world_by_half_and_swapping_the_controller_turns_the_result(batch):
+def test_turning_the_world_by_180_degrees_and_swapping_the_controller_turns_the_result(batch):
     x, y, goal_x, goal_y, _, duration, fuel = torch.tensor(batch).unbind(-1)
     key = torch.arange(len(batch)) % 3
-    # The congruent boat's keys by the incongruent boat's, with key map 1 and 2.
+    # For each key of the incongruent boat, with key map 1 and 2, the opposite key of the congruent boat.
     opposite = torch.tensor([[0, 2, 1], [1, 0, 2]])
     for keymap in (1, 2):
         maps = torch.full_like(key, keymap)
@@ -197,7 +203,7 @@ def test_turning_the_world_by_half_and_swapping_the_controller_turns_the_result(
 
 @EACH
 @given(st.lists(cases(), min_size=5, max_size=20))
-def test_a_batch_does_what_its_boats_do_alone(batch):
+def test_a_boat_moves_in_a_batch_as_it_does_alone(batch):
     together = press(batch)
     for row, case in enumerate(batch):
         for one, many in zip(press([case]), together, strict=True):
@@ -227,7 +233,7 @@ def press_and_step(columns: tuple[torch.Tensor, ...], arguments: tuple) -> tuple
 
 @pytest.fixture(scope="module")
 def compiled():
-    """Compile both functions without graph breaks, in one go because each costs a run of the C++ compiler."""
+    """Compile both functions without graph breaks, together because each call costs a run of the C++ compiler."""
     return torch.compile(press_and_step, fullgraph=True, dynamic=False)
 
 
@@ -244,8 +250,9 @@ def test_compiled_and_eager_agree(compiled):
     direction = harbour.direction(options, state.keymap, keys)
     columns = (state.x, state.y, state.fuel, state.goal_x, state.goal_y, *direction, durations[:, 0])
     arguments = (state, options, keys, durations, seed, rows, rules)
-    eager, fast = flat(press_and_step(columns, arguments)), flat(compiled(columns, arguments))
-    # A rounding error may tip a boat that all but touches a circle; the rest has to agree.
+    eager = flat(press_and_step(columns, arguments))
+    fast = flat(compiled(columns, arguments))
+    # Rounding may change the outcome of a boat that nearly touches a circle; the others must agree.
     same = torch.stack([(a.float() - b.float()).abs() < 1e-4 for a, b in zip(eager, fast, strict=True)])
     assert same.all(0).float().mean() > 0.999
 

@@ -1,4 +1,4 @@
-"""The planner's plans keep their promises in the simulator, and nothing found by other means beats them."""
+"""The planner's plans reach their scores in the simulator, and no plan found by other means beats them."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def full_tank(num: int) -> Tensor:
 
 
 def replay(boat: tuple[Tensor, ...], keys: Tensor, durations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Press a plan's keys one after another; return outcome, score and number of presses made, each `[*B]`.
+    """Press the keys of a plan one after another; return outcome, score and number of presses made, each `[*B]`.
 
-    `boat` is what `best_plan` takes: x, y, goal x, goal y, fuel, controller, keymap. A plan that has not docked after
-    its last press scores -1.
+    `boat` has the arguments of `best_plan`: x, y, goal x, goal y, fuel, controller, keymap. A plan that has not docked
+    after its last press scores -1.
     """
     x, y, goal_x, goal_y, fuel, controller, keymap = boat
     outcome = torch.full(x.shape, physics.SAILING, dtype=torch.int32)
@@ -44,14 +44,16 @@ def replay(boat: tuple[Tensor, ...], keys: Tensor, durations: Tensor) -> tuple[T
     for key, duration in zip(keys.unbind(-1), durations.unbind(-1), strict=True):
         sailing = (outcome == physics.SAILING) & (duration > 0.0)
         after = physics.press(x, y, fuel, goal_x, goal_y, *direction(controller, keymap, key), duration)
-        x, y = torch.where(sailing, after.x, x), torch.where(sailing, after.y, y)
-        fuel, outcome = torch.where(sailing, after.fuel, fuel), torch.where(sailing, after.outcome, outcome)
+        x = torch.where(sailing, after.x, x)
+        y = torch.where(sailing, after.y, y)
+        fuel = torch.where(sailing, after.fuel, fuel)
+        outcome = torch.where(sailing, after.outcome, outcome)
         presses = presses + sailing
     return outcome, score_of(outcome, fuel_fraction(fuel)), presses
 
 
-def assert_kept(boat: tuple[Tensor, ...], plan: Plan) -> None:
-    """Every plan docks, with the promised number of presses and the promised score."""
+def assert_docks_as_planned(boat: tuple[Tensor, ...], plan: Plan) -> None:
+    """Assert that every plan docks, with the planned number of presses and the planned score."""
     outcome, score, presses = replay(boat, plan.keys, plan.durations)
     assert (outcome == physics.SUCCESS).all()
     assert torch.equal(presses, plan.num_presses)
@@ -63,7 +65,7 @@ def at_start(layout: Layout, controller: int, keymap: int = 1) -> tuple[Tensor, 
     return (*layout, full_tank(num), filled(controller, num), filled(keymap, num))
 
 
-def chosen(plans: Plan, controller: int) -> Plan:
+def with_controller(plans: Plan, controller: int) -> Plan:
     return Plan(*(field[:, controller] for field in plans))
 
 
@@ -87,14 +89,14 @@ def test_shapes_and_types_are_as_documented(plans: Plan) -> None:
 
 
 @pytest.mark.parametrize("controller", [INCONGRUENT, CONGRUENT])
-def test_a_replayed_plan_docks_with_the_promised_score(layout: Layout, plans: Plan, controller: int) -> None:
-    assert_kept(at_start(layout, controller), chosen(plans, controller))
+def test_a_replayed_plan_docks_with_the_planned_score(layout: Layout, plans: Plan, controller: int) -> None:
+    assert_docks_as_planned(at_start(layout, controller), with_controller(plans, controller))
 
 
 def test_the_second_key_map_changes_keys_but_no_score(layout: Layout, plans: Plan) -> None:
     other = best_plans(layout, filled(2, NUM))
     torch.testing.assert_close(other.score, plans.score, atol=1e-3, rtol=0.0)
-    assert_kept(at_start(layout, INCONGRUENT, keymap=2), chosen(other, INCONGRUENT))
+    assert_docks_as_planned(at_start(layout, INCONGRUENT, keymap=2), with_controller(other, INCONGRUENT))
     assert not torch.equal(other.keys[:, INCONGRUENT], plans.keys[:, INCONGRUENT])
 
 
@@ -103,14 +105,14 @@ def test_consecutive_presses_use_different_keys(plans: Plan) -> None:
     assert not (repeated & (plans.durations[..., 1:] > 0.0)).any()
 
 
-def test_the_ceiling_is_where_it_was_measured() -> None:
+def test_the_mean_ceiling_has_its_documented_values() -> None:
     score = best_plans(fixed_layouts(2000, seed=0), filled(1, 2000)).score
     assert score[:, CONGRUENT].mean().item() == pytest.approx(3.42, abs=0.03)
     assert score[:, INCONGRUENT].mean().item() == pytest.approx(3.41, abs=0.03)
     assert score.amax(1).mean().item() == pytest.approx(3.64, abs=0.03)
 
 
-def test_the_boat_that_points_at_the_goal_is_the_better_one(layout: Layout, plans: Plan) -> None:
+def test_the_boat_with_a_key_towards_the_goal_is_the_better_one(layout: Layout, plans: Plan) -> None:
     offset = bearing_offset(layout)
     better = better_option(plans)
     assert (better[offset < 15.0] == CONGRUENT).float().mean() > 0.95
@@ -129,19 +131,22 @@ def test_fewer_presses_never_score_higher(layout: Layout, plans: Plan) -> None:
     one, two = best_plan(*boat, max_presses=1), best_plan(*boat, max_presses=2)
     assert one.num_presses.max() == 1 and two.num_presses.max() == 2
     assert (one.score <= two.score + 1e-6).all()
-    # Another local minimum may be refined, to another few ten-thousandths.
+    # The search may refine another local minimum, which differs by some ten-thousandths.
     assert (two.score <= plans.score[:, INCONGRUENT] + 1e-3).all()
 
 
 @pytest.mark.parametrize("max_presses", [0, 4])
-def test_other_numbers_of_presses_are_refused(layout: Layout, max_presses: int) -> None:
+def test_an_unsupported_number_of_presses_is_refused(layout: Layout, max_presses: int) -> None:
     with pytest.raises(ValueError, match="max_presses"):
         best_plan(*at_start(layout, CONGRUENT), max_presses=max_presses)
 
 
 @pytest.mark.parametrize("num_presses", [1, 2, 3])
-def test_random_plans_improved_by_mutation_never_beat_the_planner(num_presses: int) -> None:
-    num, samples, elite, children = 40, 6000, 40, 8
+def test_an_evolutionary_search_never_beats_the_planner(num_presses: int) -> None:
+    num = 40
+    samples = 6000
+    elite = 40
+    children = 8
     layout = fixed_layouts(num, seed=2)
     plans = best_plans(layout, filled(1, num))
     generator = torch.Generator().manual_seed(num_presses)
@@ -167,18 +172,18 @@ def test_random_plans_improved_by_mutation_never_beat_the_planner(num_presses: i
             score = torch.maximum(score, best_score)
         excess = score.amax(1) - plans.score[:, controller]
         assert excess.max() < 2e-3
-        # The search is no straw man: from two presses on it comes close for most layouts.
+        # The search is a fair opponent: with two presses or more it comes close for most layouts.
         assert num_presses == 1 or excess.median() > -0.01
 
 
-def test_without_enough_fuel_nothing_is_promised(layout: Layout, plans: Plan) -> None:
+def test_without_enough_fuel_there_is_no_plan(layout: Layout, plans: Plan) -> None:
     x, y, goal_x, goal_y, fuel, controller, keymap = (field[:200] for field in at_start(layout, CONGRUENT))
     needed = fuel * (1.0 - plans.score[:200, CONGRUENT] / 5.0)
     short = best_plan(x, y, goal_x, goal_y, needed - 0.01, controller, keymap)
     assert (short.score == -1.0).all()
     assert not short.num_presses.any() and not short.keys.any() and not short.durations.any()
     just_enough = (x, y, goal_x, goal_y, needed + 1e-4, controller, keymap)
-    assert_kept(just_enough, best_plan(*just_enough))
+    assert_docks_as_planned(just_enough, best_plan(*just_enough))
 
 
 def test_plans_can_start_in_the_middle_of_an_episode(layout: Layout) -> None:
@@ -196,17 +201,17 @@ def test_plans_can_start_in_the_middle_of_an_episode(layout: Layout) -> None:
     boat = tuple(field[sailing] for field in (after.x, after.y, *goal, after.fuel, controller, keymap))
     plan = best_plan(*boat)
     assert (plan.num_presses > 0).all()
-    assert_kept(boat, plan)
+    assert_docks_as_planned(boat, plan)
 
 
 def test_replanning_after_the_first_press_keeps_the_score(layout: Layout, plans: Plan) -> None:
     x, y, goal_x, goal_y, fuel, controller, keymap = at_start(layout, CONGRUENT)
-    plan = chosen(plans, CONGRUENT)
-    more = plan.num_presses > 1
+    plan = with_controller(plans, CONGRUENT)
+    has_more = plan.num_presses > 1
     first = direction(controller, keymap, plan.keys[:, 0])
     after = physics.press(x, y, fuel, goal_x, goal_y, *first, plan.durations[:, 0])
-    boat = tuple(field[more] for field in (after.x, after.y, goal_x, goal_y, after.fuel, controller, keymap))
-    torch.testing.assert_close(best_plan(*boat).score, plan.score[more], atol=2e-3, rtol=0.0)
+    boat = tuple(field[has_more] for field in (after.x, after.y, goal_x, goal_y, after.fuel, controller, keymap))
+    torch.testing.assert_close(best_plan(*boat).score, plan.score[has_more], atol=2e-3, rtol=0.0)
 
 
 def rotated(layout: Layout, degrees: float) -> Layout:
@@ -255,6 +260,6 @@ def test_a_thousand_layouts_take_seconds(layout: Layout) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
-def test_plans_made_on_the_gpu_score_the_same(layout: Layout, plans: Plan) -> None:
+def test_plans_on_the_gpu_have_the_same_scores(layout: Layout, plans: Plan) -> None:
     on_gpu = best_plans(Layout(*(field.cuda() for field in layout)), filled(1, NUM).cuda())
     torch.testing.assert_close(on_gpu.score.cpu(), plans.score, atol=2e-3, rtol=0.0)

@@ -1,4 +1,4 @@
-"""PlatformEnv plays as the domain should and keeps the framework's contract."""
+"""PlatformEnv plays like the Platform domain and keeps the framework's contract."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env.platform.environment import FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, TIME_LIMIT, PlatformEnv
+from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.env.platform.rules import FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, TIME_LIMIT
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -28,7 +29,7 @@ def snapshot(env: PlatformEnv) -> dict[str, Tensor]:
     return {name: column.clone() for name, column in env.env_state().items()}
 
 
-def is_as(env: PlatformEnv, before: dict[str, Tensor], rows=slice(None)) -> bool:
+def is_unchanged(env: PlatformEnv, before: dict[str, Tensor], rows=slice(None)) -> bool:
     return all(torch.equal(now[rows], before[name][rows]) for name, now in env.env_state().items())
 
 
@@ -37,7 +38,7 @@ def test_specs_hold(num):
     check_env_specs(PlatformEnv(num), return_contiguous=True)
 
 
-def test_learners_get_three_keys_of_one_parameter_each_and_no_options():
+def test_learners_see_three_discrete_actions_of_one_parameter_each_and_no_options():
     env = PlatformEnv(2)
     specs = PAMDPSpecs.from_env(env)
     assert specs == PAMDPSpecs(9, (), (1, 1, 1), (0.0, 0.0, 0.0), (30.0, 720.0, 430.0))
@@ -45,7 +46,7 @@ def test_learners_get_three_keys_of_one_parameter_each_and_no_options():
     assert not env.has_choice
 
 
-def test_a_sensible_rule_arrives_with_a_return_of_one():
+def test_a_hand_written_policy_arrives_with_a_return_of_one():
     env = PlatformEnv(500, seed=3)
     last, total = play(env, rule)
     success = env.results(last.select(*env.result_keys))["success"]
@@ -55,10 +56,11 @@ def test_a_sensible_rule_arrives_with_a_return_of_one():
 
 
 def test_random_actions_cover_less_than_a_sixth_of_the_course():
-    env, generator = PlatformEnv(2000), torch.Generator().manual_seed(0)
+    env = PlatformEnv(2000)
+    generator = torch.Generator().manual_seed(0)
     last, total = play(env, lambda _: random_action(env, generator))
     assert last[keys.DONE].all()
-    assert total.mean().item() == pytest.approx(0.154, abs=0.01)  # gym-platform has .154, error .002
+    assert total.mean().item() == pytest.approx(0.154, abs=0.01)  # gym-platform: .154, standard error .002
     torch.testing.assert_close(total, env.env_state()["x"] / COURSE)  # the rewards sum to the distance covered
 
 
@@ -72,7 +74,7 @@ def test_a_jump_that_is_too_short_falls():
     assert (reading[keys.REWARD] > 0.0).all()
 
 
-def test_who_waits_is_met_by_the_enemy():
+def test_an_agent_that_waits_meets_the_enemy():
     env = PlatformEnv(4)
     last, total = play(env, lambda _: action([RUN] * 4, [0.0] * 4), 9)
     assert last[keys.OUTCOME].tolist() == [MET_ENEMY] * 4
@@ -81,7 +83,7 @@ def test_who_waits_is_met_by_the_enemy():
     assert not env.results(last)["success"].any()
 
 
-def test_a_step_limit_truncates_and_an_end_at_it_terminates():
+def test_the_step_limit_truncates_but_an_end_in_the_last_step_terminates():
     env = PlatformEnv(2, max_steps=2)
     env.reset()
     assert not act(env, [RUN, RUN], [0.0, 0.0])[keys.DONE].any()
@@ -92,21 +94,23 @@ def test_a_step_limit_truncates_and_an_end_at_it_terminates():
     assert reading[keys.OUTCOME].tolist() == [TIME_LIMIT, FELL]
 
 
-def test_only_the_pressed_key_s_parameter_counts_and_is_clipped():
+def test_only_the_parameter_of_the_chosen_action_counts_and_is_clipped():
     given, inside = PlatformEnv(4), PlatformEnv(4)
     nan = math.nan
-    keys_pressed = [RUN, HOP, LEAP, RUN]
+    discrete = [RUN, HOP, LEAP, RUN]
     outside = torch.tensor([[1e9, nan, nan], [nan, 1e9, nan], [nan, nan, 1e9], [-5.0, nan, nan]])
-    given.reset(), inside.reset()
-    readings = act(given, keys_pressed, outside), act(inside, keys_pressed, [30.0, 720.0, 430.0, 0.0])
+    given.reset()
+    inside.reset()
+    readings = act(given, discrete, outside), act(inside, discrete, [30.0, 720.0, 430.0, 0.0])
     assert (readings[0] == readings[1]).all()
 
 
-def test_observations_lie_in_their_range_and_tell_where_everybody_is():
-    env, generator = PlatformEnv(300), torch.Generator().manual_seed(0)
+def test_observations_lie_in_their_range_and_encode_the_state():
+    env = PlatformEnv(300)
+    generator = torch.Generator().manual_seed(0)
     place(env, **random_columns(300, generator))
     columns = env.env_state()
-    # A step that is masked for all of them reads the state as it is.
+    # A step that is masked in every row returns the state as it is.
     still = env._step(random_action(env, generator).set("_step", torch.zeros(300, dtype=torch.bool)))
     observation = still[keys.OBSERVATION]
     assert (observation.abs() <= 1.0 + 1e-6).all()
@@ -123,7 +127,7 @@ def test_observations_lie_in_their_range_and_tell_where_everybody_is():
     torch.testing.assert_close(unit[:, 4:] * scale, course[here], rtol=0.0, atol=1e-3)
 
 
-def test_an_environment_s_episodes_do_not_depend_on_the_others():
+def test_the_episodes_of_an_environment_do_not_depend_on_the_others():
     few, many = PlatformEnv(3, seed=11), PlatformEnv(8, seed=11)
     readings = few.reset(), many.reset()
     for _ in range(6):
@@ -131,7 +135,7 @@ def test_an_environment_s_episodes_do_not_depend_on_the_others():
         actions[keys.DISCRETE][3:] = RUN
         readings = few.step(actions[:3].clone())["next"], many.step(actions.clone())["next"]
         assert (readings[0] == readings[1][:3]).all()
-        # Only some of the others start anew.
+        # Start new episodes only in some of the others.
         restart(many, readings[1], torch.arange(8) > 4)
 
 
@@ -150,13 +154,14 @@ def test_a_seed_fixes_the_noise(seed):
         assert (first[keys.OBSERVATION] != later[keys.OBSERVATION]).any(-1).all()
 
 
-def test_without_noise_seeds_make_no_difference():
+def test_without_noise_the_seed_makes_no_difference():
     readings = [play(PlatformEnv(2, noise=0.0, seed=seed), rule, 4)[0] for seed in (0, 1)]
     assert (readings[0] == readings[1]).all()
 
 
-def test_a_hundred_times_the_noise_still_makes_episodes():
-    env, generator = PlatformEnv(200, noise=100.0), torch.Generator().manual_seed(0)
+def test_episodes_stay_valid_with_a_hundred_times_the_noise():
+    env = PlatformEnv(200, noise=100.0)
+    generator = torch.Generator().manual_seed(0)
     last, total = play(env, lambda _: random_action(env, generator), 200)
     assert last[keys.OBSERVATION].isfinite().all()
     assert ((total >= 0.0) & (total <= 1.0)).all()
@@ -172,11 +177,13 @@ def test_global_generators_are_neither_moved_nor_read():
 
     with global_generators_unmoved():
         once = run()
-    torch.rand(3), np.random.rand(), random.random()
+    torch.rand(3)
+    np.random.rand()
+    random.random()
     assert (run() == once).all()
 
 
-def test_a_partial_reset_leaves_the_others_alone():
+def test_a_partial_reset_leaves_the_other_environments_alone():
     env = PlatformEnv(4)
     env.reset()
     reading = act(env, [RUN] * 4, [10.0] * 4)
@@ -184,7 +191,7 @@ def test_a_partial_reset_leaves_the_others_alone():
     mask = torch.tensor([False, True, False, True])
     fresh = restart(env, reading, mask)
     state = env.env_state()
-    assert is_as(env, before, ~mask)
+    assert is_unchanged(env, before, ~mask)
     assert (fresh[keys.OBSERVATION] == reading[keys.OBSERVATION]).all(-1).tolist() == [True, False, True, False]
     assert state["episode"].tolist() == [0, 1, 0, 1]
     assert (state["x"] > 0.0).tolist() == [True, False, True, False]
@@ -192,21 +199,23 @@ def test_a_partial_reset_leaves_the_others_alone():
 
 
 def test_a_finished_episode_stays_finished_and_earns_nothing():
-    env, generator = PlatformEnv(64), torch.Generator().manual_seed(0)
+    env = PlatformEnv(64)
+    generator = torch.Generator().manual_seed(0)
     env.reset()
     env.step(random_action(env, generator))
     before = snapshot(env)
     over = before["outcome"] != ON_THE_WAY
     assert 0 < over.sum() < 64
     after = env.step(random_action(env, generator))["next"]
-    assert is_as(env, before, over)
+    assert is_unchanged(env, before, over)
     assert after[keys.DONE][over].all()
     assert (after[keys.REWARD][over] == 0.0).all()
     assert (env.env_state()["steps"][~over] == 2).all()
 
 
-def test_what_was_returned_is_never_changed_later():
-    env, generator = PlatformEnv(16), torch.Generator().manual_seed(0)
+def test_returned_tensors_never_change_later():
+    env = PlatformEnv(16)
+    generator = torch.Generator().manual_seed(0)
     returned = [env.reset()]
     copies = [returned[0].clone()]
     columns = env.env_state()
@@ -220,7 +229,7 @@ def test_what_was_returned_is_never_changed_later():
     assert all(torch.equal(columns[name], column_copies[name]) for name in columns)
 
 
-def test_a_saved_state_goes_on_as_it_would_have():
+def test_a_restored_state_continues_as_the_original():
     env, copy = PlatformEnv(8, seed=2), PlatformEnv(8, seed=2)
     for _ in range(2):
         play(env, rule, 2)
@@ -230,7 +239,7 @@ def test_a_saved_state_goes_on_as_it_would_have():
         assert (results[0] == results[1]).all()
 
 
-def test_a_state_of_other_environments_is_refused_and_none_starts_anew():
+def test_a_state_of_other_environments_is_refused_and_an_empty_one_starts_new_episodes():
     env = PlatformEnv(3)
     play(env, rule, 2)
     before = snapshot(env)
@@ -238,7 +247,7 @@ def test_a_state_of_other_environments_is_refused_and_none_starts_anew():
         env.set_env_state(PlatformEnv(2).env_state())
     with pytest.raises(ValueError, match="not x, speed"):
         env.set_env_state({name: before[name] for name in ("x", "speed")})
-    assert is_as(env, before)
+    assert is_unchanged(env, before)
     env.set_env_state({})
     assert env.env_state()["steps"].tolist() == [0, 0, 0]
     assert env.env_state()["episode"].tolist() == [1, 1, 1]
@@ -247,28 +256,28 @@ def test_a_state_of_other_environments_is_refused_and_none_starts_anew():
 BAD_ACTIONS = {
     "nan": action([RUN, HOP], [0.1, math.nan]),
     "inf": action([RUN, HOP], [math.inf, 0.1]),
-    "key too large": action([0, 3], [0.1, 0.1]),
-    "key negative": action([-1, 0], [0.1, 0.1]),
-    "key of another shape": action([[0], [1]], torch.zeros(2, 3)),
+    "discrete action too large": action([0, 3], [0.1, 0.1]),
+    "discrete action negative": action([-1, 0], [0.1, 0.1]),
+    "discrete action of another shape": action([[0], [1]], torch.zeros(2, 3)),
     "one parameter each": action([0, 1], [[0.1], [0.1]]),
-    "fractional key": action([0.5, 1.0], [0.1, 0.1]),
-    "no key": action([0, 1], [0.1, 0.1]).exclude(keys.DISCRETE),
+    "fractional discrete action": action([0.5, 1.0], [0.1, 0.1]),
+    "no discrete action": action([0, 1], [0.1, 0.1]).exclude(keys.DISCRETE),
 }
 
 
 @pytest.mark.parametrize("name", BAD_ACTIONS)
-def test_a_bad_action_is_refused_and_harms_nothing(name):
+def test_an_invalid_action_is_refused_and_changes_nothing(name):
     env = PlatformEnv(2)
     env.reset()
     before = snapshot(env)
     with pytest.raises(ValueError, match="step: "):
         env.step(BAD_ACTIONS[name].clone())
-    assert is_as(env, before)
+    assert is_unchanged(env, before)
 
 
 @pytest.mark.parametrize(
     "arguments", [{"num_envs": 0}, {"max_steps": 0}, {"noise": -0.1}, {"noise": math.nan}], ids=str
 )
-def test_a_bad_argument_is_refused_by_name(arguments):
+def test_an_invalid_argument_is_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         PlatformEnv(**arguments)

@@ -1,4 +1,4 @@
-"""Actions in PlatformEnv come out as by the published rules, written down here for one agent, tick by tick."""
+"""Actions in PlatformEnv follow the published rules, which are written down here for one agent, tick by tick."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.platform.environment import ARRIVED, FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN, PlatformEnv
+from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.env.platform.rules import ARRIVED, FELL, HOP, LEAP, MET_ENEMY, ON_THE_WAY, RUN
 
-NUMBERS = 512  # random numbers that an action may take
+NUMBERS = 512  # random numbers of each action
 
 
 class ScalarCourse:
@@ -22,7 +23,10 @@ class ScalarCourse:
     TOP, WIDTH, HEIGHT, TICK = 40.0, 20.0, 30.0, 0.05
 
     def __init__(self, x: float, speed: float, enemy_x: float, enemy_speed: float) -> None:
-        self.x, self.y, self.speed, self.rise = x, self.TOP, speed, 0.0
+        self.x = x
+        self.y = self.TOP
+        self.speed = speed
+        self.rise = 0.0
         self.enemies = [[230.0, -30.0], [730.0, -30.0]]
         self.enemies[x > 475.0] = [enemy_x, enemy_speed]
 
@@ -34,14 +38,20 @@ class ScalarCourse:
         return self.y == self.TOP and any(left - self.WIDTH <= self.x <= right for left, right in self.PLATFORMS)
 
     def act(self, discrete: int, parameter: float, numbers: list[float]) -> tuple[float, int]:
-        """Return reward and outcome; `numbers` are normal: two for a jump, then the agent's and the enemy's a tick."""
-        start, tick, time_left = self.x, 0, 1.0
+        """Return reward and outcome.
+
+        `numbers` are normal: two for a jump, then one for the agent and one for the enemy each tick.
+        """
+        start = self.x
+        tick = 0
+        time_left = 1.0
         while True:
             self._choose(discrete, parameter, numbers, tick)
             self._patrol(numbers[3 + 2 * tick])
             self._move()
             outcome = self._outcome()
-            tick, time_left = tick + 1, time_left - self.TICK
+            tick = tick + 1
+            time_left = time_left - self.TICK
             if outcome != ON_THE_WAY or (time_left <= 0.0 if discrete == RUN else self.stands()):
                 return (self.x - start) / COURSE, outcome
 
@@ -49,11 +59,13 @@ class ScalarCourse:
         on_ground = self.stands()
         across, up = 0.0, -9.8
         if on_ground and discrete == RUN:
-            across, up = parameter / self.TICK, 0.0
+            across = parameter / self.TICK
+            up = 0.0
         elif on_ground:
             rise = 35.0 if discrete == HOP else 25.0
             change = min(max(parameter / (2.0 * rise / 9.8 + 1.0) - self.speed, -600.0), 200.0 - rise)
-            across, up = (change - abs(numbers[0])) / self.TICK, (rise - abs(numbers[1])) / self.TICK
+            across = (change - abs(numbers[0])) / self.TICK
+            up = (rise - abs(numbers[1])) / self.TICK
         self.speed += min(max(across, -600.0), 600.0) * self.TICK - abs(0.025 * numbers[2 + 2 * tick])
         self.speed = min(max(self.speed, 0.0), 70.0 if on_ground else 100.0)
         self.rise = min(max(self.rise + min(max(up, -4000.0), 4000.0) * self.TICK, -200.0), 200.0)
@@ -78,7 +90,8 @@ class ScalarCourse:
                 if aside is not None and abs(self.x - aside) < self.TOP - self.y:
                     self.x = aside
                 else:
-                    self.y, self.rise = self.TOP, 0.0
+                    self.y = self.TOP
+                    self.rise = 0.0
 
     def _outcome(self) -> int:
         if self.x >= COURSE:
@@ -89,23 +102,28 @@ class ScalarCourse:
 
 
 def numbers_of_next_action(env: PlatformEnv, seed: int) -> list[list[float]]:
-    """Return what the random numbers of every environment's next action are, `[N, NUMBERS]`."""
+    """Return the random numbers of every environment's next action, `[N, NUMBERS]`."""
     state = env.env_state()
     environment = torch.arange(env.num_envs, dtype=torch.int32)
     rng = counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.NOISE, environment, state["episode"])
-    sample = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
-    return counter_rng.normal(rng.unsqueeze(-1), sample).tolist()
+    index = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
+    return counter_rng.normal(rng.unsqueeze(-1), index).tolist()
 
 
 def compare(
     env: PlatformEnv, courses: list[ScalarCourse], actions: TensorDict, seed: int, noise: float
 ) -> tuple[Tensor, list[int]]:
-    """Do one action in every unfinished environment and by the published rules; return observation and outcomes."""
+    """Take one action in the environments and by the published rules, and compare the results where no episode is over.
+
+    Return the observation and the outcomes of the compared environments.
+    """
     over = env.env_state()["outcome"] != ON_THE_WAY
     numbers = numbers_of_next_action(env, seed)
     reading = env.step(actions.clone())["next"]
-    discrete, parameter = actions[keys.DISCRETE].tolist(), actions[keys.PARAMETERS].tolist()
-    rewards, got_outcomes = reading[keys.REWARD].squeeze(-1).tolist(), reading[keys.OUTCOME].tolist()
+    discrete = actions[keys.DISCRETE].tolist()
+    parameter = actions[keys.PARAMETERS].tolist()
+    rewards = reading[keys.REWARD].squeeze(-1).tolist()
+    got_outcomes = reading[keys.OUTCOME].tolist()
     names = ("x", "speed", "enemy_x", "enemy_speed")
     state = list(zip(*(env.env_state()[name].tolist() for name in names), strict=True))
     outcomes = []
@@ -123,26 +141,32 @@ def compare(
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
 def test_actions_from_anywhere_follow_the_published_rules(noise):
-    num, seed, generator = 500, 5, torch.Generator().manual_seed(1)
+    num = 500
+    seed = 5
+    generator = torch.Generator().manual_seed(1)
     env = PlatformEnv(num, noise=noise, seed=seed)
     place(env, **random_columns(num, generator))
     state = env.env_state()
     columns = (state[name].tolist() for name in ("x", "speed", "enemy_x", "enemy_speed"))
     courses = [ScalarCourse(*column) for column in zip(*columns, strict=True)]
-    outcomes = [
-        outcome for _ in range(3) for outcome in compare(env, courses, random_action(env, generator), seed, noise)[1]
-    ]
+    outcomes = []
+    for _ in range(3):
+        outcomes += compare(env, courses, random_action(env, generator), seed, noise)[1]
     assert min(outcomes.count(outcome) for outcome in (ON_THE_WAY, ARRIVED, FELL, MET_ENEMY)) > 50
 
 
 def test_episodes_from_start_to_end_follow_the_published_rules():
-    num, seed, generator = 100, 2**40 + 7, torch.Generator().manual_seed(2)
+    num = 100
+    seed = 2**40 + 7
+    generator = torch.Generator().manual_seed(2)
     env = PlatformEnv(num, seed=seed)
-    observation, courses = env.reset()[keys.OBSERVATION], [ScalarCourse(0.0, 0.0, 230.0, -30.0) for _ in range(num)]
+    observation = env.reset()[keys.OBSERVATION]
+    courses = [ScalarCourse(0.0, 0.0, 230.0, -30.0) for _ in range(num)]
     ends = []
     for _ in range(12):
         careless = torch.rand(num, 1, generator=generator) < 0.1
-        by_rule, by_chance = rule(observation), random_action(env, generator)
+        by_rule = rule(observation)
+        by_chance = random_action(env, generator)
         discrete = torch.where(careless.squeeze(-1), by_chance[keys.DISCRETE], by_rule[keys.DISCRETE])
         parameter = torch.where(careless, by_chance[keys.PARAMETERS], by_rule[keys.PARAMETERS])
         observation, outcomes = compare(env, courses, action(discrete, parameter), seed, 1.0)
@@ -152,11 +176,11 @@ def test_episodes_from_start_to_end_follow_the_published_rules():
 
 
 @pytest.mark.parametrize(("edge", "inwards"), [(250.0, -1.0), (455.0, 1.0)])
-def test_who_comes_down_at_an_edge_is_thrown_out_on_the_shorter_way(edge, inwards):
+def test_an_agent_that_comes_down_at_an_edge_is_pushed_out_on_the_shorter_way(edge, inwards):
     env = PlatformEnv(3, noise=0.0)
     place(env, x=200.0, speed=70.0, enemy_x=0.0)
     act(env, [LEAP] * 3, [430.0] * 3)
-    flight = env.env_state()["x"] - 200.0  # which ends in the gap, 1.2 px below the top
+    flight = env.env_state()["x"] - 200.0  # it ends in the gap, 1.2 px below the top
     aims = edge + inwards * torch.tensor([-0.5, 0.6, 1.8])
     env.reset()
     place(env, x=aims - flight, speed=70.0, enemy_x=0.0)

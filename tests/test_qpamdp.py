@@ -1,4 +1,4 @@
-"""Q-PAMDP: both halves by themselves against known answers, and how they take turns."""
+"""Q-PAMDP: each of its two learners against known answers, and how they take turns."""
 
 import itertools
 
@@ -13,7 +13,7 @@ from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, Sar
 from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients
 from hpamdp.specs import PAMDPSpecs
 
-# Two keys with a parameter each and one without.
+# Two discrete actions with a parameter each and one without.
 SPECS = PAMDPSpecs(2, (), (1, 1, 0), (0.0, -2.0), (2.0, 2.0))
 
 OPTIONS = dict(
@@ -31,7 +31,10 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> QPAMDP:
 
 
 def play(learner: QPAMDP, num_envs: int = 64, num_steps: int = 2) -> TensorDict:
-    """Play episodes of one press: the nearer key 0's parameter is to -.4 and key 1's to .6, the higher the reward."""
+    """Play episodes of one step.
+
+    The reward is the higher, the nearer the parameter of discrete action 0 is to -0.4 and that of action 1 to 0.6.
+    """
     td = TensorDict({keys.OBSERVATION: torch.rand(num_envs, num_steps, learner.specs.observation_dim)})
     td.batch_size = [num_envs, num_steps]
     td = learner.policy(td)
@@ -64,14 +67,14 @@ def ready(**changes) -> QPAMDP:
 @pytest.mark.parametrize(
     ("num_inputs", "order", "max_coupled"), [(1, 3, 1), (3, 2, 1), (3, 2, 2), (3, 2, 3), (2, 4, 9)]
 )
-def test_the_fourier_basis_has_every_term_that_couples_few_enough_inputs(num_inputs, order, max_coupled):
+def test_the_fourier_basis_has_every_term_of_few_enough_inputs(num_inputs, order, max_coupled):
     rows = fourier_coefficients(num_inputs, order, max_coupled).long().tolist()
     everything = itertools.product(range(order + 1), repeat=num_inputs)
     expected = [row for row in everything if sum(c > 0 for c in row) <= max_coupled]
     assert sorted(map(tuple, rows)) == sorted(expected) and rows[0] == [0] * num_inputs
 
 
-def test_features_are_cosines_of_the_entries_that_vary_scaled_to_their_range():
+def test_features_are_cosines_of_the_varying_entries_scaled_to_their_ranges():
     learner = make(phi_order=2, phi_max_coupled=1, warmup_frames=4)
     batch = play(learner, 2, 2)
     batch[keys.OBSERVATION] = torch.tensor([[[3.0, 7.0], [5.0, 7.0]], [[4.0, 7.0], [3.5, 7.0]]])
@@ -81,36 +84,47 @@ def test_features_are_cosines_of_the_entries_that_vary_scaled_to_their_range():
     torch.testing.assert_close(features, expected, atol=1e-6, rtol=0.0)
 
 
-def test_entries_that_are_not_there_are_refused():
+def test_entries_outside_the_observation_are_refused():
     with pytest.raises(ValueError, match="entries 0 to 1"):
         make(features=[0, 2])
 
 
 def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
-    rows = {"phi": torch.tensor(phi), "next_phi": torch.tensor(next_phi), "discrete": torch.tensor(discrete)}
-    rows |= {"reward": torch.tensor(reward), "terminated": torch.tensor(terminated), "done": torch.tensor(done)}
-    return TensorDict({**rows, "mask": torch.ones(2, len(discrete[0]), dtype=torch.bool)}, [2, len(discrete[0])])
+    shape = (2, len(discrete[0]))
+    return TensorDict(
+        {
+            "phi": torch.tensor(phi),
+            "next_phi": torch.tensor(next_phi),
+            "discrete": torch.tensor(discrete),
+            "reward": torch.tensor(reward),
+            "terminated": torch.tensor(terminated),
+            "done": torch.tensor(done),
+            "mask": torch.ones(shape, dtype=torch.bool),
+        },
+        shape,
+    )
 
 
-def test_sarsa_does_what_a_computation_by_hand_gives():
-    # One feature, two keys, gamma .5, lambda .5, a step too small for the bound to matter.
+def test_sarsa_matches_a_computation_by_hand():
+    # One feature, two discrete actions, gamma 0.5, lambda 0.5, a step too small for the bound to matter.
     sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.1, temperature=1.0)
     w = torch.tensor([[1.0], [2.0]])
-    # Environment 0 goes on, environment 1 ends its episode with the first press.
+    # Environment 0 goes on after the first step, environment 1 ends its episode there.
     phi, next_phi = [[[1.0], [2.0]], [[1.0], [1.0]]], [[[2.0], [1.0]], [[9.0], [2.0]]]
     ends = [[False, True], [True, False]]
     first = sarsa_rows(phi, next_phi, [[0, 1], [1, 0]], [[1.0, 0.0], [0.0, 1.0]], ends, ends)
     got, _ = sarsa.update(w, first)
-    # Press 1: errors 1 + .5 * (2 * 2) - 1 = 2 along key 0's trace 1; 0 - 2 = -2 along key 1's trace 1.
+    # Step 1: error 1 + 0.5 * (2 * 2) - 1 = 2 along action 0's trace 1; error 0 - 2 = -2 along action 1's trace 1.
     w1 = [1.0 + 0.1 * 0.5 * 2.0, 2.0 - 0.1 * 0.5 * 2.0]
-    # Press 2: environment 0 ends: traces (.25, 2), error -2 w[1]; 1: traces (1, 0), next key unknown.
+    # Step 2: environment 0 ends with traces (0.25, 2) and error -2 w[1]; environment 1 has traces (1, 0) and an unknown
+    # next action.
     q = torch.tensor(w1) * 2.0
     error_0, error_1 = -2.0 * w1[1], 1.0 + 0.5 * float((q.softmax(0) * q).sum()) - w1[0]
     w2 = [w1[0] + 0.05 * (0.25 * error_0 + error_1), w1[1] + 0.05 * 2.0 * error_0]
     torch.testing.assert_close(got, torch.tensor(w2).unsqueeze(-1))
     torch.testing.assert_close(sarsa.traces.squeeze(-1), torch.tensor([[0.0, 0.0], [1.0, 0.0]]))
 
-    # The next batch: environment 1's trace goes on, environment 0 begins anew; both end.
+    # The next batch: environment 1's trace goes on, environment 0 begins a new episode; both end.
     ends = [[True], [True]]
     second = sarsa_rows([[[1.0]], [[2.0]]], [[[0.0]], [[0.0]]], [[0], [1]], [[1.0], [1.0]], ends, ends)
     got, _ = sarsa.update(torch.tensor(w2).unsqueeze(-1), second)
@@ -120,7 +134,7 @@ def test_sarsa_does_what_a_computation_by_hand_gives():
     assert (sarsa.traces == 0.0).all()
 
 
-def test_the_bound_shortens_sarsas_step_to_one_that_cancels_the_error():
+def test_the_bound_shortens_sarsas_step_to_cancel_the_error():
     sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=1.0, temperature=1.0)
     ends = [[True], [True]]
     rows = sarsa_rows([[[3.0]], [[3.0]]], [[[0.0]], [[0.0]]], [[0], [0]], [[6.0], [6.0]], ends, ends)
@@ -129,7 +143,7 @@ def test_the_bound_shortens_sarsas_step_to_one_that_cancels_the_error():
     assert error == 36.0
 
 
-def test_the_natural_gradient_leads_to_the_optimum():
+def test_the_natural_gradient_finds_the_best_parameters():
     torch.manual_seed(0)
     learner = ready(
         initial_episodes=100, parameter_updates=1000, rollouts=2000, natural_step_size=10.0, max_divergence=10.0
@@ -139,7 +153,7 @@ def test_the_natural_gradient_leads_to_the_optimum():
     torch.testing.assert_close(mean, torch.tensor([-0.4, 0.6]).expand(200, 2), atol=0.08, rtol=0.0)
 
 
-def test_the_regression_is_least_squares_on_whole_episodes_that_span_batches():
+def test_the_regression_is_least_squares_on_whole_episodes_across_batches():
     learner = ready(parameter_updates=1000, rollouts=10_000, ridge=0.0, initial_episodes=1)
     learn(learner, 1)
     assert learner.phase == PARAMETERS
@@ -169,7 +183,7 @@ def test_the_regression_is_least_squares_on_whole_episodes_that_span_batches():
     )
 
 
-def test_the_phases_take_turns_and_freeze_the_other_half():
+def test_the_phases_take_turns_and_leave_the_other_weights_alone():
     torch.manual_seed(0)
     learner = ready()
     phases = []
@@ -180,22 +194,22 @@ def test_the_phases_take_turns_and_freeze_the_other_half():
         assert torch.equal(w, learner.policy.w) == (phase == PARAMETERS)
         assert torch.equal(theta, learner.policy.theta) == (updates == learner.updates)
         phases.append(phase)
-    # 100 episodes a batch: one of Sarsa, three updates of a batch each, and again.
+    # A batch has 100 episodes: one batch of Sarsa, then three parameter updates of a batch each, and so on.
     assert phases == ([SARSA] + 3 * [PARAMETERS]) * 6 + [SARSA]
     assert learner.updates == 18
 
 
-def test_without_a_number_of_updates_a_turn_lasts_until_the_return_sets_no_more_records():
+def test_without_a_number_of_updates_a_phase_lasts_until_the_return_sets_no_more_records():
     torch.manual_seed(0)
     learner = ready(parameter_updates=None, patience=4, rollouts=400, max_divergence=0.05)
-    turns = [0]
+    lengths = [0]  # of the phases, in batches
     for _ in range(150):
         phase = int(learner.phase)
         learn(learner, 1, num_envs=200)
-        turns[-1] += 1
+        lengths[-1] += 1
         if learner.phase != phase:
-            turns.append(0)
-    assert len(turns) > 4 and turns[1] > 5, "the first parameter phase has the most to gain"
+            lengths.append(0)
+    assert len(lengths) > 4 and lengths[1] > 5, "the first parameter phase has the most to gain"
     assert (learner.policy.theta[:, 0] - torch.tensor([-0.4, 0.6])).abs().max() < 0.1
 
 
@@ -208,11 +222,11 @@ def test_sigma_is_the_standard_deviation_of_the_parameters():
     learn(learner, 2)
     assert learner.phase == PARAMETERS
     learn(learner, 20)
-    assert learner.policy.sigma == pytest.approx(0.1), "decayed to its lower limit"
+    assert learner.policy.sigma == pytest.approx(0.1), "it decays to sigma_final"
 
 
 @pytest.mark.parametrize("dims", [(0, 0), (0, 2, 1)])
-def test_keys_of_any_number_of_parameters_work(dims):
+def test_discrete_actions_with_any_number_of_parameters_work(dims):
     torch.manual_seed(0)
     specs = PAMDPSpecs(2, (), dims, (0.0,) * sum(dims), (1.0,) * sum(dims))
     learner = make(specs, step_size=0.5)
@@ -233,18 +247,18 @@ def test_keys_of_any_number_of_parameters_work(dims):
     assert (td[keys.DISCRETE] == 1).all() and td[keys.PARAMETERS].shape == (64, sum(dims))
 
 
-def test_the_greedy_policy_draws_nothing_and_stays_in_bounds():
+def test_the_greedy_policy_samples_nothing_and_stays_in_bounds():
     learner = ready(sigma=3.0)
     td = TensorDict({keys.OBSERVATION: torch.rand(100, 2)}, [100])
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
-    duration = learner.policy(td.clone())[keys.PARAMETERS]
-    assert (duration >= low).all() and (duration <= high).all()
+    parameters = learner.policy(td.clone())[keys.PARAMETERS]
+    assert (parameters >= low).all() and (parameters <= high).all()
     with global_generators_unmoved(), GREEDY:
         td = learner.policy(td)
     torch.testing.assert_close(td[RAW], learner.policy.psi(td[keys.OBSERVATION]) @ learner.policy.theta.T)
 
 
-def test_rows_of_another_learner_change_nothing():
+def test_rows_of_other_learners_change_nothing():
     learners = [ready(), ready()]
     learners[1].load_state_dict(learners[0].state_dict())
     batch, mask = play(learners[0], 20, 2), (torch.arange(20) < 10).unsqueeze(-1).expand(20, 2)
@@ -256,7 +270,7 @@ def test_rows_of_another_learner_change_nothing():
     assert learners[0].window_episodes == 20
 
 
-def test_a_saved_state_fits_a_new_learner_and_goes_on_the_same():
+def test_a_state_dict_restores_a_learner_that_goes_on_the_same():
     torch.manual_seed(0)
     learner, other = make(), make()
     learn(learner, 5)

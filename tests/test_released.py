@@ -1,4 +1,4 @@
-"""ReleasedBoatDockEnv plays by the released code's rules, to the last digit of its recorded episodes."""
+"""ReleasedBoatDockEnv follows the released code's rules, to the last digit of its recorded episodes."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from released_players import (
     end,
     layouts,
     load_replay,
+    observed,
     one,
     place,
     press,
-    seen,
 )
 
 from hpamdp import keys
@@ -50,7 +50,7 @@ def test_every_recorded_trace_is_reproduced(file, dtype, tolerance):
     assert difference < tolerance
 
 
-def test_replay_tells_the_same_from_another_and_from_no_trace_at_all(tmp_path, monkeypatch, capsys):
+def test_replay_exits_with_0_for_the_same_trace_1_for_another_and_2_for_none(tmp_path, monkeypatch, capsys):
     other = json.loads(json.dumps(RECORDED))
     other["steps"][2]["reward"] += 1e-6
     for episodes, code in (([RECORDED], 0), ([RECORDED, other], 1), ({"a": 1}, 2), ([{"controller": 1}], 2), ([], 2)):
@@ -64,14 +64,14 @@ def test_replay_tells_the_same_from_another_and_from_no_trace_at_all(tmp_path, m
 
 
 @pytest.mark.parametrize("change", [{"done": True}, {"success": True}, {"reward": math.nan}], ids=str)
-def test_replay_finds_a_wrong_flag_and_a_number_that_is_none(change):
+def test_replay_finds_a_wrong_flag_and_a_nan(change):
     other = json.loads(json.dumps(RECORDED))
     other["steps"][1].update(change)
     assert load_replay().replay([other])[1] == math.inf
 
 
 @pytest.mark.parametrize(("seconds", "px"), [(0.1, 33.333), (0.2, 66.66), (0.31, -16.0415), (5.0, -1_958_437.5)])
-def test_a_press_of_more_than_three_tenths_of_a_second_throws_the_boat_backwards(seconds, px):
+def test_a_press_of_more_than_three_tenths_of_a_second_moves_the_boat_backwards(seconds, px):
     assert released.reach(torch.tensor(seconds, dtype=torch.float64)).item() == pytest.approx(px, rel=1e-3)
 
 
@@ -88,7 +88,7 @@ def test_keys_push_where_the_key_map_says(controller, keymap, expected):
     for key, (x, y) in enumerate(expected):
         given = {} if keymap is None else {"keymap": keymap}
         place(env, (640.0, 512.0), (600.0, 440.0), **given)
-        after = seen(press(env, key, -0.96))
+        after = observed(press(env, key, -0.96))
         assert (after[X] - 640.0, after[Y] - 512.0) == pytest.approx((33.333 * x, 33.333 * y), abs=1e-3)
         assert after[VELOCITY] == pytest.approx([x, y], abs=1e-6)  # 10 x .1 s
         assert after[7:9] == [float(controller == "congruent"), -1 if keymap is None else keymap]
@@ -99,32 +99,32 @@ def test_durations_outside_their_bounds_are_clipped():
     for duration in (-1.0, -1.5):
         env = one()
         place(env, (640.0, 512.0), (600.0, 440.0))
-        results.append(seen(press(env, 0, duration)))
+        results.append(observed(press(env, 0, duration)))
     assert results[0] == results[1]
 
 
-def test_the_duration_is_rounded_as_float32_whatever_the_type_of_the_rest():
+def test_the_duration_is_rounded_as_float32_whatever_the_dtype_of_the_rest():
     u = np.float32(0.1234567)
     env = one()
     place(env, (640.0, 512.0), (600.0, 440.0))
-    speed = -seen(press(env, 1, float(u)))[12]
+    speed = -observed(press(env, 1, float(u)))[12]
     assert speed == 10.0 * float((u + np.float32(1)) / np.float32(2) * np.float32(5))
     assert speed != 10.0 * 2.5 * (float(u) + 1.0)
 
 
-def test_idling_at_minus_one_refuels_without_limit_and_success_pays_for_it():
+def test_idling_at_minus_one_refuels_without_limit_and_success_rewards_the_fuel():
     env = one()
     place(env, (640.0, 512.0), (640.0, 440.0))
     for idle in range(1, 401):
         td = press(env, 1, IDLE)
-        assert seen(td)[FUEL] == pytest.approx(1.0 + idle / 5.0)
+        assert observed(td)[FUEL] == pytest.approx(1.0 + idle / 5.0)
         assert td[keys.REWARD].item() == 0.0
     outcome, reward, terminated, truncated = end(press(env, 1, STEP))
     assert (outcome, terminated, truncated) == (SUCCESS, True, False)
     assert reward == pytest.approx(2.0 * (5.0 + 400.0 + 0.92))
 
 
-def test_the_reward_under_way_is_the_distance_covered_as_a_share_of_the_start_s():
+def test_the_reward_before_the_end_is_the_decrease_of_the_distance_as_a_share_of_that_at_the_start():
     env = one()
     place(env, (640.0, 570.0), (640.0, 450.0))
     outcome, reward, *flags = end(press(env, 1, -0.96))
@@ -132,9 +132,11 @@ def test_the_reward_under_way_is_the_distance_covered_as_a_share_of_the_start_s(
     assert reward == pytest.approx(33.333 / 120.0, abs=1e-4)
 
 
-def with_fuel(env: ReleasedBoatDockEnv, fuel: float, **more) -> None:
-    columns = {"fuel": torch.tensor([fuel]).double(), **more}
-    env.set_env_state({**env.env_state(), **columns})
+def set_fuel_and_steps(env: ReleasedBoatDockEnv, fuel: float, steps: int) -> None:
+    state = env.env_state()
+    state["fuel"] = torch.tensor([fuel], dtype=torch.float64)
+    state["steps"] = torch.tensor([steps])
+    env.set_env_state(state)
 
 
 @pytest.mark.parametrize(
@@ -149,10 +151,12 @@ def with_fuel(env: ReleasedBoatDockEnv, fuel: float, **more) -> None:
         ((640.0, 512.0), 1, STEP, 5.0, 997, SUCCESS),
     ],
 )
-def test_time_limit_comes_before_fuel_before_walls_before_the_dock(start, key, duration, fuel, steps, expected):
+def test_where_several_outcomes_apply_the_time_limit_beats_fuel_beats_walls_beats_the_dock(
+    start, key, duration, fuel, steps, expected
+):
     env = one()
     place(env, start, (640.0, 440.0))
-    with_fuel(env, fuel, steps=torch.tensor([steps]))
+    set_fuel_and_steps(env, fuel, steps)
     outcome, reward, terminated, truncated = end(press(env, key, duration))
     assert outcome == expected
     assert reward == pytest.approx({SUCCESS: 2.0 * (fuel + 0.92), OUT_OF_FUEL: -1.0}.get(expected, 0.0))
@@ -168,12 +172,12 @@ def test_time_limit_comes_before_fuel_before_walls_before_the_dock(start, key, d
         ("lower", (640.0, 570.0), 2, SAILING),
     ],
 )
-def test_two_walls_end_the_episode_for_nothing_and_two_are_free(name, start, key, expected):
+def test_the_left_and_upper_walls_end_the_episode_with_reward_0_and_the_others_do_not(name, start, key, expected):
     env = one()
     place(env, start, (640.0, 512.0))
     td = press(env, key, STEP)
     assert td[keys.OUTCOME].item() == expected
-    shown = seen(td)
+    shown = observed(td)
     if expected == WALL:
         assert td[keys.REWARD].item() == 0.0
         assert tuple(shown[X : Y + 1]) == start and shown[DISTANCE] == 1.0
@@ -181,32 +185,32 @@ def test_two_walls_end_the_episode_for_nothing_and_two_are_free(name, start, key
         assert shown[X] == 707.0 if name == "right" else shown[Y] == 579.0
 
 
-def test_the_start_is_shown_raw_until_the_first_move_which_goes_from_within_bounds():
+def test_a_start_out_of_bounds_is_shown_as_it_is_but_the_first_move_starts_within_bounds():
     env = one()
     td = place(env, (715.0, 588.0), (640.0, 440.0))
-    assert seen(td)[X : Y + 1] == [715.0, 588.0]
-    after = seen(press(env, 1, IDLE))
+    assert observed(td)[X : Y + 1] == [715.0, 588.0]
+    after = observed(press(env, 1, IDLE))
     assert after[X : Y + 1] == [707.0, 579.0]
 
 
-def test_the_goal_is_within_bounds_for_the_dock_but_not_for_the_distance():
+def test_the_goal_is_clamped_for_the_dock_but_not_for_the_distance():
     env = one()
     place(env, (640.0, 512.0), (715.0, 555.0))
     # A press to (698, 545.5): within 10 px of (707, 555), but not of the goal itself.
     outcome, reward, *_ = end(press(env, 2, -0.9196))
     assert outcome == SUCCESS and reward > 10.0
-    assert seen(env.step(action([2], [IDLE]))["next"])[DISTANCE] == 1.0
+    assert observed(env.step(action([2], [IDLE]))["next"])[DISTANCE] == 1.0
     place(env, (640.0, 512.0), (715.0, 588.0))
-    after = seen(press(env, 2, -0.96))
+    after = observed(press(env, 2, -0.96))
     expected = math.hypot(715.0 - after[X], 588.0 - after[Y]) / math.hypot(75.0, 76.0)
     assert after[DISTANCE] == pytest.approx(expected)
 
 
-def test_the_velocity_outlives_a_reset_but_fuel_and_position_do_not():
+def test_a_reset_keeps_the_velocity_but_resets_fuel_and_position():
     env = one()
     place(env, (640.0, 512.0), (640.0, 440.0))
-    before = seen(press(env, 2, -0.96))
-    again = seen(env.reset())
+    before = observed(press(env, 2, -0.96))
+    again = observed(env.reset())
     assert again[VELOCITY] == before[VELOCITY] != [0.0, 0.0]
     assert again[X:11] == [640.0, 512.0] and again[FUEL:] == [1.0, 1.0]
 
@@ -219,7 +223,7 @@ def test_the_time_limit_is_the_999th_step():
     assert end(press(env, 0, IDLE)) == (TIME_LIMIT, 0.0, False, True)
 
 
-def test_a_layout_is_frozen_for_life_unless_told_otherwise():
+def test_layouts_are_frozen_for_life_by_default_and_new_each_episode_otherwise():
     frozen, fresh = ReleasedBoatDockEnv(50), ReleasedBoatDockEnv(50, frozen_layouts=False)
     first = layouts(frozen.reset())
     assert (layouts(frozen.reset()) == first).all()
@@ -230,7 +234,7 @@ def test_a_layout_is_frozen_for_life_unless_told_otherwise():
     assert (layouts(frozen.reset()) == layouts(frozen.reset(frozen.fixed_episodes(0)))).all()
 
 
-def test_key_map_zero_is_drawn_again_at_every_reset_until_it_is_one():
+def test_key_map_zero_is_sampled_again_at_every_reset_until_it_is_one():
     env = ReleasedBoatDockEnv(400, controller="incongruent")
     last = torch.zeros(400)
     shares = []
@@ -246,7 +250,7 @@ def test_key_map_zero_is_drawn_again_at_every_reset_until_it_is_one():
 
 
 @pytest.mark.parametrize("test_mode", [None, 0, 1])
-def test_layouts_are_whole_apart_and_of_their_test_mode(test_mode):
+def test_layouts_are_whole_pixels_far_enough_apart_and_of_their_test_mode(test_mode):
     env = ReleasedBoatDockEnv(2_000, test_mode=test_mode)
     for points in (layouts(env.reset()), torch.cat(list(env.fixed_episodes(3).values()), -1)):
         assert (points == points.round()).all()
@@ -258,7 +262,7 @@ def test_layouts_are_whole_apart_and_of_their_test_mode(test_mode):
 
 
 def is_test_layout(*layout: float) -> bool:
-    """Tell by angles whether the bearing between the clamped icons is under 30 degrees off 90, 210 or 330 (y down)."""
+    """Return whether the bearing between the clamped points is less than 30 degrees from 90, 210 or 330 (y down)."""
     x, y, goal_x, goal_y = (min(value, high) for value, high in zip(layout, (707, 579) * 2, strict=True))
     bearing = math.degrees(math.atan2(goal_y - y, goal_x - x))
     return abs((bearing - 90.0 + 60.0) % 120.0 - 60.0) < 30.0 - 1e-9

@@ -1,19 +1,21 @@
-"""What all selectors have in common, and those that learn nothing."""
+"""What all selectors have in common, the selectors that learn nothing, and the random agent."""
+
+import textwrap
 
 import pytest
 import torch
-from conftest import choices, compose_config
+from conftest import choices, make_config
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from toy_bandits import CPU, SPECS, due
+from toy_bandits import CPU, SPECS, constant, due, play
 from toy_options import Stepper, Toll
 
 from hpamdp import keys
-from hpamdp.config import run_config
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.env.decisions import with_decisions
+from hpamdp.policies import base as policies_base
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
 from hpamdp.policies.high_level.actor import LOG_PROB, Actor
@@ -23,13 +25,25 @@ from hpamdp.policies.high_level.human import Human
 from hpamdp.policies.high_level.oracle import Oracle
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
+from hpamdp.policies.random_agent import random_agent
+from hpamdp.policies.shared.fractions import Fraction
 from hpamdp.run.assemble import assemble
 from hpamdp.specs import PAMDPSpecs
 
 
 def make_actor(specs: PAMDPSpecs) -> Actor:
-    options = dict(hidden_dims=[16], gamma=1.0, epochs=1, minibatch_size=8, clip=0.2, entropy=0.0)
-    return Actor(specs, CPU, **options, lr=1e-3, max_grad_norm=1.0)
+    return Actor(
+        specs,
+        CPU,
+        hidden_dims=[16],
+        gamma=1.0,
+        epochs=1,
+        minibatch_size=8,
+        clip=0.2,
+        entropy=0.0,
+        lr=1e-3,
+        max_grad_norm=1.0,
+    )
 
 
 def make_exp3(specs: PAMDPSpecs) -> Exp3:
@@ -37,7 +51,7 @@ def make_exp3(specs: PAMDPSpecs) -> Exp3:
 
 
 class Counter(Selector):
-    """Choose 0, 1, 0, 1 ... at its calls, and say at which."""
+    """Choose 0, 1, 0, 1, ... at successive calls, and write the number of the call."""
 
     def __init__(self) -> None:
         super().__init__(SPECS)
@@ -50,7 +64,7 @@ class Counter(Selector):
         return {keys.OPTION: (call - 1) % 2, "call": call}
 
 
-def test_all_that_a_choice_tells_is_held_where_no_decision_is_due():
+def test_all_keys_of_a_choice_are_held_where_no_decision_is_due():
     counter, root = Counter(), due(4)
     first = counter(root)
     assert first[keys.OPTION].tolist() == [0] * 4 and first["call"].tolist() == [1] * 4
@@ -62,7 +76,7 @@ def test_all_that_a_choice_tells_is_held_where_no_decision_is_due():
 
 
 def probability_now(selector: Selector, rows: TensorDict) -> torch.Tensor:
-    """Return the (log-)probability of the rows' options as the selector would choose now."""
+    """Return the (log-)probability with which the selector would choose the rows' options now."""
     option = rows[keys.OPTION]
     if isinstance(selector, Exp3):
         return selector.probabilities.float()[option]
@@ -86,18 +100,19 @@ def test_a_choices_probability_is_held_with_the_option_while_the_selector_learns
         now.append(probability_now(selector, batch))
         agent.learn(batch)
     collector.shutdown()
-    rows, now = torch.cat(rows, 1), torch.cat(now, 1)
+    rows = torch.cat(rows, 1)
+    now = torch.cat(now, 1)
     is_decision = rows[keys.IS_DECISION].squeeze(-1)
     torch.testing.assert_close(rows[key][is_decision], now[is_decision])
     goes_on = ~is_decision[:, 1:]
     assert goes_on.sum() > 50 and is_decision.sum() > 20
     for held in (keys.OPTION, key):
         assert torch.equal(rows[held][:, 1:][goes_on], rows[held][:, :-1][goes_on])
-    assert not torch.isclose(rows[key], now).all(), "the selector has learned while options were held"
+    assert not torch.isclose(rows[key], now).all(), "the selector has not learned while options were held"
 
 
 @pytest.mark.parametrize(("make", "key"), [(make_actor, LOG_PROB), (make_exp3, PROBABILITY)])
-def test_a_finished_decision_tells_the_probability_at_the_decision(make, key):
+def test_a_finished_decision_has_the_probability_it_was_made_with(make, key):
     torch.manual_seed(0)
     env = with_decisions(BoatDockEnv(6))
     specs = PAMDPSpecs.from_env(env)
@@ -110,28 +125,58 @@ def test_a_finished_decision_tells_the_probability_at_the_decision(make, key):
     torch.testing.assert_close(ended[key], probability_now(selector, decided))
 
 
+class Keeper(Stepper):
+    """Count the transitions of a data set."""
+
+    def add_demonstrations(self, batch: TensorDict, mask: torch.Tensor) -> None:
+        self.num_kept = mask.sum().item()
+
+
+@pytest.mark.parametrize("make", [make_actor, make_exp3])
+def test_a_selector_that_learns_from_its_own_choices_alone_leaves_a_data_set_to_the_learners(make):
+    torch.manual_seed(0)
+    env = with_decisions(Toll(4), option_length=3)
+    specs = PAMDPSpecs.from_env(env)
+    data_set = env.rollout(12, random_agent(specs, CPU).policy, break_when_any_done=False)
+    selector = make(specs)
+    before = {name: value.clone() for name, value in selector.named_parameters()}
+    agent = HierarchicalAgent(selector, [Keeper(specs), Keeper(specs)], specs)
+    agent.add_demonstrations(data_set)
+    assert [learner.num_kept for learner in agent.learners] == torch.bincount(data_set[keys.OPTION].flatten()).tolist()
+    assert all(torch.equal(value, before[name]) for name, value in selector.named_parameters())
+
+
+def test_the_example_in_the_documentation_of_selectors_learns_the_better_option():
+    source = textwrap.dedent(Selector.__doc__.partition("::\n")[2].partition("\n    Constructor")[0])
+    names = {**vars(policies_base), "Fraction": Fraction}
+    exec(source, names)
+    torch.manual_seed(0)
+    options, _ = play(names["GreedyMean"](SPECS, epsilon=0.1), constant(0.0, 1.0), 600, noise=0.5)
+    assert options[-200:].float().mean() > 0.8
+
+
 @pytest.mark.parametrize(("option", "number"), [("left", 0), ("right", 1), (1, 1)])
 def test_fixed_chooses_by_name_or_number(option, number):
     assert Fixed(SPECS, option=option).select(due(3)).tolist() == [number] * 3
 
 
 @pytest.mark.parametrize("option", ["up", 2, -1])
-def test_fixed_refuses_an_unknown_option_and_names_the_known_ones(option):
+def test_fixed_refuses_an_unknown_option_and_lists_the_known_ones(option):
     with pytest.raises(ValueError, match="left, right"):
         Fixed(SPECS, option=option)
 
 
-def test_uniform_chooses_both_options_about_equally():
+def test_uniform_chooses_both_options_equally_often():
     torch.manual_seed(0)
     assert Uniform(SPECS).select(due(10_000)).float().mean().item() == pytest.approx(0.5, abs=0.02)
 
 
-def test_oracle_passes_on_what_the_environment_knows():
+def test_oracle_chooses_what_the_environment_says():
     assert Oracle(SPECS).select(due(3, oracle={"option": torch.tensor([1, 0, 1])})).tolist() == [1, 0, 1]
 
 
 @pytest.mark.parametrize("exploration", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
-def test_human_chooses_the_congruent_boat_as_often_as_people_do_at_each_bearing(exploration):
+def test_human_chooses_the_congruent_boat_as_often_as_humans_do_at_each_bearing(exploration):
     torch.manual_seed(0)
     env = BoatDockEnv(20_000, human=True)
     human = Human(PAMDPSpecs.from_env(env))
@@ -147,13 +192,36 @@ def test_human_chooses_the_congruent_boat_as_often_as_people_do_at_each_bearing(
         assert chosen[inside].mean().item() == pytest.approx(share, abs=0.035)
 
 
+# The random agent.
+
+
+def test_the_random_agent_chooses_options_discrete_actions_and_parameters_uniformly():
+    torch.manual_seed(0)
+    td = random_agent(SPECS, CPU).policy(due(20_000))
+    assert td[keys.OPTION].float().mean().item() == pytest.approx(0.5, abs=0.02)
+    assert td[keys.DISCRETE].float().mean().item() == pytest.approx(0.5, abs=0.02)
+    for parameter in td[keys.PARAMETERS].unbind(-1):
+        assert parameter.min() >= 0.0 and parameter.max() <= 1.0
+        assert torch.histc(parameter, 4, 0.0, 1.0).tolist() == pytest.approx([5000] * 4, rel=0.06)
+
+
+def test_the_random_agent_has_no_selector_where_there_are_no_options():
+    specs = PAMDPSpecs(2, (), (1, 2), (0.0,) * 3, (1.0,) * 3)
+    agent = random_agent(specs, CPU)
+    td = agent.policy(due(5))
+    assert agent.selector is None and keys.OPTION not in td.keys() and td[keys.PARAMETERS].shape == (5, 3)
+
+
+# The beginning of a run.
+
+
 @pytest.mark.parametrize(
     "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
 )
-def test_options_are_uniform_until_practice_is_over_and_greedy_choices_never(high, tmp_path):
+def test_exploring_choices_are_uniform_for_uniform_option_frames_and_greedy_ones_never(high, tmp_path):
     words = [f"high={high}", "low=random", "num_envs=400", "eval.layouts=4", "agent.uniform_option_frames=800"]
-    cfg = compose_config([*words, *(["high.warmup_decisions=0"] if high == "meta_critic" else [])])
-    parts = assemble(cfg, run_config(cfg), tmp_path)
+    words += ["high.warmup_decisions=0"] if high == "meta_critic" else []
+    parts = assemble(make_config(words), tmp_path)
     torch.manual_seed(0)
     agent = parts.agent
     for _ in range(2):

@@ -5,18 +5,19 @@ import itertools
 import json
 import os
 import signal
-import threading
 
 import numpy as np
 import pytest
 import torch
-from conftest import compose_config
+from conftest import compose_config, make_config
 
 from hpamdp.config import ConfigError
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import human_normalised
 from hpamdp.run import checkpoint
+from hpamdp.run.assemble import assemble
 from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
@@ -37,7 +38,7 @@ def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys):
     assert start(tmp_path, "high=uniform", "low=random") == 0
     assert {file.name for file in tmp_path.iterdir()} >= FILES | PICTURES
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert {"score", "success", "too_fast", "presses", "option_congruent", "oracle_agreement", "optimality_gap"} <= {
+    assert {"score", "success", "too_fast", "steps", "option_congruent", "oracle_agreement", "optimality_gap"} <= {
         *summary
     }
     assert {"frames", "wall_s", "seed", "versions", "ceiling"} <= {*summary}
@@ -72,11 +73,7 @@ def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
     states = []
     for name in ("often", "seldom"):
         file = checkpoint.find(tmp_path / name, "resume")
-        cfg = compose_config([*SMALL, "low=random"])
-        from hpamdp.config import run_config
-        from hpamdp.run.assemble import assemble
-
-        parts = assemble(cfg, run_config(cfg), tmp_path)
+        parts = assemble(make_config([*SMALL, "low=random"]), tmp_path)
         states.append(checkpoint.load(file, parts.agent, torch.device("cpu"), with_training=True))
     assert all(torch.equal(states[0][column], states[1][column]) for column in states[0])
 
@@ -99,13 +96,19 @@ def test_training_ends_at_the_first_evaluation_that_reaches_the_stop_score(tmp_p
         assert json.loads((tmp_path / name / "summary.json").read_text())["frames"] == frames
 
 
-def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys):
-    timer = threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT))
-    timer.start()
+def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, capsys, monkeypatch):
+    take, batches = Recorder.take, itertools.count(1)
+
+    def interrupted(self, batch, scalars):
+        take(self, batch, scalars)
+        if next(batches) == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Recorder, "take", interrupted)
     assert start(tmp_path / "stopped", "low=random", "total_frames=100_000_000", "eval.every=0") == 130
     assert f"resume={tmp_path / 'stopped'}" in capsys.readouterr().out
     stopped = json.loads((tmp_path / "stopped" / "summary.json").read_text())
-    assert 0 < stopped["frames"] < 100_000_000 and not stopped["finished"]
+    assert 0 < stopped["frames"] <= 5 * 128 and not stopped["finished"]
     total = stopped["frames"] + 2048
     more = [f"resume={tmp_path / 'stopped'}", f"total_frames={total}"]
     assert run(compose_config(more), tmp_path / "resumed", more) == 0

@@ -1,4 +1,4 @@
-"""Problems of one step for selectors: two options, whose payoffs may depend on what is observed."""
+"""One-step problems for selectors: two options, whose rewards may depend on the observation."""
 
 from __future__ import annotations
 
@@ -15,26 +15,30 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(2, ("left", "right"), (1, 1), (0.0, 0.0), (1.0, 1.0))
 CPU = torch.device("cpu")
 
-Means = Callable[[Tensor], Tensor]  # observations [B, 2] to the options' mean payoffs [B, 2]
+Means = Callable[[Tensor], Tensor]  # from observations [B, 2] to the options' mean rewards [B, 2]
 
 
 def constant(left: float, right: float) -> Means:
-    """Payoffs that depend on nothing."""
+    """Return mean rewards that do not depend on the observation."""
     return lambda observation: torch.tensor([left, right]).expand(len(observation), 2)
 
 
 def by_sign(observation: Tensor) -> Tensor:
-    """Right pays 1 and left -1 where the first entry is positive, the reverse elsewhere; either alone is worth 0."""
+    """Return 1 for right and -1 for left where the first entry is positive, elsewhere the reverse.
+
+    Always the same option has a mean reward of 0.
+    """
     right = observation[:, 0].sign()
     return torch.stack([-right, right], -1)
 
 
 def against_sign(observation: Tensor) -> Tensor:
+    """Return the negative of `by_sign`."""
     return -by_sign(observation)
 
 
 def due(observation: Tensor | int, **more: object) -> TensorDict:
-    """Return a root at which every environment decides, given the observations or their number."""
+    """Return a tensordict in which a decision is due in every environment, given the observations or their number."""
     if isinstance(observation, int):
         observation = torch.zeros(observation, SPECS.observation_dim)
     is_decision = torch.ones(len(observation), 1, dtype=torch.bool)
@@ -42,7 +46,7 @@ def due(observation: Tensor | int, **more: object) -> TensorDict:
 
 
 def ended(chosen: TensorDict, rewards: Tensor) -> TensorDict:
-    """Return the decisions `[N]` made at a root, each paid after one step, which ended its episode."""
+    """Return choices as finished decisions `[N]`: each got its reward after one step, which ended its episode."""
     is_end = torch.ones(len(chosen), 1, dtype=torch.bool)
     after = {
         keys.OBSERVATION: torch.zeros_like(chosen[keys.OBSERVATION]),
@@ -56,14 +60,14 @@ def ended(chosen: TensorDict, rewards: Tensor) -> TensorDict:
 
 
 def paid(options: list[int], rewards: list[float], **more: object) -> TensorDict:
-    """Return the decisions for these options with these payoffs, all of them made at the observation 0."""
+    """Return finished decisions for these options with these rewards, all made at the observation 0."""
     return ended(due(len(options), option=torch.tensor(options), **more), torch.tensor(rewards))
 
 
 def play(selector: Selector, means: Means, num: int, batch: int = 1, noise: float = 1.0) -> tuple[Tensor, Tensor]:
-    """Let the selector choose and learn for `num` decisions, `batch` at once; return the options and the regrets.
+    """Let the selector choose and learn for `num` decisions, `batch` at a time; return the options and the regrets.
 
-    Observations are uniform in [-1, 1]; payoffs are normal with the deviation `noise`.
+    Observations are uniform in [-1, 1]; rewards are normal with standard deviation `noise`.
     """
     options, regrets = [], []
     for _ in range(num // batch):

@@ -1,4 +1,4 @@
-"""Small environments of every kind that hpamdp.env.gymnasium.environment takes in; importing them registers Toy-v0."""
+"""Small environments of every kind that GymnasiumEnv accepts; importing this module registers Toy-v0."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-# Three keys with two, no and one parameter, in odd bounds that float32 cannot tell, shapes and types.
+# Three discrete actions with two, no and one parameter. Some bounds are not exact in float32; shapes and dtypes differ.
 TWO = spaces.Box(np.array([-1.0, 10.0]), np.array([1.0, 30.0]), dtype=np.float64)
 NONE = spaces.Box(0.0, 1.0, (0,))
 ONE = spaces.Box(0.1, 0.3, (1, 1), dtype=np.float64)
 ALL = spaces.Box(np.float32([-1.0, 10.0, 0.1]), np.float32([1.0, 30.0, 0.3]))
 PAIR = spaces.Box(np.float32([[-1.0, 10.0]]), np.float32([[1.0, 30.0]]))
 
-# Each form of action space, and the option that it needs.
+# Each form of action space, and the `parameter_dims` that it needs.
 FORMS: dict[str, tuple[spaces.Space, list[int] | None]] = {
     "nested": (spaces.Tuple([spaces.Discrete(3), spaces.Tuple([TWO, NONE, ONE])]), None),
     "flat": (spaces.Tuple([spaces.Discrete(3, start=4), TWO, NONE, ONE]), None),
@@ -30,10 +30,19 @@ FORMS: dict[str, tuple[spaces.Space, list[int] | None]] = {
 }
 
 
-def native_action(form: str, key: int, values: np.ndarray):
-    """Return the native action of a key in 0..2 and the canonical parameters, written out."""
-    two, none, one = values[:2].astype(np.float64), np.zeros(0, np.float32), values[2:3, None].astype(np.float64)
-    k, boxes = np.int64(key), (two, none, one)
+def native_action(form: str, discrete: int, values: np.ndarray):
+    """Return the action in the space's own format, written out for each form.
+
+    Args:
+        form: of the action space, from FORMS.
+        discrete: the discrete action, 0 to 2.
+        values: the parameters of all discrete actions.
+    """
+    two = values[:2].astype(np.float64)
+    none = np.zeros(0, np.float32)
+    one = values[2:3, None].astype(np.float64)
+    boxes = (two, none, one)
+    k = np.int64(discrete)
     return {
         "nested": (k, boxes),
         "flat": (k + 4, *boxes),
@@ -42,18 +51,18 @@ def native_action(form: str, key: int, values: np.ndarray):
         "numbered": {"key": k, "of": {"xgo0": two, "turn1": none, "wait10": one}},
         "split": (k, values),
         "split dict": {"how": values, "what": k + 7},
-        "shared": (k, values[2 * key : 2 * key + 2][None]),
+        "shared": (k, values[2 * discrete : 2 * discrete + 2][None]),
     }[form]
 
 
 class Toy(gymnasium.Env):
-    """Notes every action and observes random numbers, its own steps last.
+    """Record every action; observe a random number and the number of steps.
 
     Args:
         form: of the action space, from FORMS.
-        length: steps to the end; 0 for no end.
-        success: what the info says at the end; None for nothing.
-        broken: makes a constructor with a bug.
+        length: steps to the end; 0: it never ends.
+        success: `is_success` of the last info; None: the info does not have it.
+        broken: whether the constructor has a bug.
     """
 
     def __init__(self, form: str = "nested", length: int = 0, success: bool | None = None, broken: bool = False):
@@ -61,7 +70,8 @@ class Toy(gymnasium.Env):
             len(3)  # a bug
         self.action_space = FORMS[form][0]
         self.observation_space = spaces.Box(np.array([-3.0, 0.0]), np.array([5.0, np.inf]), dtype=np.float64)
-        self.length, self.success = length, success
+        self.length = length
+        self.success = success
         self.actions: list[Any] = []
         self.is_open = True
 
@@ -85,12 +95,12 @@ class Toy(gymnasium.Env):
         return np.array([self.np_random.uniform(-3.0, 5.0), self.steps])
 
 
-# What a Mixed observes: seven numbers once it is flattened.
+# The observations of Mixed: seven numbers when flattened.
 MIXED = spaces.Tuple([spaces.Box(-2, 2, (2, 1)), spaces.Discrete(3, start=1), spaces.Dict(a=spaces.MultiBinary(2))])
 
 
 class Mixed(Toy):
-    """Observes samples of MIXED, or of a space of words."""
+    """Observe samples of MIXED, or of a space of texts."""
 
     def __init__(self, is_text: bool = False):
         super().__init__()
@@ -101,18 +111,19 @@ class Mixed(Toy):
 
 
 class Wrong(Toy):
-    """Observes what its space does not hold."""
+    """Observe what its observation space does not contain."""
 
     def __init__(self, size: int = 2, value: float = 0.0):
         super().__init__()
-        self.size, self.value = size, value
+        self.size = size
+        self.value = value
 
     def _observation(self):
         return np.full(self.size, self.value)
 
 
 def old_space(space: spaces.Space) -> Any:
-    """Return a space that has the attributes of gym's, and no more."""
+    """Return an object with the attributes of a `gym` space and no others."""
     if isinstance(space, spaces.Tuple):
         return SimpleNamespace(spaces=[old_space(part) for part in space.spaces], shape=None)
     if isinstance(space, spaces.Dict):
@@ -122,10 +133,11 @@ def old_space(space: spaces.Space) -> Any:
 
 
 class OldToy:
-    """Toy with the old four-value interface, and a time limit as gym had them; a Gymnasium environment for nobody."""
+    """Toy with the four-value interface and the time limit of `gym`, and no `gymnasium.Env`."""
 
     def __init__(self, form: str = "nested", length: int = 0, limit: int = 0):
-        self.toy, self.limit = Toy(form, length), limit
+        self.toy = Toy(form, length)
+        self.limit = limit
         self.action_space, self.observation_space = map(old_space, (self.toy.action_space, self.toy.observation_space))
         self.seeds: list[int | None] = []
 

@@ -1,4 +1,4 @@
-"""A problem whose best option changes within an episode, what it is worth, and learners that need no training."""
+"""A problem whose best option changes within an episode, its best value, and learners that need no training."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ from hpamdp.specs import PAMDPSpecs
 
 WALK, SWIM = 0, 1
 STEP, REST = 0, 1
-LENGTH, SHORE = 6.0, 3.0  # of the way, and where its land ends and its water begins
-SLOW = 0.25  # what a whole step makes of the way with the wrong option
+LENGTH = 6.0  # of the way
+SHORE = 3.0  # where land ends and water begins
+SLOW = 0.25  # length of a whole step with the wrong option
 _CELLS = int(LENGTH / SLOW) + 1
 
 
 class Crossing(PAMDPEnv):
-    """Walk over land, then swim through water, and arrive: only that pays, 1.
+    """Walk over land, then swim through water; only the arrival is rewarded, with 1.
 
-    Keys: 0 steps, by the share in [0, 1] of a whole step that its parameter says; 1 rests, and its parameter says
-    nothing. A whole step is 1 long with the option that suits the place and `SLOW` with the other. The observation says
-    which `SLOW` of the way one is at. Episodes start anywhere in the first `start` of the way.
+    Discrete actions: 0 steps, and its parameter in [0, 1] is the fraction of a whole step; 1 rests, and its parameter
+    has no effect. A whole step is 1 long with the option that suits the place and `SLOW` with the other. The
+    observation is the one-hot index of the place, in units of `SLOW`. Episodes start at a random place in the first
+    `start` of the way.
     """
 
     option_names = ("walk", "swim")
@@ -40,14 +42,15 @@ class Crossing(PAMDPEnv):
 
     def __init__(self, num_envs: int = 1, *, start: float = 0.0, seed: int = 0, device: object = "cpu") -> None:
         super().__init__(device=device, batch_size=[num_envs])
-        n = num_envs
         self.start = start
+        n = num_envs
         self.observation_spec = Composite(
             observation=Bounded(0.0, 1.0, shape=(n, _CELLS)), place=Bounded(0.0, LENGTH, shape=(n, 1)), shape=(n,)
         )
         action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(0.0, 1.0, shape=(n, 2)), shape=(n,))
         self.action_spec = Composite(action=action, option=Categorical(2, shape=(n,)), shape=(n,))
-        self.reward_spec, self.done_spec = Unbounded(shape=(n, 1)), self.make_done_spec()
+        self.reward_spec = Unbounded(shape=(n, 1))
+        self.done_spec = self.make_done_spec()
         self._set_seed(seed)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
@@ -55,7 +58,8 @@ class Crossing(PAMDPEnv):
 
     def _set_seed(self, seed: int | None) -> None:
         self.generator = torch.Generator().manual_seed(seed or 0)
-        self.place, self.steps = torch.zeros(self.batch_size), torch.zeros(self.batch_size)
+        self.place = torch.zeros(self.batch_size)
+        self.steps = torch.zeros(self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -66,15 +70,12 @@ class Crossing(PAMDPEnv):
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        discrete, share, option = (
-            tensordict[keys.DISCRETE],
-            tensordict[keys.PARAMETERS][:, STEP],
-            tensordict[keys.OPTION],
-        )
+        fraction = tensordict[keys.PARAMETERS][:, STEP].clamp(0.0, 1.0)
         over = (self.place >= LENGTH) | (self.steps >= self.max_steps)
-        whole = torch.where(option == (self.place >= SHORE), 1.0, SLOW)
-        way = torch.where((discrete == REST) | over, 0.0, share.clamp(0.0, 1.0) * whole)
-        self.place, self.steps = (self.place + way).clamp(max=LENGTH), self.steps + ~over
+        whole = torch.where(tensordict[keys.OPTION] == (self.place >= SHORE), 1.0, SLOW)
+        way = torch.where((tensordict[keys.DISCRETE] == REST) | over, 0.0, fraction * whole)
+        self.place = (self.place + way).clamp(max=LENGTH)
+        self.steps = self.steps + ~over
         return self._read().set(keys.REWARD, ((self.place >= LENGTH) & ~over).float().unsqueeze(-1))
 
     def _read(self) -> TensorDict:
@@ -87,16 +88,16 @@ class Crossing(PAMDPEnv):
 
 
 class Toll(Crossing):
-    """A crossing at which every step pays, each time something else."""
+    """A crossing with a random reward at every step."""
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         return super()._step(tensordict).set(keys.REWARD, torch.rand(*self.batch_size, 1))
 
 
 def best_value(gamma: float, option_length: int) -> float:
-    """Return the discounted return of the best choices from the start of the way, for who makes whole steps.
+    """Return the discounted return of the best choices of options from the start of the way, with whole steps.
 
-    By dynamic programming over how much of the way is left, in units of `SLOW`.
+    By dynamic programming over the places, in units of `SLOW`, from the end of the way.
     """
     quick = round(1.0 / SLOW)
     value = {0: 0.0}
@@ -114,7 +115,7 @@ def best_value(gamma: float, option_length: int) -> float:
 
 
 class WholeStep(TensorDictModuleBase):
-    """Always make a whole step."""
+    """Always take a whole step."""
 
     in_keys: ClassVar[list] = [keys.OBSERVATION]
     out_keys: ClassVar[list] = [keys.DISCRETE, keys.PARAMETERS]
@@ -125,7 +126,7 @@ class WholeStep(TensorDictModuleBase):
 
 
 class Stepper(Learner):
-    """Make whole steps, learn nothing, and expect a fixed value for each place."""
+    """Take whole steps, learn nothing, and give each place a fixed value."""
 
     has_value: ClassVar[bool] = True
 
@@ -139,7 +140,7 @@ class Stepper(Learner):
 
 
 def steppers(selector: Selector, specs: PAMDPSpecs) -> HierarchicalAgent:
-    """Return the agent that makes whole steps with the selector's options."""
+    """Return the agent that takes whole steps with the selector's options."""
     return HierarchicalAgent(selector, [Stepper(specs), Stepper(specs)], specs)
 
 

@@ -43,8 +43,10 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     runs = []
     for file in (file for folder in folders for file in sorted(Path(folder).glob("**/summary.json"))):
         summary = json.loads(file.read_text())
-        if summary.get("finished", True):  # early runs' summaries lack it
-            runs.append(Run(file.parent, summary, OmegaConf.load(file.parent / "config.yaml")))
+        if summary["finished"]:
+            config = OmegaConf.load(file.parent / "config.yaml")
+            assert isinstance(config, DictConfig)
+            runs.append(Run(file.parent, summary, config))
         else:
             print(f"{file.parent}: was stopped, left out", file=sys.stderr)
     return runs
@@ -99,12 +101,12 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
 
     Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
     """
-    values = np.asarray(values, dtype=float)
-    middle = float(stats.trim_mean(values, 0.25))
-    if len(values) < 2 or np.ptp(values) == 0.0:
+    sample = np.asarray(values, dtype=float)
+    middle = float(stats.trim_mean(sample, 0.25))
+    if len(sample) < 2 or np.ptp(sample) == 0.0:
         return middle, middle, middle
     interval = stats.bootstrap(
-        (values,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=0, n_resamples=2000
+        (sample,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=0, n_resamples=2000
     ).confidence_interval
     return middle, float(interval.low), float(interval.high)
 

@@ -1,0 +1,1 @@
+"""Problems, and what serves any of them."""

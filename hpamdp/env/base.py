@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -14,22 +15,63 @@ from torchrl.envs import EnvBase
 
 from hpamdp import keys
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of an evaluation, as tables and plots show it.
+
+    Attributes:
+        name: in the summary, and with the prefix `eval/` in `metrics.csv`.
+        title: what people read.
+        kind: a `number`, a `share` of the episodes (shown in percent), or a `count` (two digits).
+    """
+
+    name: str
+    title: str
+    kind: Literal["number", "share", "count"] = "number"
+
 
 class PAMDPEnv(EnvBase):
     """`num_envs` copies of a problem with parameterised actions, in one batch dimension.
 
-    A subclass has the specs: `observation` float32 `[N, observation_dim]`; the action leaves `("action", "discrete")` int64
-    `[N]` and `("action", "parameters")` float32 `[N, num_parameters]`, the bounded parameters of all keys side by side,
-    of which only the pressed key's count; where the agent chooses options, the leaf `option` int64 `[N]`; `reward`,
-    `done`, `terminated`, `truncated` `[N, 1]`, where a time limit is `truncated` only. A step leaves an episode that is
-    over as it is and earns 0.
+    A subclass has these specs:
+    - `observation` float32 `[N, observation_dim]`;
+    - the action leaves `("action", "discrete")` int64 `[N]` and `("action", "parameters")` float32
+      `[N, num_parameters]`: the bounded parameters of all discrete actions side by side, of which only those of the
+      chosen one count;
+    - where the agent chooses options, the action leaf `option` int64 `[N]`;
+    - `reward`, `done`, `terminated`, `truncated` `[N, 1]`; a time limit is `truncated` only.
+
+    A step leaves an episode that is over as it is and earns 0.
+
+    The other attributes and methods tell the framework what it cannot know: how an episode went, what is best possible,
+    and which tables and figures show it. All of them have defaults.
     """
 
-    option_names: tuple[str, ...] = ()  # of the options, where there are some
+    option_names: tuple[str, ...] = ()
     can_change_option: ClassVar[bool] = True  # whether an option may end before its episode
-    parameter_dims: tuple[int, ...]  # how many parameters each key takes
-    max_steps: int  # presses in the longest episode
-    result_keys: ClassVar[tuple[str, ...]] = ()  # leaves of an episode's last step that `results` reads
+    parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
+    max_steps: int  # steps of the longest episode
+    result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
+
+    # Settings that leave the choice of an option to the agent and that take it away, to name in an error.
+    choice_setting: ClassVar[str] = ""
+    no_choice_setting: ClassVar[str] = ""
+
+    # Rows of the closing table, and panels of the learning curves.
+    table_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "score"),
+        Metric("success", "success", "share"),
+        Metric("steps", "steps an episode", "count"),
+        Metric("optimality_gap", "gap to the ceiling"),
+    )
+    curve_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "Score"),
+        Metric("success", "Episodes that succeed", "share"),
+    )
 
     @property
     def has_choice(self) -> bool:
@@ -38,18 +80,18 @@ class PAMDPEnv(EnvBase):
 
     @property
     def is_shardable(self) -> bool:
-        """Whether several processes can each step a share of the environments: these learn nothing from one another."""
+        """Whether several processes can each step a shard of the environments: they learn nothing from one another."""
         return True
 
     @property
     def position(self) -> Tensor | None:
-        """Where the agents are, for drawing, `[N, 2]`; None where that means nothing."""
+        """Positions of the agents for drawing, `[N, 2]`; None where that means nothing."""
         return None
 
     def fixed_episodes(self, seed: int) -> TensorDict | None:
         """Return what to `reset` with for the evaluation episodes of a seed, one for each environment.
 
-        None: `set_seed(seed)` and a reset without arguments are all that it takes.
+        None: `set_seed(seed)` and a reset without arguments fix them.
         """
         return None
 
@@ -58,7 +100,7 @@ class PAMDPEnv(EnvBase):
         return {}
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return how episodes `[M]` went by their last steps' leaves `result_keys`, each `[M]`.
+        """Return how episodes `[M]` went, from the leaves `result_keys` of their last steps, each `[M]`.
 
         A `score` takes the place of the return wherever agents are compared; `success` is bool.
         """
@@ -67,29 +109,53 @@ class PAMDPEnv(EnvBase):
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return means of an evaluation, whose arrays are those of `Evaluation.run`, beside score and success.
 
-        `ceiling` is the best possible mean score on the same episodes, where that is known.
+        `ceiling` is the best possible mean score on the same episodes, where it is known.
+        """
+        return {}
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return figures to show beside the agent's own, by the name of who reached them.
+
+        Args:
+            measured: the means of the agent's evaluation. `random`, the uniformly random agent, is added by the run.
+        """
+        if "ceiling" not in measured:
+            return {}
+        return {"ceiling": {"score": measured["ceiling"], "optimality_gap": 0.0}}
+
+    def summary_entries(self) -> dict[str, Any]:
+        """Return JSON values that a run's summary shows of the problem."""
+        return {}
+
+    @classmethod
+    def draw_figures(cls, evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
+        """Return figures of the final evaluation by their file names, such as `trajectories.png`.
+
+        Args:
+            evaluation: the arrays of `evaluation.npz`, any of which may be missing.
+            summary: of the run; `references` has the figures to compare with.
         """
         return {}
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return what episodes' future depends on, each `[N, ...]`, for a checkpoint; empty where it cannot be had."""
+        """Return what the episodes' future depends on, each `[N, ...]`, for a checkpoint; empty where it is unknown."""
         return {}
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Go on where `state_columns` were taken; with none, episodes start anew.
+        """Continue from an `env_state`; an empty one starts new episodes.
 
         Raises:
-            ValueError: they are of another number of environments.
+            ValueError: the state is of another number of environments.
         """
 
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
-        """Take from saved state columns what was learned of the observations' scale alone, as to score an agent."""
+        """Take only the scale of the observations from an `env_state`, to score a saved agent."""
 
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations as the other environment does, now and later, where their scale is learned."""
 
     def make_action_spec(self, low: Tensor, high: Tensor, *, has_option: bool = False) -> Composite:
-        """Return the spec of the action leaves by the bounds `[num_parameters]` of all keys' parameters."""
+        """Return the spec of the action leaves, given the bounds `[num_parameters]` of all parameters."""
         n, device = self.batch_size, self.device
         low, high = (side.to(device, torch.float32).expand(*n, -1) for side in (low, high))
         action = Composite(
@@ -106,16 +172,20 @@ class PAMDPEnv(EnvBase):
         Raises:
             ValueError: a leaf is missing, or has another shape or type.
         """
-        n = self.batch_size
-        shapes = {keys.DISCRETE: n, keys.PARAMETERS: (*n, sum(self.parameter_dims))}
-        for name, shape in ({**shapes, keys.OPTION: n} if self.has_choice else shapes).items():
+        shapes: dict[str | tuple[str, str], tuple[int, ...]] = {
+            keys.DISCRETE: tuple(self.batch_size),
+            keys.PARAMETERS: (*self.batch_size, sum(self.parameter_dims)),
+        }
+        if self.has_choice:
+            shapes[keys.OPTION] = tuple(self.batch_size)
+        for name, shape in shapes.items():
             value = tensordict.get(name)
             if value is None or value.shape != shape:
-                given = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given}, but must be {list(shape)}")
+                given_shape = None if value is None else list(value.shape)
+                raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
             if name != keys.PARAMETERS and (value.is_floating_point() or value.dtype == torch.bool):
-                given = str(value.dtype).removeprefix("torch.")
-                raise ValueError(f"step: {name} has type {given}, but must be integer")
+                given_type = str(value.dtype).removeprefix("torch.")
+                raise ValueError(f"step: {name} has type {given_type}, but must be integer")
 
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""

@@ -1,4 +1,4 @@
-"""The high level alone: the controller-choice MDP, one transition an episode, over a low level that plays it out."""
+"""The high level alone, as an environment: one step is one whole episode, played by a fixed low-level policy."""
 
 from __future__ import annotations
 
@@ -16,67 +16,85 @@ from hpamdp.env.base import PAMDPEnv
 
 
 class OptionChoiceEnv(PAMDPEnv):
-    """Choose an option, see the episode's return: an ordinary environment with one discrete action.
+    """Choose an option and receive the episode's return: an ordinary environment with one discrete action.
 
-    The action is `option` int64 `[N]`; every step plays the episode to its end with the low-level policy, greedily, and
-    is terminal. Reward is the episode's return; what else the environment observes says how it ended.
+    The action is `option` int64 `[N]`. A step plays the episode to its end with the greedy low-level policy and is
+    terminal; its reward is the episode's return, and what it observes is what the episode's last step observed.
 
     Args:
-        low_policy: writes the action leaves from `observation` and `option`.
-        env: the environment with a choice of options, such as boats with `controller="choose"`.
+        low_policy: writes the action leaves, given `observation` and `option`.
+        env: an environment in which the agent chooses options.
 
     Raises:
-        ValueError: the environment leaves no choice.
+        ValueError: the environment has no option to choose.
     """
 
     def __init__(self, low_policy: TensorDictModuleBase, env: PAMDPEnv) -> None:
         if not env.has_choice:
-            raise ValueError('ControllerChoiceEnv: the environment leaves no choice; boats need controller="choose"')
+            raise ValueError("OptionChoiceEnv: the environment has no option to choose")
         super().__init__(device=env.device, batch_size=env.batch_size)
-        # In a tuple: an nn.Module attribute would register the policy's parameters as the environment's own.
-        self._low = (low_policy, env)
-        self.option_names, self.parameter_dims = env.option_names, env.parameter_dims
-        self.max_steps, self.result_keys = 1, env.result_keys
+        # In a tuple: as attributes, the modules' parameters would be registered as the environment's own.
+        self._wrapped = (low_policy, env)
+        self.option_names = env.option_names
+        self.parameter_dims = env.parameter_dims
+        self.max_steps = 1
+        self.result_keys = env.result_keys
         self.observation_spec = env.observation_spec.clone()
         self.action_spec = Composite(option=env.full_action_spec[keys.OPTION].clone(), shape=env.batch_size)
         self.reward_spec = Unbounded(shape=(*env.batch_size, 1), device=env.device)
         self.done_spec = self.make_done_spec()
 
+    @property
+    def _low_policy(self) -> TensorDictModuleBase:
+        return self._wrapped[0]
+
+    @property
+    def _inner_env(self) -> PAMDPEnv:
+        return self._wrapped[1]
+
     def fixed_episodes(self, seed: int) -> TensorDict | None:
-        """Return those of the environment."""
-        return self._low[1].fixed_episodes(seed)
+        """Return the fixed episodes of the wrapped environment."""
+        return self._inner_env.fixed_episodes(seed)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return how episodes went."""
-        return self._low[1].results(last)
+        """Return the results of the wrapped environment."""
+        return self._inner_env.results(last)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the environment's."""
-        return self._low[1].env_state()
+        """Return the state of the wrapped environment."""
+        return self._inner_env.env_state()
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Set the environment's."""
-        self._low[1].set_env_state(columns)
+        """Set the state of the wrapped environment."""
+        self._inner_env.set_env_state(columns)
 
     def _set_seed(self, seed: int | None) -> None:
-        self._low[1].set_seed(seed)
+        self._inner_env.set_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        env = self._low[1]
-        return env._reset(tensordict).select(*self.observation_spec.keys(True, True))
+        return self._observed(self._inner_env._reset(tensordict))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        policy, env = self._low
         option = tensordict.get(keys.OPTION)
-        # After a partial reset the other episodes are over already: they stay so and earn nothing.
-        td = tensordict.select(*self.observation_spec.keys(True, True))
-        total = torch.zeros(*env.batch_size, 1, device=env.device)
+        td = self._observed(tensordict)
+        total = torch.zeros(*self.batch_size, 1, device=self.device)
+        # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-            for _ in range(env.max_steps):
-                td = env._step(policy(td.set(keys.OPTION, option)))
+            for _ in range(self._inner_env.max_steps):
+                td = self._inner_env._step(self._low_policy(td.set(keys.OPTION, option)))
                 total = total + td.get(keys.REWARD)
                 if td.get(keys.DONE).all():
                     break
-        over = torch.ones_like(td.get(keys.DONE))
-        flags = {keys.DONE: over, keys.TERMINATED: over.clone(), keys.TRUNCATED: torch.zeros_like(over)}
-        return td.select(*self.observation_spec.keys(True, True)).update({keys.REWARD: total, **flags})
+        done = torch.ones_like(td.get(keys.DONE))
+        return self._observed(td).update(
+            {
+                keys.REWARD: total,
+                keys.DONE: done,
+                keys.TERMINATED: done.clone(),
+                keys.TRUNCATED: torch.zeros_like(done),
+            }
+        )
+
+    def _observed(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return only the entries of the observation spec."""
+        return tensordict.select(*self.observation_spec.keys(True, True))

@@ -1,32 +1,54 @@
-"""States as named tuples of columns, with a row an environment."""
+"""States as named tuples of columns: tensors with one row for each environment."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TypeVar
+from collections.abc import Iterator, Mapping
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
-State = TypeVar("State", bound=tuple[Tensor, ...])
+
+class Columns(Protocol):
+    """A `NamedTuple` whose fields are tensors."""
+
+    def __init__(self, *columns: Tensor) -> None: ...
+
+    def __iter__(self) -> Iterator[Tensor]: ...
+
+    @property
+    def _fields(self) -> tuple[str, ...]: ...
+
+    def _asdict(self) -> dict[str, Tensor]: ...
+
+
+State = TypeVar("State", bound=Columns)
 
 
 def where(mask: Tensor, new: State, old: State) -> State:
-    """Take `new` in the rows of `mask` `[N]` and `old` elsewhere."""
+    """Return `new` in the rows of `mask` `[N]` and `old` in the others."""
+    # A column that both states share needs no `torch.where`.
     return type(old)(*(o if n is o else torch.where(mask, n, o) for n, o in zip(new, old, strict=True)))
 
 
-def taken_back(saved: Mapping[str, Tensor], now: State, owner: str) -> State:
-    """Return a state of saved columns, in the types and on the devices of the one that there is.
+def restored(saved: Mapping[str, Tensor], current: State, owner: str) -> State:
+    """Return the state that was saved as `_asdict`, with the dtypes and devices of the current one.
+
+    Args:
+        saved: the columns by name.
+        current: a state of the same environments.
+        owner: name of the environment's class, for the error.
 
     Raises:
-        ValueError: they are not the columns of such a state of as many environments; it begins with the `owner`.
+        ValueError: a column is missing, unknown, or of another number of environments.
     """
-    if set(saved) != set(now._fields):
-        raise ValueError(f"{owner}: the state has {', '.join(now._fields)}, not {', '.join(saved)}")
-    for name, column in now._asdict().items():
+    if set(saved) != set(current._fields):
+        raise ValueError(f"{owner}: the state has {', '.join(current._fields)}, not {', '.join(saved)}")
+    columns = []
+    for name, column in current._asdict().items():
         if saved[name].shape != column.shape:
             raise ValueError(
                 f"{owner}: the state's {name} is {list(saved[name].shape)}, but must be {list(column.shape)}"
             )
-    return type(now)(*(saved[name].to(column) for name, column in now._asdict().items()))
+        columns.append(saved[name].to(column))
+    return type(current)(*columns)

@@ -1,8 +1,8 @@
 """Random numbers that are pure functions of integer counters.
 
-`torch.rand` draws from one stream, so what one environment gets depends on how often the others were reset, and a draw
+`torch.rand` reads one stream, so what one environment gets depends on how often the others were reset, and a number
 for every row costs more than a step of the physics. Here each number is a hash of (seed, stream, environment, episode,
-draw): every environment's episodes are its own, whatever the batch, and nothing touches the global generator.
+index): the episodes of an environment do not depend on the batch, and no global generator is touched.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-# Separate streams, so that evaluation layouts are never met in training and switching a noise on moves no layout.
+# Separate streams: evaluation never meets a layout of training, and noise changes no layout.
 TRAINING, EVALUATION, NOISE = range(3)
 
 
@@ -29,27 +29,28 @@ def _mix(h: Tensor) -> Tensor:
 
 
 def key_for(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> Tensor:
-    """Return the int32 `[*B]` key from which an episode's draws are derived; all inputs int32."""
+    """Return the int32 `[*B]` random key of an episode, from which all its numbers derive; all inputs are int32."""
     h = _mix(seed ^ (0x2545F491 + 0x01234567 * stream))
     h = _mix(h ^ environment)
     return _mix(h ^ episode)
 
 
-def uniform(key: Tensor, draw: int | Tensor) -> Tensor:
-    """Return float32 `[*B]` in (0, 1), the `draw`-th number of each key; `draw` may be an int32 tensor."""
-    # An odd step walks through all 2^32 states before it comes back (Weyl sequence), `_mix` hides the walk.
-    # 23 bits: with one more the half would be rounded away in the upper half, up to 1.
-    bits = _shift_right(_mix(key + draw * -0x61C88647), 9)
+def uniform(key: Tensor, index: int | Tensor) -> Tensor:
+    """Return float32 `[*B]` in (0, 1): number `index` of each key; `index` may be an int32 tensor."""
+    # An odd step visits all 2^32 states before it repeats one (a Weyl sequence); `_mix` hides its regularity.
+    # 23 bits: with 24, adding a half would round up to 1 in the upper half of the interval.
+    bits = _shift_right(_mix(key + index * -0x61C88647), 9)
     return (bits.to(torch.float32) + 0.5) * 2.0**-23
 
 
-def normal(key: Tensor, draw: int | Tensor) -> Tensor:
-    """Return standard normal float32 `[*B]` (Box-Muller) from draws `2 draw` and `2 draw + 1`."""
-    radius = (-2.0 * uniform(key, 2 * draw).log()).sqrt()
-    return radius * (2.0 * math.pi * uniform(key, 2 * draw + 1)).cos()
+def normal(key: Tensor, index: int | Tensor) -> Tensor:
+    """Return standard normal float32 `[*B]` (Box-Muller), from the uniform numbers `2 index` and `2 index + 1`."""
+    radius = (-2.0 * uniform(key, 2 * index).log()).sqrt()
+    return radius * (2.0 * math.pi * uniform(key, 2 * index + 1)).cos()
 
 
 def seed_tensor(seed: int, device: torch.device | None = None) -> Tensor:
     """Fold a Python integer of any size into the int32 scalar that `key_for` takes."""
     folded = (seed ^ (seed >> 32)) & 0xFFFFFFFF
-    return torch.tensor(folded - (1 << 32) if folded >= 1 << 31 else folded, dtype=torch.int32, device=device)
+    signed = folded - (1 << 32) if folded >= 1 << 31 else folded
+    return torch.tensor(signed, dtype=torch.int32, device=device)

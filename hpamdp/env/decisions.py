@@ -1,4 +1,4 @@
-"""Time abstraction: which steps are decisions, and what each option earned from its decision to its end."""
+"""Temporal abstraction: which steps are decisions, and what each option earned from its decision to its end."""
 
 from __future__ import annotations
 
@@ -15,83 +15,94 @@ from hpamdp.env.base import PAMDPEnv
 
 
 class DecisionTracker(Transform):
-    """Write where an option is due and the semi-MDP view of the option that runs.
+    """Mark the steps at which an option is due and keep the return of the option that runs.
 
-    At the root of a step `is_decision` `[*B, 1]` says that the agent chooses an option there. Under `next` it says that
-    the option ended with this step, so the rows where `("next", "is_decision")` are the semi-MDP's transitions, with
-    the discounted return `option_return` `[*B, 1]`, the length `option_steps` `[*B, 1]` and the observation
-    `decision_observation` `[*B, observation_dim]` at which the option was chosen. `episode_return` and `episode_steps`
-    `[*B, 1]` are the (undiscounted) sums since the episode began. All state travels in the tensordict, so an option
-    that spans two collected batches is accounted right.
+    Keys that it writes, `[*B, 1]` but for the observation:
+
+    - `is_decision`, bool: in a step's root, the agent chooses an option at this step; under `next`, the option ended
+      with this step.
+    - `option_return`: discounted sum of rewards since the option began, and `option_steps`, its number of steps.
+    - `decision_observation` `[*B, observation_dim]`: the observation at which the option was chosen.
+    - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
+
+    The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
+    tensordict, so an option may span several collected batches.
 
     Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.
 
     Args:
         gamma: discount of a step within the option.
-        option_length: steps after which an option ends, if its episode does not end before; None: it lasts an episode.
+        option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode.
     """
 
     def __init__(self, gamma: float = 1.0, option_length: int | None = None) -> None:
         super().__init__()
-        self.gamma, self.option_length = gamma, option_length
+        self.gamma = gamma
+        self.option_length = option_length
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declare the keys that the tracker writes."""
-        shape, device = observation_spec.shape, observation_spec.device
-        observation_spec[keys.IS_DECISION] = Binary(n=1, shape=(*shape, 1), dtype=torch.bool, device=device)
+        shape = (*observation_spec.shape, 1)
+        device = observation_spec.device
+        observation_spec[keys.IS_DECISION] = Binary(n=1, shape=shape, dtype=torch.bool, device=device)
         for name in (keys.OPTION_RETURN, keys.EPISODE_RETURN):
-            observation_spec[name] = Unbounded(shape=(*shape, 1), device=device)
+            observation_spec[name] = Unbounded(shape=shape, device=device)
         for name in (keys.OPTION_STEPS, keys.EPISODE_STEPS):
-            observation_spec[name] = Unbounded(shape=(*shape, 1), dtype=torch.long, device=device)
+            observation_spec[name] = Unbounded(shape=shape, dtype=torch.long, device=device)
         observation_spec[keys.DECISION_OBSERVATION] = observation_spec[keys.OBSERVATION].clone()
         return observation_spec
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        """Start an option everywhere; of environments that were not reset TorchRL keeps the rows as they were."""
+        """Begin an option in every row; TorchRL restores the rows of the environments that were not reset."""
         observation = tensordict_reset.get(keys.OBSERVATION)
-        is_new = torch.ones_like(tensordict_reset.get(keys.DONE))
-        nothing = torch.zeros(is_new.shape, device=observation.device)
+        is_decision = torch.ones_like(tensordict_reset.get(keys.DONE))
+        zeros = torch.zeros(is_decision.shape, device=observation.device)
         return tensordict_reset.update(
             {
-                keys.IS_DECISION: is_new,
-                keys.OPTION_RETURN: nothing,
-                keys.OPTION_STEPS: nothing.long(),
+                keys.IS_DECISION: is_decision,
+                keys.OPTION_RETURN: zeros,
+                keys.OPTION_STEPS: zeros.long(),
                 keys.DECISION_OBSERVATION: observation,
-                keys.EPISODE_RETURN: nothing.clone(),
-                keys.EPISODE_STEPS: nothing.long(),
+                keys.EPISODE_RETURN: zeros.clone(),
+                keys.EPISODE_STEPS: zeros.long(),
             }
         )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        """Add this step to the accounts of the option and the episode."""
-        reward, done = next_tensordict.get(keys.REWARD), next_tensordict.get(keys.DONE)
-        total, steps = tensordict.get(keys.OPTION_RETURN), tensordict.get(keys.OPTION_STEPS)
-        chosen_at = tensordict.get(keys.DECISION_OBSERVATION)
+        """Add this step to the sums of its option and its episode."""
+        reward = next_tensordict.get(keys.REWARD)
+        done = next_tensordict.get(keys.DONE)
+        option_return = tensordict.get(keys.OPTION_RETURN)
+        option_steps = tensordict.get(keys.OPTION_STEPS)
+        decision_observation = tensordict.get(keys.DECISION_OBSERVATION)
         if self.option_length is None:
-            is_decision, chosen_at = done.clone(), chosen_at.clone()
+            is_decision = done.clone()
+            decision_observation = decision_observation.clone()
         else:
-            is_first = tensordict.get(keys.IS_DECISION)  # of its option, whose account it opens
-            total, steps = _unless(is_first, total), _unless(is_first, steps)
-            chosen_at = torch.where(is_first, tensordict.get(keys.OBSERVATION), chosen_at)
-            is_decision = done | (steps + 1 >= self.option_length)
+            # Only a reset writes zeros: an option that begins inside an episode restarts its sums here.
+            is_first = tensordict.get(keys.IS_DECISION)
+            option_return = _zero_where(is_first, option_return)
+            option_steps = _zero_where(is_first, option_steps)
+            decision_observation = torch.where(is_first, tensordict.get(keys.OBSERVATION), decision_observation)
+            is_decision = done | (option_steps + 1 >= self.option_length)
         next_tensordict.set(keys.IS_DECISION, is_decision)
-        next_tensordict.set(keys.OPTION_RETURN, total + self.gamma**steps * reward)
-        next_tensordict.set(keys.OPTION_STEPS, steps + 1)
-        next_tensordict.set(keys.DECISION_OBSERVATION, chosen_at)
+        next_tensordict.set(keys.OPTION_RETURN, option_return + self.gamma**option_steps * reward)
+        next_tensordict.set(keys.OPTION_STEPS, option_steps + 1)
+        next_tensordict.set(keys.DECISION_OBSERVATION, decision_observation)
         next_tensordict.set(keys.EPISODE_RETURN, tensordict.get(keys.EPISODE_RETURN) + reward)
         next_tensordict.set(keys.EPISODE_STEPS, tensordict.get(keys.EPISODE_STEPS) + 1)
         return next_tensordict
 
 
-def _unless(is_first: Tensor, account: Tensor) -> Tensor:
-    return torch.where(is_first, torch.zeros_like(account), account)
+def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
+    return torch.where(mask, torch.zeros_like(values), values)
 
 
 class DecisionEnv(TransformedEnv):
-    """An environment with its decisions tracked, whose `reset` takes what the environment's own takes."""
+    """An environment whose decisions are tracked; its `reset` takes the same keys as the environment's own."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        # As TorchRL's, which passes no more than the mask on.
+        # Like TransformedEnv's, except that it passes on more than the mask: layouts and seeds to start from.
         given = None if tensordict is None else tensordict.copy()
         given = self.transform._reset_env_preprocess(given)
         fresh = self.base_env._reset(given, **kwargs)
@@ -100,5 +111,5 @@ class DecisionEnv(TransformedEnv):
 
 
 def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: int | None = None) -> DecisionEnv:
-    """Return the environment with its decisions tracked."""
+    """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
     return DecisionEnv(env, DecisionTracker(gamma, option_length))

@@ -1,18 +1,22 @@
-"""The Gymnasium ids of our environments, apart from the environments so that registering them loads no torch."""
+"""Registration of the problems' Gymnasium ids."""
 
 from __future__ import annotations
 
-import gymnasium
+import importlib
+import importlib.util
+import pkgutil
 
-BOAT_DOCK_ID = "hpamdp/BoatDock-v0"
+import hpamdp.env
 
 
 def register() -> None:
-    """Register our ids with Gymnasium; calling it again changes nothing."""
-    if BOAT_DOCK_ID not in gymnasium.registry:
-        # No max_episode_steps: the environment itself truncates after its last press.
-        gymnasium.register(
-            id=BOAT_DOCK_ID,
-            entry_point="hpamdp.env.boatdock.gymnasium_faces:BoatDock",
-            vector_entry_point="hpamdp.env.boatdock.gymnasium_faces:BoatDockVector",
-        )
+    """Register the Gymnasium ids of all problems; calling it again changes nothing.
+
+    A problem with a Gymnasium interface has a module `registration` in its folder, with a function `register()`. Since
+    every import of the package calls it, it must import neither torch nor TorchRL: Gymnasium takes the environment's
+    class as text, `package.module:Class`, and imports it when it is made.
+    """
+    for problem in pkgutil.iter_modules(hpamdp.env.__path__, "hpamdp.env."):
+        name = f"{problem.name}.registration"
+        if problem.ispkg and importlib.util.find_spec(name) is not None:
+            importlib.import_module(name).register()

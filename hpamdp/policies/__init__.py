@@ -1,0 +1,1 @@
+"""Selectors, learners and the agent made of them."""

@@ -1,8 +1,8 @@
-"""The whole agent: a selector over one learner for each option, or over one learner that is told the option."""
+"""The whole agent: a selector over one learner for each option, or over a single learner that observes the option."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
@@ -17,7 +17,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
-    """Return a shallow copy whose observations (under `next` too) end in the one-hot option."""
+    """Return a shallow copy whose observations, also those under `next`, end in the one-hot option."""
     rows = rows.copy()
     one_hot = F.one_hot(rows.get(keys.OPTION), num_options).float()
     for name in (keys.OBSERVATION, ("next", keys.OBSERVATION)):
@@ -28,18 +28,25 @@ def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
 
 
 class OptionRouter(TensorDictModuleBase):
-    """Has each environment's press chosen by the learner of the option it holds."""
+    """The low level's policy: in each environment, the policy of the held option's learner acts.
+
+    Args:
+        learners: one for each option, or a single one.
+        specs: of the problem as the environment states it.
+        is_shared: whether the single learner observes the option.
+    """
 
     def __init__(self, learners: Sequence[Learner], specs: PAMDPSpecs, is_shared: bool) -> None:
         super().__init__()
         self.policies = nn.ModuleList(learner.policy for learner in learners)
-        self.specs, self.is_shared = specs, is_shared
-        in_keys = {key for policy in self.policies for key in policy.in_keys}
+        self.specs = specs
+        self.is_shared = is_shared
+        in_keys = {key for learner in learners for key in learner.policy.in_keys}
         self.in_keys = [*in_keys, *([keys.OPTION] if specs.num_options else [])]
-        self.out_keys = list(self.policies[0].out_keys)
+        self.out_keys = list(learners[0].policy.out_keys)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the action leaves and whatever else the learners' policies keep."""
+        """Write the action leaves and the other `out_keys` of the learners' policies."""
         if self.is_shared:
             acted = self.policies[0](with_option(td.select(*self.in_keys), self.specs.num_options))
             return td.update(acted.select(*self.out_keys))
@@ -64,30 +71,40 @@ class OptionRouter(TensorDictModuleBase):
 
 
 class HeldOption(TensorDictModuleBase):
-    """The same option everywhere."""
+    """The same option in every environment at every step."""
 
     def __init__(self, option: int) -> None:
         super().__init__()
-        self.in_keys, self.out_keys, self.option = [keys.OBSERVATION], [keys.OPTION], option
+        self.in_keys = [keys.OBSERVATION]
+        self.out_keys = [keys.OPTION]
+        self.option = option
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write `option` `[*B]`."""
+        """Write `option` int64 `[*B]`."""
         observation = td.get(keys.OBSERVATION)
         return td.set(keys.OPTION, torch.full(td.batch_size, self.option, device=observation.device))
 
 
 class HierarchicalAgent(nn.Module):
-    """Selector and learners as one policy and one call to learn.
+    """A selector and its learners: one policy that acts and one call to learn.
 
     Args:
-        selector: the high level; None where the environment leaves no choice.
+        selector: the high level; None if the environment leaves no choice.
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
-        is_shared: whether the single learner takes the option as input (its own specs then count the one-hot option).
+        is_shared: whether the single learner observes the option; the specs it was built with then count the one-hot
+            option as part of the observation.
         is_frozen: whether the learners stay as they are.
-        uniform_option_frames: presses (decisions, where the learners are frozen) at the start for which the selector's
-            exploring choices are uniform; it learns from them.
+        uniform_option_frames: number of steps (of decisions, if the learners are frozen) at the beginning for which the
+            selector's exploring choices are uniform. The selector learns from them.
+
+    Attributes:
+        policy: writes `option`, if there is a selector, and the action leaves.
+        router: the low level's part of `policy`.
+        frames: how many steps (decisions) the agent has learned from.
     """
+
+    frames: Tensor
 
     def __init__(
         self,
@@ -101,7 +118,9 @@ class HierarchicalAgent(nn.Module):
         super().__init__()
         self.selector = selector
         self.learners = nn.ModuleList(learners)
-        self.specs, self.is_shared, self.is_frozen = specs, is_shared, is_frozen
+        self.specs = specs
+        self.is_shared = is_shared
+        self.is_frozen = is_frozen
         self.uniform_option_frames = uniform_option_frames
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self._set_is_uniform()
@@ -109,17 +128,20 @@ class HierarchicalAgent(nn.Module):
         self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
 
     def policy_of(self, option: int) -> TensorDictModuleBase:
-        """Return the policy that presses as this agent but holds one option."""
+        """Return the policy that always holds one option and otherwise acts like this agent."""
         return TensorDictSequential(HeldOption(option), self.router)
 
     @torch.no_grad()
     def option_values(self, observation: Tensor) -> Tensor:
-        """Return what each option's learner expects from observations `[B, observation_dim]` on, `[B, num_options]`."""
-        num = self.specs.num_options
+        """Return the value of observations `[B, observation_dim]` under each option's learner, `[B, num_options]`."""
         if not self.is_shared:
-            return torch.stack([learner.value(observation) for learner in self.learners], -1)
-        told = [F.one_hot(torch.tensor(i), num).to(observation).expand(len(observation), -1) for i in range(num)]
-        return torch.stack([self.learners[0].value(torch.cat([observation, option], -1)) for option in told], -1)
+            return torch.stack([learner.value(observation) for learner in self._learners()], -1)
+        shared = next(self._learners())
+        values = []
+        for one_hot in torch.eye(self.specs.num_options).to(observation):
+            option = one_hot.expand(len(observation), -1)
+            values.append(shared.value(torch.cat([observation, option], -1)))
+        return torch.stack(values, -1)
 
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
@@ -127,56 +149,65 @@ class HierarchicalAgent(nn.Module):
         self.frames += batch.numel()
         if self.selector is not None:
             self._set_is_uniform()
-            scalars |= {f"high/{name}": value for name, value in self._teach_selector(batch).items()}
+            learned = self._teach_selector(self.selector, batch)
+            scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
+        for prefix, learner, rows, mask in self._shares(batch):
+            learned = learner.learn(rows, mask)
+            scalars.update({f"{prefix}/{name}": value for name, value in learned.items()})
+        return scalars
+
+    def add_demonstrations(self, batch: TensorDictBase) -> None:
+        """Let the selector learn from a data set `[*B, T]`, if it can, and the learners keep their own transitions."""
+        if self.selector is not None and "offline" in self.selector.modes:
+            self._teach_selector(self.selector, batch)
+        for _, learner, rows, mask in self._shares(batch):
+            learner.add_demonstrations(rows, mask)
+
+    def update(self, num_updates: int) -> dict[str, float]:
+        """Let each learner make updates from its stored transitions; return scalars named `low/...`."""
+        scalars: dict[str, float] = {}
+        for i, learner in enumerate(self._learners()):
+            learned = learner.update(num_updates)
+            scalars.update({f"{self._prefix_of(i)}/{name}": value for name, value in learned.items()})
+        return scalars
+
+    def stateful(self) -> dict[str, Any]:
+        """Return what a checkpoint must hold besides parameters and buffers, by level and name."""
+        levels: dict[str, Learner | Selector] = {f"learner{i}": each for i, each in enumerate(self._learners())}
+        if self.selector is not None:
+            levels["selector"] = self.selector
+        return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
+
+    def _learners(self) -> Iterator[Learner]:
+        for learner in self.learners:
+            assert isinstance(learner, Learner)
+            yield learner
+
+    def _shares(self, batch: TensorDictBase) -> Iterator[tuple[str, Learner, TensorDictBase, Tensor]]:
+        """Yield for each learner its prefix in logs, itself, the batch as it sees it, the mask of its transitions."""
         everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
         if self.is_shared:
             batch = with_option(batch, self.specs.num_options)
-        for i, learner in enumerate(self.learners):
-            is_own = everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i
-            scalars |= {f"{self._name_of(i)}/{name}": value for name, value in learner.learn(batch, is_own).items()}
-        return scalars
+        for i, learner in enumerate(self._learners()):
+            mask = everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i
+            yield self._prefix_of(i), learner, batch, mask
 
-    def _name_of(self, learner: int) -> str:
+    def _prefix_of(self, learner: int) -> str:
         return "low" if len(self.learners) == 1 else f"low/{self.specs.option_names[learner]}"
 
     def _set_is_uniform(self) -> None:
         if self.selector is not None:
             self.selector.is_uniform.fill_(self.frames < self.uniform_option_frames)
 
-    def _teach_selector(self, batch: TensorDictBase) -> dict[str, float]:
+    def _teach_selector(self, selector: Selector, batch: TensorDictBase) -> dict[str, float]:
         is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
         if not is_end.any():
             return {}
-        # Time first, so that the selector meets the decisions oldest first.
+        # Time first, so that the selector sees the decisions oldest first.
         decisions = batch.transpose(0, -1)[is_end.transpose(0, -1)]
-        if self.selector.needs_values:
+        if selector.needs_values:
             decided_at = decisions.get(("next", keys.DECISION_OBSERVATION))
             decisions.set(keys.OPTION_VALUES, self.option_values(decided_at))
-        return self.selector.learn(decisions)
-
-    def add_demonstrations(self, batch: TensorDictBase) -> None:
-        """Let the learners keep a data set's transitions `[*B, T]`, each its own option's; the selector learns."""
-        if self.selector is not None:
-            self._teach_selector(batch)
-        everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
-        if self.is_shared:
-            batch = with_option(batch, self.specs.num_options)
-        for i, learner in enumerate(self.learners):
-            learner.add_demonstrations(batch, everything if len(self.learners) == 1 else batch.get(keys.OPTION) == i)
-
-    def update(self, num_updates: int) -> dict[str, float]:
-        """Let each learner make updates from what it remembers; return scalars named `low/...`."""
-        scalars: dict[str, float] = {}
-        for i, learner in enumerate(self.learners):
-            made = learner.update(num_updates)
-            scalars |= {f"{self._name_of(i)}/{name}": value for name, value in made.items()}
-        return scalars
-
-    def stateful(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold beside the parameters and buffers."""
-        levels = {f"learner{i}": learner for i, learner in enumerate(self.learners)}
-        if self.selector is not None:
-            levels["selector"] = self.selector
-        return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
+        return selector.learn(decisions)

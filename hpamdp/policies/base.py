@@ -1,11 +1,11 @@
-"""What a selector (the high level) and a learner (the low level) are to the rest of the framework."""
+"""The two contracts of an agent: `Selector`, the high level, and `Learner`, the low level."""
 
 from __future__ import annotations
 
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -15,86 +15,193 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def is_greedy() -> bool:
-    """Return whether policies are to act greedily here; else they explore."""
+    """Return whether policies must act greedily; otherwise they explore."""
     return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
 
 
 def option_ends(batch: TensorDictBase) -> Tensor:
-    """Return where a batch's episodes or options end, bool `[*B, T, 1]`: another learner's rows can follow."""
+    """Return where an episode or an option ends, bool `[*B, T, 1]`; another option's rows may follow."""
     return batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
 
 
 class Selector(TensorDictModuleBase):
-    """Chooses an option where a decision is due and holds it until the next one.
+    """The high level: chooses an option at every decision and holds it until the next one.
 
-    A subclass writes `select` and, if it learns, `learn`; what it remembers lives in buffers, so that a checkpoint
-    holds it. Its `__init__` takes `specs` and its options as keyword arguments, which are the schema of its yaml.
+    A decision is due where an episode begins or the previous option has ended. `forward` does the holding: a subclass
+    writes `select` and, if it learns, `learn`::
+
+        class GreedyMean(Selector):  # the option with the highest mean reward, at times a random one
+            def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:
+                super().__init__(specs)
+                self.epsilon = epsilon
+                self.register_buffer("sums", torch.zeros(specs.num_options))
+                self.register_buffer("counts", torch.zeros(specs.num_options))
+
+            def select(self, td: TensorDictBase) -> Tensor:
+                best = (self.sums / self.counts.clamp(min=1.0)).argmax().expand(td.batch_size)
+                if is_greedy():
+                    return best
+                is_random = torch.rand_like(best, dtype=torch.float32) < self.epsilon
+                return torch.where(is_random, torch.randint_like(best, self.specs.num_options), best)
+
+            def learn(self, decisions: TensorDictBase) -> dict[str, float]:
+                option = decisions.get(keys.OPTION)
+                reward = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
+                self.sums.index_add_(0, option, reward)
+                self.counts.index_add_(0, option, torch.ones_like(reward))
+                return {"reward": reward.mean().item()}
+
+    Constructor: `specs` holds the sizes of the problem; `device`, if it is an argument, says where tensors live. All
+    other arguments are keyword-only; their names and type annotations are the schema of the selector's yaml in
+    `conf/high`. A selector never sees the environment, the config or the agent.
+
+    Tensordict: `forward` gets the current step of `[*B]` environments and reads `in_keys`: `observation`
+    `[*B, observation_dim]` and `is_decision` bool `[*B, 1]`. It writes `out_keys`: `option` int64 `[*B]`. If `learn`
+    needs to know more about a choice, such as its log-probability, append a key to `out_keys` and return it from
+    `choose` and `choose_uniformly`, shape `[*B]`. It is held with the option and is there again in `learn`.
+
+    State: the same module acts in training and evaluation, with different numbers of environments, so whatever belongs
+    to an episode travels in the tensordict. What the selector has learned belongs in parameters and buffers: they are
+    saved in checkpoints and sent to collector processes. Everything else that training needs, such as optimisers and
+    replay buffers, is returned by `stateful`.
+
+    Attributes:
+        specs: sizes of the problem.
+        needs: names of constructor arguments of the environment which the run sets to true, so that the environment
+            writes more than its observation: with `oracle` its planner's best action for each option (the `ORACLE_`
+            keys of `hpamdp.keys`), with `human` the probabilities of the human choices (`HUMAN_OPTION`). Append the
+            keys that `select` reads to `in_keys`. Environments without such an argument are refused.
+        needs_values: whether `learn` reads `option_values`, the learners' own estimates of a state. Learners without
+            `has_value` are then refused.
+        gamma: discount of a step, if options may end before their episode (`agent.option_length`): `option_return` is
+            discounted by it, and a selector that bootstraps multiplies what follows by `gamma ** option_steps`.
+            Options that last an episode are not discounted.
+        modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others
+            made. A selector with keys of its own in `out_keys` usually has `train` alone, as a data set lacks them.
+        is_uniform: bool scalar, a buffer that the agent sets. While it is true, for the first
+            `agent.uniform_option_frames` steps of a run, exploring choices come from `choose_uniformly`, so that every
+            option's learner gets transitions to learn from.
     """
 
-    # What it reads that an environment writes only when asked: `oracle`, `human`.
     needs: ClassVar[tuple[str, ...]] = ()
-    needs_values: bool = False  # whether it reads the learners' own values of a state
-    gamma: float = 1.0  # discount of a step, where options end before their episode
+    modes: ClassVar[tuple[str, ...]] = ("train", "offline")
+    needs_values: bool = False
+    gamma: float = 1.0
+    is_uniform: Tensor
+
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION, keys.IS_DECISION]
         self.out_keys = [keys.OPTION]
         self.specs = specs
-        # While it is true, exploring choices are uniform, so that every option's learner gets its practice.
         self.register_buffer("is_uniform", torch.zeros((), dtype=torch.bool))
 
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return a fresh choice for every environment, int64 `[*B]`."""
+        """Return an option for every environment, int64 `[*B]`.
+
+        Choose greedily if `is_greedy()`, else explore. Where no decision is due, the choice is ignored.
+        """
         raise NotImplementedError
 
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return all `out_keys` of a fresh choice, each `[*B]`; beside the option what `learn` wants to know of it."""
+        """Return a fresh choice: a tensor `[*B]` for each of `out_keys`.
+
+        Override it instead of `select` if there is more to return than the option.
+        """
         return {keys.OPTION: self.select(td)}
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return all `out_keys` of uniformly random choices, each `[*B]`."""
+        """Return a uniformly random choice: a tensor `[*B]` for each of `out_keys`."""
         return {keys.OPTION: torch.randint(self.specs.num_options, td.batch_size, device=self.is_uniform.device)}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Learn from finished decisions `[N]`, oldest first; return scalars to log.
+        """Learn from finished decisions `[N]`, oldest first, and return scalars to log as `high/<name>`.
 
-        A decision is its last step: `option`, and under `next` its `option_return`, `option_steps`,
-        `decision_observation`, `observation` and `terminated`; with `needs_values`, `option_values` `[N, num_options]`
-        at the decision.
+        Called after each collected batch in which an option ended, before the learners learn from the batch, and, with
+        the mode `offline`, once before training with the decisions in the run's data set.
+
+        A decision is represented by the last step of its option:
+
+        - `option` int64 `[N]` and the other `out_keys`, as chosen (a data set holds `option` alone);
+        - `("next", "decision_observation")` `[N, observation_dim]`: the observation at the decision;
+        - `("next", "option_return")` `[N, 1]`: the sum of the option's rewards, discounted as described at `gamma`;
+        - `("next", "option_steps")` int64 `[N, 1]`: how many steps the option took;
+        - `("next", "observation")` `[N, observation_dim]` and `("next", "terminated")` bool `[N, 1]`: where it ended,
+          and whether nothing follows;
+        - `option_values` `[N, num_options]`, if `needs_values`: what each option's learner expects at the decision.
+
+        `observation`, without `next`, belongs to the option's last step: it is not what the choice was based on.
         """
         return {}
 
     def stateful(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold beside the module's parameters and buffers: optimisers, replay."""
+        """Return what a checkpoint must hold besides parameters and buffers, by name: optimisers, replay buffers.
+
+        Each value has `state_dict` and `load_state_dict`, or is a TorchRL `ReplayBuffer`.
+        """
         return {}
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write `out_keys` `[*B]`: a fresh choice where `is_decision`, the held one elsewhere."""
+        """Write `out_keys`: a fresh choice where `is_decision`, elsewhere what `td` already holds."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         held = {key: td.get(key, None) for key in self.out_keys}
-        is_new = any(value is None for value in held.values())
-        if is_new or is_decision.any():
-            is_uniform = bool(self.is_uniform) and not is_greedy()
-            fresh = self.choose_uniformly(td) if is_uniform else self.choose(td)
-            held = fresh if is_new else {key: torch.where(is_decision, fresh[key], held[key]) for key in held}
-        for key, value in held.items():
-            td.set(key, value)
+        nothing_held = any(value is None for value in held.values())
+        if not nothing_held and not is_decision.any():
+            return td
+        explores_uniformly = bool(self.is_uniform) and not is_greedy()
+        fresh = self.choose_uniformly(td) if explores_uniformly else self.choose(td)
+        for key, value in fresh.items():
+            td.set(key, value if nothing_held else torch.where(is_decision, value, held[key]))
         return td
 
 
 class Learner(nn.Module):
-    """Learns which key to press and for how long.
+    """The low level: learns which discrete action to take, and with which parameters.
 
-    A subclass gives `policy`, a module that writes the action leaves (`keys.KEY` `[*B]`, `keys.DURATION`
-    `[*B, num_parameters]`) greedily or exploring by `is_greedy`, and `learn`. It owns its data and its
-    optimisers. Its `__init__` takes `specs`, `device` and its options as keyword arguments, the schema of its yaml.
+    By default each option has a learner of its own; with `agent.sharing=shared` a single one serves all of them, and
+    the observation it sees ends in the one-hot option. A subclass provides:
+
+    - `policy`, which acts;
+    - `learn`, to learn from the agent's own transitions;
+    - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in `modes`;
+    - `value` and `has_value = True`, if it can estimate the value of a state;
+    - `stateful`, if it has optimisers or a replay buffer.
+
+    `policies.shared.replay.ReplayLearner` implements `learn`, `add_demonstrations`, `update` and `stateful` for
+    off-policy learners. The smallest complete learner is `policies.low_level.random.Random`.
+
+    Constructor: `specs` holds the sizes and bounds of the problem, and `device`, if it is an argument, says where
+    tensors live. All other arguments are keyword-only; their names and type annotations are the schema of the learner's
+    yaml in `conf/low`. A learner never sees the environment, the config, the agent or another learner.
+
+    Policy: `policy` reads its `in_keys`, usually `observation` `[*B, observation_dim]`, and writes its `out_keys`:
+    `("action", "discrete")` int64 `[*B]` and `("action", "parameters")` `[*B, num_parameters]`, within their bounds.
+    The parameters of all discrete actions lie side by side, and only the chosen action's own have an effect;
+    `specs.parameter_mask` says whose they are, `specs.from_unit` maps [-1, 1] to the bounds. `is_greedy()` says whether
+    to act greedily or to explore.
+
+    - If `learn` needs to know more about an action, such as its log-probability, append a key to the policy's
+      `out_keys`: it is there again in the batch.
+    - The policy gets only the environments whose option is its learner's, so their number changes from step to step,
+      and it acts in evaluation, too. It must not remember anything about an episode.
+    - The policy may run as a copy in another process, which receives its parameters and buffers and nothing else. So
+      whatever changes during training, such as an exploration rate, must be one of them.
+
+    Attributes:
+        specs: sizes and bounds of the problem.
+        policy: the module that acts.
+        needs: what the environment must reveal beyond its observation, as in `Selector`.
+        modes: what the learner can learn from. `train`: transitions that the agent collects (`mode=train`). `offline`:
+            a data set (`mode=offline`, or `data=...` with `mode=train`).
+        has_value: whether `value` is implemented.
     """
 
-    needs: ClassVar[tuple[str, ...]] = ()  # as of a selector
-    # What it can learn from: `train`, its own presses; `offline`, a data set of others' presses.
+    needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train",)
-    has_value: ClassVar[bool] = False  # whether `value` is there
+    has_value: ClassVar[bool] = False
 
     policy: TensorDictModuleBase
 
@@ -103,27 +210,40 @@ class Learner(nn.Module):
         self.specs = specs
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Learn from a collected batch `[*B, T]`, of which the transitions in `mask` bool `[*B, T]` are this learner's.
+        """Learn from a collected batch `[*B, T]` and return scalars to log, averaged over the updates made.
 
-        Return scalars to log, averaged over the updates made.
+        Called after every batch, even if none of its transitions is this learner's. When and how often it updates is
+        up to the learner. The scalars are logged as `low/<name>`, or `low/<option>/<name>` with several learners.
+
+        Args:
+            batch: consecutive steps along `T`: `observation`, `option` (if the problem has options), the policy's
+                `out_keys` and, under `next`, `observation`, `reward` `[*B, T, 1]` and bool `[*B, T, 1]` `terminated`,
+                `truncated`, `done` and `is_decision`. A time limit is `truncated`, not `terminated`: values may be
+                bootstrapped there. Where `option_ends`, the next step may belong to another learner. All learners get
+                the same batch, and the collector may reuse its memory: do not modify it, and copy what must last.
+            mask: bool `[*B, T]`, the transitions that are this learner's.
         """
         return {}
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
-        """Keep those of a data set's transitions `[*B, T]` that are in `mask`, beside what the learner will collect.
+        """Keep the transitions of a data set `[*B, T]` that are in `mask`, bool `[*B, T]`, to learn from them later.
 
-        Only for learners with the mode `offline`.
+        Called once, before training, on learners with the mode `offline`. The batch has the keys of a collected one
+        except for what the policy writes besides the action.
         """
         raise NotImplementedError
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Make updates from what is remembered; return scalars to log, averaged over them."""
+        """Make updates from the stored transitions and return scalars to log, averaged over them.
+
+        Called repeatedly with `mode=offline`, in which `learn` is not called, on learners with the mode `offline`.
+        """
         raise NotImplementedError
 
     def value(self, observation: Tensor) -> Tensor:
-        """Return what the learner expects to earn from observations `[B, observation_dim]` on, `[B]`."""
+        """Return the expected return from observations `[B, observation_dim]` on, `[B]`; see `has_value`."""
         raise NotImplementedError
 
     def stateful(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold beside the module's parameters and buffers: optimisers, replay."""
+        """Return what a checkpoint must hold besides parameters and buffers, as `Selector.stateful` does."""
         return {}

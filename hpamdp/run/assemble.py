@@ -1,257 +1,227 @@
-"""The parts of a run from its config: environment, agent, evaluation, logger."""
+"""The parts of a run, built from its config: environment, agent, evaluation, data, logger."""
 
 from __future__ import annotations
 
 import importlib.util
-import inspect
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from hpamdp.config import ConfigError, RunConfig, build, name_of, run_config, validate
+from hpamdp.config import Config, ConfigError, constructor_arguments
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.loggers import Logger
 from hpamdp.specs import PAMDPSpecs
-
-if TYPE_CHECKING:
-    from hpamdp.run.collection.base import Collection
-
-# What the builder supplies; the rest of a constructor's arguments is the yaml's.
-CONTEXT = {
-    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human"),
-    "high": ("specs", "device"),
-    "low": ("specs", "device"),
-    "data": ("env",),
-    "logger": ("output_dir", "config"),
-    "collector": ("cfg", "settings", "parts", "frames"),
-}
 
 
 @dataclass
 class Parts:
-    """What a run is made of."""
+    """What a run is made of.
+
+    Attributes:
+        env: the environments to train in, with their decisions tracked.
+        policy: acts in `env`.
+        agent: selector and learners.
+        evaluation: scores the agent on environments of its own.
+        data: transitions `[1, M]` of others to learn from, if there are any.
+        logger: takes the run's numbers beside its own files.
+        device: of all of them.
+    """
 
     env: TransformedEnv
-    policy: TensorDictModuleBase  # that acts in `env`
-    evaluation: Evaluation
+    policy: TensorDictModuleBase
     agent: HierarchicalAgent
-    logger: Any
-    data: TensorDict | None  # others' presses `[1, M]` to learn from
+    evaluation: Evaluation
+    data: TensorDict | None
+    logger: Logger
     device: torch.device
 
 
-def assemble(cfg: DictConfig, settings: RunConfig, output_dir: Path) -> Parts:
-    """Check every group, then build them.
+def assemble(config: Config, output_dir: Path) -> Parts:
+    """Build the parts of a run.
 
     Raises:
-        ConfigError: the first wrong value or impossible pair found.
+        ConfigError: values that do not go together, or that a constructor refuses.
     """
-    classes = {group: validate(group, cfg[group], context)[0] for group, context in CONTEXT.items()}
-    device = settings.resolve_device()
-    env = make_env(cfg, settings.num_envs, device, settings.seed)
-    specs = PAMDPSpecs.from_env(env)
-    _check_levels(cfg, settings, env, classes)
-    _check_collector(cfg, settings, env, classes["collector"])
-    agent = make_agent(cfg, settings, specs, device)
-    _check_values(cfg, agent)
-    _check_data(cfg, settings, classes)
-    # Who goes on or is only scored has learned from it already.
-    is_new = settings.mode != "eval" and settings.resume is None
-    demonstrations = build("data", cfg.data, env=env) if is_new else None
-    data = None if demonstrations is None else demonstrations.batch
-    if settings.low.checkpoint is not None and settings.resume is None and settings.mode != "eval":
-        checkpoint.load_learners(checkpoint.find(settings.low.checkpoint, "low.checkpoint"), agent, device)
-    test_env = make_env(cfg, settings.eval.layouts, device, seed=0)
-    test_env.set_scaling_from(env)
-    evaluation = Evaluation(_with_decisions(test_env, settings), settings.eval.seed)
-    config = OmegaConf.to_container(cfg, resolve=True)
-    logger = build("logger", cfg.logger, output_dir=output_dir, config=config)
-    return Parts(*acting(env, agent, settings), evaluation, agent, logger, data, device)
+    device = config.run.resolve_device()
+    env = make_env(config, config.run.num_envs, device, config.run.seed)
+    check_choice(config, env)
+    check_collector(config, env)
+    check_modes(config)
+    agent = make_agent(config, PAMDPSpecs.from_env(env), device)
+    check_values(config, agent)
+    is_new = config.run.mode != "eval" and config.run.resume is None
+    data = make_data(config, env) if is_new else None
+    if is_new and config.run.low.checkpoint is not None:
+        checkpoint.load_learners(checkpoint.find(config.run.low.checkpoint, "low.checkpoint"), agent, device)
+    evaluation = make_evaluation(config, env)
+    logger = config.logger.build(output_dir=output_dir, config=config.to_dict())
+    tracked, policy = acting(env, agent, config)
+    return Parts(tracked, policy, agent, evaluation, data, logger, device)
 
 
-def make_env(cfg: DictConfig, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:
-    """Build the environments from number `first_env` on, with all that the two levels need of them.
+def make_env(config: Config, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:
+    """Build the environments from number `first_env` on, which write what the two levels read of them.
 
-    Those of a class without an argument `first_env` get a seed of their own.
+    Environments whose class has no argument `first_env` get a seed of their own.
 
     Raises:
-        ConfigError: a wrong option, or something that this environment does not have.
+        ConfigError: an option that the constructor refuses, or something that this environment does not have.
     """
-    classes = {group: validate(group, cfg[group], CONTEXT[group])[0] for group in ("env", "high", "low")}
-    if first_env > 0 and "first_env" not in inspect.signature(classes["env"].__init__).parameters:
-        seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
-    asked = _asked_of_env(cfg, classes)
-    return build("env", cfg.env, num_envs=num_envs, device=device, seed=seed, first_env=first_env, **asked)
-
-
-def acting(env: PAMDPEnv, agent: HierarchicalAgent, settings: RunConfig) -> tuple[TransformedEnv, TensorDictModuleBase]:
-    """Return the environment to train in, with its decisions tracked, and the policy that acts there."""
-    gamma, policy = 1.0 if agent.selector is None else agent.selector.gamma, agent.policy
-    if settings.low.freeze:
-        env, policy = OptionChoiceEnv(agent.router, env), agent.selector
-    return _with_decisions(env, settings, gamma), policy
-
-
-def _asked_of_env(cfg: DictConfig, classes: dict[str, type | None]) -> dict[str, Any]:
-    """Return the environment's arguments for what the two levels need of it."""
-    offered = inspect.signature(classes["env"].__init__).parameters
-    asked = {}
-    for group in ("high", "low"):
-        for name in classes[group].needs if classes[group] is not None else ():
-            if name not in offered:
+    assert config.env.cls is not None
+    arguments = constructor_arguments(config.env.cls)
+    needs = {}
+    for level in (config.high, config.low):
+        for name in getattr(level.cls, "needs", ()):
+            if name not in arguments:
                 lacks = {"oracle": "has no planner to ask", "human": "has no human data"}[name]
-                raise ConfigError(f"{group}={name_of(cfg[group])}: env={name_of(cfg.env)} {lacks}")
-            asked[name] = True
-    return asked
+                raise ConfigError(f"{level}: {config.env} {lacks}")
+            needs[name] = True
+    if first_env > 0 and "first_env" not in arguments:
+        seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
+    return config.env.build(num_envs=num_envs, device=device, seed=seed, first_env=first_env, **needs)
 
 
-def _with_decisions(env: PAMDPEnv, settings: RunConfig, gamma: float = 1.0) -> TransformedEnv:
-    length = settings.agent.option_length
+def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:
+    """Build both levels with fresh weights.
+
+    Raises:
+        ConfigError: an option that a constructor refuses.
+    """
+    selector = config.high.build(specs=specs, device=device) if specs.num_options else None
+    is_shared = config.run.agent.sharing == "shared" and specs.num_options > 0
+    learner_specs = specs.with_option_observed() if is_shared else specs
+    num_learners = 1 if is_shared else max(1, specs.num_options)
+    learners = [config.low.build(specs=learner_specs, device=device) for _ in range(num_learners)]
+    agent = HierarchicalAgent(
+        selector,
+        learners,
+        specs,
+        is_shared=is_shared,
+        is_frozen=config.run.low.freeze,
+        uniform_option_frames=config.run.agent.uniform_option_frames,
+    )
+    return agent.to(device)
+
+
+def make_data(config: Config, env: PAMDPEnv) -> TensorDict | None:
+    """Build the data set and return its transitions `[1, M]`, if there is one."""
+    demonstrations = config.data.build(env=env)
+    return None if demonstrations is None else demonstrations.batch
+
+
+def make_evaluation(config: Config, env: PAMDPEnv) -> Evaluation:
+    """Build the evaluation on environments of its own, which scale observations as `env` does."""
+    test_env = make_env(config, config.run.eval.layouts, env.device, seed=0)
+    test_env.set_scaling_from(env)
+    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed)
+
+
+def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
+    """Return the environment to train in, with its decisions tracked, and the policy that acts there."""
+    gamma = 1.0 if agent.selector is None else agent.selector.gamma
+    if config.run.low.freeze:
+        return _with_decisions(OptionChoiceEnv(agent.router, env), config, gamma), agent.selector
+    return _with_decisions(env, config, gamma), agent.policy
+
+
+def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
+    length = config.run.agent.option_length
     return with_decisions(env) if length == "episode" else with_decisions(env, gamma, length)
 
 
-def _check_levels(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, classes: dict[str, type | None]) -> None:
-    high, name, length = name_of(cfg.high), name_of(cfg.env), settings.agent.option_length
-    if classes["high"] is not None and not env.option_names and high != "fixed":
-        raise ConfigError(f"high={high}: env={name} has no options to choose; use high=none")
-    if classes["high"] is not None and env.option_names and not env.has_choice:
+def check_choice(config: Config, env: PAMDPEnv) -> None:
+    """Refuse a selector where there is nothing to choose, none where there is, and options of an impossible length.
+
+    Raises:
+        ConfigError: with the settings to change.
+    """
+    length, freeze = config.run.agent.option_length, config.run.low.freeze
+    has_selector = config.high.cls is not None
+    if has_selector and not env.option_names:
+        raise ConfigError(f"{config.high}: {config.env} has no options to choose; use high=none")
+    if has_selector and not env.has_choice:
         raise ConfigError(
-            f"high={high}: env.controller={cfg.env.controller} leaves nothing to choose; use high=none or "
-            "env.controller=choose"
+            f"{config.high}: {config.env} leaves nothing to choose; use high=none or {env.choice_setting}"
         )
-    if classes["high"] is None and env.has_choice:
-        raise ConfigError(
-            "high=none: env.controller=choose needs a selector; use another high or env.controller=congruent, "
-            "incongruent, random"
-        )
+    if not has_selector and env.has_choice:
+        without = f" or {env.no_choice_setting}" if env.no_choice_setting else ""
+        raise ConfigError(f"high=none: {config.env} needs a selector; use another high{without}")
     if length != "episode" and not (env.has_choice and env.can_change_option):
         why = "keeps an option for an episode" if env.has_choice else "has no options"
-        raise ConfigError(f"agent.option_length={length}: env={name} {why}; use agent.option_length=episode")
-    if settings.low.freeze and not env.has_choice:
+        raise ConfigError(f"agent.option_length={length}: {config.env} {why}; use agent.option_length=episode")
+    if freeze and not env.has_choice:
         raise ConfigError("low.freeze=true: there is no choice left to learn; use low.freeze=false")
-    if settings.low.freeze and length != "episode":
+    if freeze and length != "episode":
         raise ConfigError(
             f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
         )
 
 
-_SOURCES = {"train": "its own presses", "offline": "data sets"}  # by the mode of a run
+def check_modes(config: Config) -> None:
+    """Refuse a learner that cannot learn from what the run has: its own steps, a data set or both.
 
-
-def _check_data(cfg: DictConfig, settings: RunConfig, classes: dict[str, type | None]) -> None:
-    low, modes = name_of(cfg.low), classes["low"].modes
-    can = f"low={low} learns from {' and '.join(_SOURCES[mode] for mode in modes)}"
-    if settings.mode == "train" and "train" not in modes:
-        raise ConfigError(f"mode=train: {can} only; use mode=offline data=human, or another low")
-    if settings.mode == "offline" and classes["data"] is None:
-        raise ConfigError("mode=offline: data=none leaves nothing to learn from; use data=human")
-    if settings.mode != "eval" and classes["data"] is not None and "offline" not in modes:
-        raise ConfigError(f"data={name_of(cfg.data)}: {can} only; use data=none, or another low")
-    if settings.mode == "offline" and settings.low.freeze:
+    Raises:
+        ConfigError: with the settings to change.
+    """
+    mode, has_data = config.run.mode, config.data.cls is not None
+    modes: tuple[str, ...] = getattr(config.low.cls, "modes", ())
+    sources = {"train": "its own steps", "offline": "data sets"}
+    learns = f"{config.low} learns from {' and '.join(sources[known] for known in modes)}"
+    if mode == "train" and "train" not in modes:
+        raise ConfigError(f"mode=train: {learns} only; use mode=offline and a data set, or another low")
+    if mode == "offline" and not has_data:
+        raise ConfigError("mode=offline: data=none leaves nothing to learn from; choose a data set")
+    if mode != "eval" and has_data and "offline" not in modes:
+        raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
+    if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
+        raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
+    if mode == "offline" and config.run.low.freeze:
         raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
 
 
-def _check_values(cfg: DictConfig, agent: HierarchicalAgent) -> None:
-    if agent.selector is not None and agent.selector.needs_values and not agent.learners[0].has_value:
-        raise ConfigError(
-            f"high.bootstrap={cfg.high.bootstrap}: low={name_of(cfg.low)} has no value of a state; use high.bootstrap=0"
-        )
+def check_values(config: Config, agent: HierarchicalAgent) -> None:
+    """Refuse a selector that needs values of learners that have none.
 
-
-def _check_collector(cfg: DictConfig, settings: RunConfig, env: PAMDPEnv, collection: type[Collection]) -> None:
-    name, num_workers = name_of(cfg.collector), cfg.collector.get("num_workers", 1)
-    if settings.mode == "eval":  # which collects nothing
+    Raises:
+        ConfigError: with the settings to change.
+    """
+    if agent.selector is None or not agent.selector.needs_values or agent.learners[0].has_value:
         return
-    if settings.mode == "offline" and name != "single":
-        raise ConfigError(f"collector={name}: mode=offline presses nothing; use collector=single")
-    if collection.package is not None and importlib.util.find_spec(collection.package) is None:
+    bootstrap = config.high.options.get("bootstrap")
+    raise ConfigError(f"high.bootstrap={bootstrap}: {config.low} has no value of a state; use high.bootstrap=0")
+
+
+def check_collector(config: Config, env: PAMDPEnv) -> None:
+    """Refuse a collector that this run cannot have.
+
+    Raises:
+        ConfigError: with the settings to change.
+    """
+    num_workers = config.collector.options.get("num_workers", 1)
+    package: str | None = getattr(config.collector.cls, "package", None)
+    if config.run.mode == "eval":  # which collects nothing
+        return
+    if config.run.mode == "offline" and getattr(config.collector.cls, "has_workers", False):
+        raise ConfigError(f"{config.collector}: mode=offline takes no steps; use collector=single")
+    if package is not None and importlib.util.find_spec(package) is None:
+        raise ConfigError(f"{config.collector}: {package} is not installed; pip install hpamdp[{package}]")
+    if config.run.num_envs % num_workers:
         raise ConfigError(
-            f"collector={name}: {collection.package} is not installed; pip install hpamdp[{collection.package}]"
-        )
-    if settings.num_envs % num_workers:
-        raise ConfigError(
-            f"collector.num_workers={num_workers}: must divide num_envs={settings.num_envs}, of which each worker has "
-            "an equal share"
+            f"collector.num_workers={num_workers}: must divide num_envs={config.run.num_envs}, of which each worker "
+            "has an equal share"
         )
     if num_workers > 1 and not env.is_shardable:
         raise ConfigError(
-            f"collector={name}: env={name_of(cfg.env)} learns the scale of its observations from all environments "
-            "together; use collector=single or env.observation_scaling=bounds"
+            f"{config.collector}: {config.env} learns the scale of its observations from all environments together; "
+            "use collector=single or env.observation_scaling=bounds"
         )
-
-
-def make_agent(cfg: DictConfig, settings: RunConfig, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:
-    """Build both levels, as they begin.
-
-    Raises:
-        ConfigError: a wrong option.
-    """
-    selector = build("high", cfg.high, specs=specs, device=device) if specs.num_options else None
-    is_shared = settings.agent.sharing == "shared" and specs.num_options > 0
-    learner_specs, num_learners = specs, max(1, specs.num_options)
-    if is_shared:
-        learner_specs, num_learners = specs.with_option_observed(), 1
-    learners = [_make_learner(cfg.low, learner_specs, device) for _ in range(num_learners)]
-    agent = HierarchicalAgent(
-        selector, learners, specs, is_shared, settings.low.freeze, settings.agent.uniform_option_frames
-    )
-    return agent.to(device)
-
-
-def _make_learner(node: Any, specs: PAMDPSpecs, device: torch.device) -> Learner:
-    return build("low", node, specs=specs, device=device)
-
-
-def random_policy(parts: Parts) -> torch.nn.Module:
-    """Return the policy that chooses and presses at random: the lower line of every figure."""
-    specs = parts.agent.specs
-    learners = [_make_learner({"_target_": "hpamdp.policies.low_level.random.Random"}, specs, parts.device)]
-    selector = None
-    if specs.num_options:
-        selector = build("high", {"_target_": "hpamdp.policies.high_level.uniform.Uniform"}, specs=specs)
-    return HierarchicalAgent(selector, learners, specs).policy
-
-
-def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[DictConfig, RunConfig, Path | None]:
-    """Return the config to run, its typed run values and the checkpoint to start from, if any.
-
-    With `resume` or `mode=eval` the checkpoint's own config is taken, changed by what `overrides`, the command line's
-    words, set anew.
-
-    Raises:
-        ConfigError: a wrong value, no such checkpoint, or a word that would change the saved agent.
-    """
-    settings = run_config(cfg)
-    where = "resume" if settings.resume is not None else "checkpoint"
-    source = settings.resume or settings.checkpoint
-    if source is None:
-        return cfg, settings, None
-    file = checkpoint.find(source, where)
-    # Early runs chose no collector and no data.
-    later = {"collector": cfg.collector, "data": {"_target_": None}, "offline": cfg.offline}
-    saved = OmegaConf.create(later | checkpoint.progress_of(file)["config"])
-    if settings.resume is not None and settings.mode != saved.mode:
-        raise ConfigError(
-            f"resume={source}: a run with mode={saved.mode}; resume it so, or start one with low.checkpoint={source}"
-        )
-    for key in ("mode", "resume", "checkpoint"):  # what that run began with is no matter of this one
-        saved[key] = cfg[key]
-    for override in overrides:
-        key = override.partition("=")[0].lstrip("+~")
-        if key.split(".")[0] in ("high", "low", "agent", "experiment", "search"):
-            raise ConfigError(f"{override}: {where} takes the agent from {file}; leave this out")
-        OmegaConf.update(saved, key, OmegaConf.select(cfg, key), merge=False)
-    return saved, run_config(saved), file

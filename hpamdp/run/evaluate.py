@@ -1,4 +1,4 @@
-"""The only evaluation rollout: every episode of a fixed set once, greedily, to its end."""
+"""Evaluation: every episode of a fixed set is played once, greedily, to its end."""
 
 from __future__ import annotations
 
@@ -13,43 +13,51 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.policies.agent import HierarchicalAgent
 
-# Keeps the randomness of the evaluation apart from that of a training run with the same seed.
+# Separates the noise of the evaluation from that of a training run with the same seed.
 _APART = 0x5EED0000
 
 
 class Evaluation:
-    """A fixed set of episodes with what is known of them, on which agents are scored.
+    """A fixed set of episodes on which agents are scored.
 
     Args:
-        env: a `PAMDPEnv` with its decisions tracked, one environment for each episode, used for nothing else.
-        seed: of the set; training never meets its episodes.
+        env: a `PAMDPEnv` with its decisions tracked; one environment for each episode, used for nothing else.
+        seed: of the episodes.
     """
 
     def __init__(self, env: TransformedEnv, seed: int) -> None:
-        self.env, self.seed = env, seed
+        self.env = env
+        self.seed = seed
         self.episodes = env.fixed_episodes(seed)
         self._reset()
         self.known = env.describe()
+
+    @property
+    def problem(self) -> PAMDPEnv:
+        """The environment itself, without what tracks its decisions."""
+        return self.env.base_env
 
     def _reset(self) -> TensorDictBase:
         self.env.set_seed(self.seed ^ _APART)  # the noise, too, is the same at every evaluation
         return self.env.reset(None if self.episodes is None else self.episodes.copy())
 
     def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
-        """Play every episode greedily; return one array an attribute, first dimension the episode.
+        """Play every episode greedily and return arrays whose first dimension is the episode.
 
-        `return`, `presses` and `score` (the return, where the environment has no score of its own); `option`, the first
-        one, where the agent chooses; `path` `[N, P + 1, 2]` (NaN past the end), where there are positions; beside them
-        what the environment `describe`s and gives as `results`.
+        - `return`, `steps`, and `score`: the return, where the environment has no score of its own;
+        - `option`: the first one of each episode, where the agent chooses;
+        - `path` `[N, T + 1, 2]`, NaN past an episode's end, where the environment has positions;
+        - what the environment's `describe` and `results` give.
         """
         device = self.env.device
         td = self._reset()
         total = torch.zeros(td.batch_size, device=device)
-        presses = torch.zeros(td.batch_size, dtype=torch.long, device=device)
+        steps = torch.zeros(td.batch_size, dtype=torch.long, device=device)
         over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]
-        # A policy that draws even when greedy (random presses) must not move the run's generators.
+        # A policy that samples even when greedy (a random one) must not move the run's generators.
         with (
             torch.random.fork_rng(devices=[device] if device.type == "cuda" else []),
             set_exploration_type(ExplorationType.DETERMINISTIC),
@@ -59,14 +67,14 @@ class Evaluation:
             for _ in range(self.env.max_steps):
                 td = self.env.step(policy(td))
                 total += td.get(("next", keys.REWARD)).squeeze(-1)
-                presses += ~over
+                steps += ~over
                 options.append(td.get(keys.OPTION, None))
                 path.append(_unless(over, self.env.position))
                 td = self.env.step_mdp(td)
                 over = td.get(keys.DONE).squeeze(-1)
                 if over.all():
                     break
-        played: dict[str, Tensor] = {"return": total, "presses": presses, "score": total, **self.known}
+        played: dict[str, Tensor] = {"return": total, "steps": steps, "score": total, **self.known}
         if options[0] is not None:
             played["option"] = options[0]
         if path[0] is not None:
@@ -75,9 +83,9 @@ class Evaluation:
         return {name: value.cpu().numpy() for name, value in played.items()}
 
     def run_agent(self, agent: HierarchicalAgent) -> dict[str, np.ndarray]:
-        """Play every episode as `run` does; where the agent chooses, also with each option held.
+        """Play every episode as `run` does and, where the agent chooses, once more with each option held.
 
-        `option_scores` `[N, num_options]`: the scores that this agent's own low level reaches with each option.
+        The latter gives `option_scores` `[N, num_options]`: the scores of the agent's own learners with each option.
         """
         played = self.run(agent.policy)
         if agent.selector is not None:
@@ -86,14 +94,17 @@ class Evaluation:
         return played
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return the means of an evaluation: score, return, presses, success, and what else the environment tells.
+        """Return the means of an evaluation: score, return, steps, success and the environment's own metrics.
 
-        `optimality_gap` is what is missing to the environment's `ceiling`. Of choices: `regret`, what the better option
-        of each episode would have scored with the agent's own low level less what was scored; `score_NAME`, the score
-        with the option NAME held; `choice_gain`, the score less that of the best option held; `choice_entropy` of the
-        options' shares (nats).
+        - `optimality_gap`: the environment's `ceiling` less the score.
+
+        Where the agent chooses options:
+        - `score_NAME`: the score with the option NAME held;
+        - `regret`: the score of each episode's best option, with the agent's own learners, less the score;
+        - `choice_gain`: the score less that of the best single option;
+        - `choice_entropy`: entropy of the options' shares (nats).
         """
-        names = [name for name in ("score", "success", "return", "presses") if name in played]
+        names = [name for name in ("score", "success", "return", "steps") if name in played]
         means = {name: float(played[name].mean()) for name in names} | self.env.measure(played)
         if "ceiling" in means:
             means["optimality_gap"] = means["ceiling"] - means["score"]

@@ -1,19 +1,21 @@
-"""What a run tells while it goes on and when it ends: rows of metrics, evaluations, the summary, the pictures."""
+"""What a run writes while it trains and when it ends: metrics, evaluations, the summary, figures."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
-from omegaconf import DictConfig
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.analysis import figures as plots
-from hpamdp.run.assemble import Parts, random_policy
-from hpamdp.run.metrics import MetricsFile, closing_table
+from hpamdp.analysis import figures
+from hpamdp.config import Config
+from hpamdp.policies.random_agent import random_agent
+from hpamdp.run.assemble import Parts
+from hpamdp.run.closing_table import closing_table
+from hpamdp.run.metrics import MetricsFile
 from hpamdp.run.summary import summarise
 
 
@@ -21,27 +23,30 @@ class Recorder:
     """Collects a run's figures and writes them to its output folder and its logger.
 
     Args:
-        cfg: the resolved config.
+        config: of the run.
         parts: the run's environment, agent, evaluation and logger.
         output_dir: where `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures go.
     """
 
-    def __init__(self, cfg: DictConfig, parts: Parts, output_dir: Path) -> None:
-        self.cfg, self.parts, self.output_dir = cfg, parts, output_dir
+    def __init__(self, config: Config, parts: Parts, output_dir: Path) -> None:
+        self.config = config
+        self.parts = parts
+        self.output_dir = output_dir
         self.metrics = MetricsFile(output_dir / "metrics.csv")
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
-        # The last evaluation, as long as the agent has not learned since.
+        # The last evaluation; None once the agent has learned since.
         self._played: dict[str, np.ndarray] | None = None
         self._held: dict[str, float] = {}  # scores with each option held, at the last evaluation
-        self._random = parts.evaluation.measure(parts.evaluation.run(random_policy(parts)))
+        random = random_agent(parts.agent.specs, parts.device)
+        self._random = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
     def resume_from(self, folder: Path, frames: int) -> None:
-        """Start the metrics with those that the run in `folder` had written by then."""
+        """Begin the metrics with the rows of the run in `folder`, up to `frames`."""
         self.metrics = MetricsFile(self.metrics.path, folder / "metrics.csv", frames)
 
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
-        """Take note of a collected batch `[N, T]`, if there is one, and of what the agent said while learning."""
+        """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
         self._scalars |= scalars
         self._played = None
         if batch is None:
@@ -53,7 +58,7 @@ class Recorder:
         self._ended.append(ended)
 
     def log(self, frames: int, wall_s: float, is_evaluated: bool) -> dict[str, float]:
-        """Write a row, with an evaluation if asked for, and return it."""
+        """Write a row of metrics, with an evaluation if `is_evaluated`, and return it."""
         row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
         if is_evaluated:
             measured = self.parts.evaluation.measure(self._play())
@@ -64,17 +69,20 @@ class Recorder:
         return row
 
     def finish(self, frames: int, wall_s: float, cpu_s: float, is_finished: bool) -> str:
-        """Evaluate, write the summary and the pictures, close the logger; return the closing table."""
+        """Evaluate, write the summary and the figures, close the logger; return the closing table."""
         played = self._play()
-        np.savez_compressed(self.output_dir / "evaluation.npz", **played)
+        arrays: dict[str, Any] = dict(played)
+        np.savez_compressed(self.output_dir / "evaluation.npz", **arrays)
         measured = self.parts.evaluation.measure(played)
-        summary = summarise(self.cfg, measured, self._random, frames, wall_s, cpu_s, is_finished)
+        effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
+        env = self.parts.evaluation.problem
+        summary = summarise(self.config, env, measured, self._random, effort, is_finished=is_finished)
         (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         logger = self.parts.logger
-        logger.images(plots.draw_all(self.output_dir))
+        logger.images(figures.draw_all(self.output_dir, type(env)))
         logger.summary(summary)
         logger.close()
-        return closing_table(summary)
+        return closing_table(summary, env.table_metrics)
 
     def _play(self) -> dict[str, np.ndarray]:
         if self._played is None:
@@ -82,7 +90,7 @@ class Recorder:
         return self._played
 
     def _drift(self, measured: dict[str, float]) -> dict[str, float]:
-        """Return how far the score with each option held has moved since the evaluation before."""
+        """Return the change of the score with each option held since the last evaluation."""
         held = {name: value for name, value in measured.items() if name.startswith("score_")}
         before, self._held = self._held, held
         return {
@@ -93,13 +101,13 @@ class Recorder:
         """Return the means over the exploring episodes that ended since the last row."""
         if not sum(len(ended) for ended in self._ended):
             return {}
-        ended = torch.cat(self._ended)
+        ended: TensorDictBase = TensorDict.cat(self._ended)
         results = {"score": ended[keys.EPISODE_RETURN], **self.parts.env.results(ended)}
         scores = {
             f"train/{name}": results[name].float().mean().item() for name in ("score", "success") if name in results
         }
         scores["train/return"] = ended[keys.EPISODE_RETURN].mean().item()
-        scores["train/presses"] = ended[keys.EPISODE_STEPS].float().mean().item()
+        scores["train/steps"] = ended[keys.EPISODE_STEPS].float().mean().item()
         for i, name in enumerate(self.parts.agent.specs.option_names):
             scores[f"train/option_{name}"] = (ended[keys.OPTION] == i).float().mean().item()
         return scores

@@ -3,58 +3,47 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Mapping
 from importlib.metadata import version
 from typing import Any
 
-from omegaconf import DictConfig
-
 from hpamdp import __version__
-from hpamdp.config import name_of
-from hpamdp.env.boatdock.reference import human_normalised
+from hpamdp.config import Config
+from hpamdp.env.base import PAMDPEnv
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")
 
 
 def summarise(
-    cfg: DictConfig,
-    measured: dict[str, float],
-    random: dict[str, float],
-    frames: int,
-    wall_s: float,
-    cpu_s: float,
+    config: Config,
+    env: PAMDPEnv,
+    measured: Mapping[str, float],
+    random: Mapping[str, float],
+    effort: Mapping[str, float],
+    *,
     is_finished: bool,
 ) -> dict[str, Any]:
-    """Return the run's summary: its final evaluation's means, what to hold them against, what it cost, what made it.
+    """Return the run's summary: its final evaluation's means, references, its cost, and the versions that made it.
 
     Args:
-        cfg: the resolved config.
-        measured: means of the agent's final evaluation, from `evaluate.measure`.
-        random: the same for random choices and presses.
-        frames, wall_s, cpu_s: presses, seconds and the process's own seconds of training, evaluations included.
-        is_finished: whether the run came to its end.
+        config: of the run.
+        env: the problem, which knows the references.
+        measured: means of the agent's final evaluation, from `Evaluation.measure`.
+        random: the same for the uniformly random agent.
+        effort: `frames`, `wall_s` and `cpu_s` of training, evaluations included.
+        is_finished: whether the run reached its end.
     """
-    references = {"random": random}
-    if "ceiling" in measured:
-        references["ceiling"] = {"score": measured["ceiling"], "success": 1.0, "optimality_gap": 0.0}
-    if "oracle_agreement" in measured:
-        references["ceiling"]["oracle_agreement"] = 1.0
-    controller = cfg.env.get("controller")
-    boat = {} if controller is None else {"controller": "chosen" if controller == "choose" else controller}
-    if name_of(cfg.env) == "boatdock":
-        measured = measured | {"human_normalised": human_normalised(measured["score"], boat["controller"])}
     return {
-        "high": name_of(cfg.high),
-        "low": name_of(cfg.low),
-        "env": name_of(cfg.env),
-        **boat,
+        "high": config.high.name,
+        "low": config.low.name,
+        "env": config.env.name,
+        **env.summary_entries(),
         **measured,
-        "references": references,
-        "episodes": cfg.eval.layouts,
+        "references": {"random": dict(random), **env.references(measured)},
+        "episodes": config.run.eval.layouts,
         "finished": is_finished,
-        "frames": frames,
-        "wall_s": wall_s,
-        "cpu_s": cpu_s,
-        "seed": cfg.seed,
+        **effort,
+        "seed": config.run.seed,
         "versions": {
             "hpamdp": __version__,
             "python": platform.python_version(),

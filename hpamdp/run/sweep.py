@@ -1,4 +1,4 @@
-"""A sweep: its jobs go on where they stopped, none takes the others down, the end tells what became of each."""
+"""Sweeps: finished jobs are skipped, stopped ones resumed; a failing job stops no other; a report closes the sweep."""
 
 from __future__ import annotations
 
@@ -17,33 +17,35 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import yaml
 from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config import ConfigError
+from hpamdp.config import Config, ConfigError
+from hpamdp.messages import one_line
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
-# What can become of a job; the first until it has ended.
+# States of a job; the first one until it has ended.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
 
 
 class SweepDir(Callback):
-    """Tells the process that starts a sweep where the results go, which Hydra tells callbacks alone."""
+    """Remembers the sweep's folder, which Hydra passes to callbacks only."""
 
     path: ClassVar[Path | None] = None
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Take note of the sweep's folder."""
+        """Remember the sweep's folder."""
         SweepDir.path = Path(config.hydra.sweep.dir).absolute()
 
 
 @dataclass
 class Job:
-    """What is known of a job."""
+    """State of one job."""
 
     number: int
     overrides: str
@@ -54,7 +56,7 @@ class Job:
 
 
 class Records:
-    """The jobs of one start of a sweep, a file each: they may run in other processes or on other machines.
+    """The states of a sweep's jobs, one file each, because jobs may run in other processes or on other machines.
 
     Args:
         sweep_dir: the sweep's folder.
@@ -65,7 +67,7 @@ class Records:
         self._folder = sweep_dir / ".sweep" / start
 
     def write(self, job: Job) -> None:
-        """Keep what is known of a job."""
+        """Save the state of a job."""
         self._folder.mkdir(parents=True, exist_ok=True)
         draft = self._folder / f"{job.number}.draft"
         draft.write_text(json.dumps(asdict(job)))
@@ -77,7 +79,7 @@ class Records:
         return sorted(jobs, key=lambda job: job.number)
 
     def remove(self) -> None:
-        """Leave no trace, unless another start is under way."""
+        """Remove the files, and their folder unless another start of the sweep uses it."""
         for file in self._folder.glob("*"):
             file.unlink(missing_ok=True)
         with suppress(OSError):
@@ -86,7 +88,7 @@ class Records:
 
 
 def run_job(cfg: DictConfig, start: str) -> float | None:
-    """Run the job that Hydra is at, or what is left of it; return its score, None where it failed.
+    """Run Hydra's current job, or what is left of it; return its score, or None if it failed.
 
     Args:
         cfg: the job's config.
@@ -109,11 +111,11 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         with _locked(folder):
             job.state, job.score = _go_on(cfg, overrides, folder)
     except ConfigError as error:
-        job.state, job.reason = _REFUSED, _one_line(str(error))
+        job.state, job.reason = _REFUSED, one_line(str(error))
         with suppress(OSError):
             folder.rmdir()  # Hydra made it; it stays if there is something in it
     except Exception as error:
-        job.state, job.reason = _FAILED, _one_line("".join(traceback.format_exception_only(error)))
+        job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
         with suppress(OSError):
             (folder / "error.txt").write_text(traceback.format_exc())
     records.write(job)
@@ -125,15 +127,15 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
 
 
 def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None]:
-    """Run what is not done yet in a job's folder; return what became of it, and its score."""
+    """Run what is not done yet in a job's folder; return the job's state and its score."""
     from hpamdp.run import checkpoint, train  # takes seconds, which --help need not wait for
-    from hpamdp.run.assemble import resolve
+    from hpamdp.run.resume import resolve
 
-    wanted, _, _ = resolve(cfg, overrides)
+    wanted, _ = resolve(cfg, overrides)
     source = folder / checkpoint.FILE_NAME
     if source.exists() or (folder / "summary.json").exists():
         _check_same(wanted, folder / "config.yaml")
-    score = _final_score(wanted, folder)
+    score = _final_score(folder)
     if score is not None:
         return _SKIPPED, score
     (folder / "error.txt").unlink(missing_ok=True)
@@ -143,29 +145,23 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
     code = train.run(cfg, folder, overrides, source if is_resumed else None)
     if code:
         return _STOPPED, None
-    return (_RESUMED if is_resumed else _FINISHED), _final_score(wanted, folder)
+    return (_RESUMED if is_resumed else _FINISHED), _final_score(folder)
 
 
-def _final_score(wanted: DictConfig, folder: Path) -> float | None:
-    """Return the score of a run that came to its end; None where there is none. A stopped run has a summary, too."""
+def _final_score(folder: Path) -> float | None:
+    """Return the score of a run that reached its end; None where there is none. A stopped run has a summary, too."""
     try:
         summary = json.loads((folder / "summary.json").read_text())
     except (OSError, ValueError):  # not there, or cut off in the middle
         return None
-    if "finished" in summary:
-        is_finished = summary["finished"]
-    else:  # an early run
-        num_frames = wanted.offline.updates if wanted.mode == "offline" else wanted.total_frames
-        is_finished = wanted.mode == "eval" or summary["frames"] >= num_frames
-    return summary["score"] if is_finished else None
+    return summary["score"] if summary["finished"] else None
 
 
-def _check_same(wanted: DictConfig, file: Path) -> None:
-    """Refuse to touch the results of another config."""
-    saved = _flat(OmegaConf.to_container(OmegaConf.load(file))) if file.is_file() else {}
+def _check_same(wanted: Config, file: Path) -> None:
+    """Refuse to continue in a folder with the results of another config."""
+    saved = _flat(yaml.safe_load(file.read_text())) if file.is_file() else {}
     # Written and read as the saved one was.
-    own = _flat(OmegaConf.to_container(OmegaConf.create(OmegaConf.to_yaml(wanted, resolve=True))))
-    # An older config may lack what is null now.
+    own = _flat(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.create(wanted.to_dict()))))
     keys = [key for key in {**own, **saved} if own.get(key) != saved.get(key)]
     if keys:
         there, here = (json.dumps(values.get(keys[0]), default=str) for values in (saved, own))
@@ -185,7 +181,7 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @functools.cache  # once a process, which may run several jobs
 def _stop_with_parent() -> None:
-    """See to it that this process saves and stops when the one that started it is killed, which joblib does not."""
+    """Save and stop this process when the one that started it is killed, which joblib does not do."""
     parent = os.getppid()
 
     def watch() -> None:
@@ -199,7 +195,7 @@ def _stop_with_parent() -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out; wait for those that are about to stop, the workers of a sweep that was killed."""
+    """Lock a job's folder; wait for the workers of a killed sweep, which are about to stop."""
     file = folder / ".lock"
     lock = FileLock(file, timeout=_PATIENCE_S)
     try:
@@ -219,7 +215,7 @@ def has_begun(start: str) -> bool:
 
 
 def report(start: str, error: BaseException | None = None) -> int:
-    """Tell what became of the jobs, a line on stderr for each that failed; return the exit code.
+    """Print a tally of the jobs and, on stderr, a line for each that failed; return the exit code.
 
     Args:
         start: names this start of the sweep.
@@ -242,7 +238,7 @@ def report(start: str, error: BaseException | None = None) -> int:
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if not is_stopped:
             (sweep_dir / "error.txt").write_text("".join(traceback.format_exception(error)))
-            reason = _one_line("".join(traceback.format_exception_only(error)))
+            reason = one_line("".join(traceback.format_exception_only(error)))
             print(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})", file=sys.stderr)
         print(f"To go on: the same command with hydra.sweep.dir={_shown(sweep_dir)}")
         return _INTERRUPTED if is_stopped else 1
@@ -254,15 +250,11 @@ def report(start: str, error: BaseException | None = None) -> int:
 def _print_tally(jobs: list[Job]) -> None:
     counts = Counter(job.state for job in jobs)
     print(f"{len(jobs)} jobs: {'; '.join(f'{count} {state}' for state, count in counts.items())}")
-    scored = [job for job in jobs if job.score is not None]
+    scored = [(job.score, job) for job in jobs if job.score is not None]
     if len(scored) > 1:
-        best = max(scored, key=lambda job: job.score)
-        print(f"Best score {best.score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
+        score, best = max(scored, key=lambda entry: entry[0])
+        print(f"Best score {score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
 
 
 def _shown(path: Path) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())

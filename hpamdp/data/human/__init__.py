@@ -1,0 +1,1 @@
+"""The recording of 40 people who docked boats."""

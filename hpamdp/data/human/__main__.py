@@ -1,4 +1,4 @@
-"""`python -m hpamdp.data.human`."""
+"""`python -m hpamdp.data.human`: see `hpamdp.data.human.cli`."""
 
 import sys
 

@@ -1,135 +1,187 @@
-"""The command line of the human data: `python -m hpamdp.data.human download | check | summary | export`."""
+"""The command line of the recording: `python -m hpamdp.data.human download | check | summary | export`."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 import torch
+from torch import Tensor
 
-from hpamdp.data.human import export, minari, statistics, validation
+from hpamdp.data import export
+from hpamdp.data.errors import DataError
+from hpamdp.data.human import minari, statistics, validation
 from hpamdp.data.human.download import download
-from hpamdp.data.human.episodes import scores_of_people, select
-from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.human.episodes import scores_by_person, select
 from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SHA256, HumanData, default_path, read
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
 
-_MISTAKE, _INTERRUPTED = 2, 130
-_FORMATS = ("csv", "npz", "memmap", "minari")
+_USAGE_ERROR = 2
+_INTERRUPTED = 130
+_TABLE_FORMATS = ("csv", "npz")
+_TRANSITION_FORMATS = ("memmap", "minari")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return its exit code: 0, 2 (a mistake, told in one line) or 130 (interrupted)."""
-    given = _parser().parse_args(arguments)
+    """Run the command line.
+
+    Args:
+        arguments: the words after the program's name; None: those it was started with.
+
+    Returns:
+        The exit code: 0, 2 after an error (printed to stderr in one line) or 130 after an interrupt.
+    """
+    options = _parser().parse_args(arguments)
     try:
-        given.run(given)
-    except HumanDataError as error:
+        options.run(options)
+    except DataError as error:
         print(" ".join(str(error).split()), file=sys.stderr)
-        return _MISTAKE
+        return _USAGE_ERROR
     except KeyboardInterrupt:
         return _INTERRUPTED
     return 0
 
 
 class _Parser(argparse.ArgumentParser):
-    """One that refuses in one line, like the rest of hpamdp."""
+    """A parser whose errors are one line, like all of hpamdp's."""
 
-    def error(self, message: str) -> None:
-        self.exit(_MISTAKE, f"{message}; see --help\n")
+    def error(self, message: str) -> NoReturn:
+        self.exit(_USAGE_ERROR, f"{message}; see --help\n")
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
-        prog="python -m hpamdp.data.human", description="What people did at the boats: get it, check it, sum it up."
+        prog="python -m hpamdp.data.human",
+        description="The recording of 40 people at the boat-docking task: fetch, check, summarise and export it.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
 
-    get = commands.add_parser("download", help="fetch the released file into the user's cache")
-    get.add_argument("--url", required=True, help=f"where {FILE_NAME} lies in the paper's repository")
-    get.add_argument("--to", type=Path, help=f"the file to make (default {default_path()})")
-    get.set_defaults(run=_download)
+    download_parser = commands.add_parser("download", help="fetch the released file into the user's cache")
+    download_parser.add_argument("--url", required=True, help=f"address of {FILE_NAME} in the paper's repository")
+    download_parser.add_argument("--to", type=Path, help=f"file to make (default {default_path()})")
+    download_parser.set_defaults(run=_download)
 
-    read_arguments = _Parser(add_help=False)
-    read_arguments.add_argument(
-        "file", nargs="?", type=Path, help=f"the recording (default ${PATH_VARIABLE}, else the one in the cache)"
+    file_arguments = _Parser(add_help=False)
+    file_arguments.add_argument(
+        "file", nargs="?", type=Path, help=f"the recording (default: ${PATH_VARIABLE}, else the one in the cache)"
     )
-    read_arguments.add_argument(
-        "--any-file", action="store_true", help="take a file of the same schema, whatever its checksum"
+    file_arguments.add_argument(
+        "--any-file", action="store_true", help="take any file of the same schema, whatever its checksum"
     )
-    check = commands.add_parser("check", parents=[read_arguments], help="does the file hold what it should?")
-    check.set_defaults(run=_check)
-    summary = commands.add_parser("summary", parents=[read_arguments], help="people's scores, choices and outcomes")
-    summary.add_argument("--json", action="store_true", help="as json, by person, block and controller")
-    summary.set_defaults(run=_summary)
 
-    out = commands.add_parser("export", parents=[read_arguments], help="write it for other programs")
-    out.add_argument("--to", required=True, help="file or folder to make, or the Minari data set's name")
-    out.add_argument("--format", required=True, choices=_FORMATS)
-    out.add_argument("--complete", action="store_true", help="only completely logged episodes")
-    out.add_argument("--successes", action="store_true", help="only episodes that docked")
-    out.add_argument("--best-people", type=int, metavar="K", help="only the K people of the best mean score")
-    out.add_argument("--controller", choices=harbour.CONTROLLERS, help="only the episodes with this boat")
-    out.add_argument("--one-frame", action="store_true", help="csv, npz: every harbour at the environment's centre")
-    out.add_argument("--reward", default="paper", choices=("paper", "sparse"), help="memmap, minari")
-    out.add_argument("--observation", default="scaled", choices=("scaled", "pixels"), help="memmap, minari")
-    out.set_defaults(run=_export)
+    check_parser = commands.add_parser(
+        "check", parents=[file_arguments], help="check the file's contents, and our physics against them"
+    )
+    check_parser.set_defaults(run=_check)
+
+    summary_parser = commands.add_parser(
+        "summary", parents=[file_arguments], help="print people's scores, outcomes and choices"
+    )
+    summary_parser.add_argument("--json", action="store_true", help="as json, by person, block and controller")
+    summary_parser.set_defaults(run=_summary)
+
+    export_parser = commands.add_parser(
+        "export", parents=[file_arguments], help="write the tables or the transitions for other programs"
+    )
+    export_parser.add_argument("--to", required=True, help="file or folder to make, or the Minari data set's name")
+    export_parser.add_argument("--format", required=True, choices=(*_TABLE_FORMATS, *_TRANSITION_FORMATS))
+    export_parser.add_argument("--complete", action="store_true", help="only completely logged episodes")
+    export_parser.add_argument("--successes", action="store_true", help="only episodes that ended in the dock")
+    export_parser.add_argument(
+        "--best-people", type=int, metavar="K", help="only episodes of the K people with the highest mean score"
+    )
+    export_parser.add_argument("--controller", choices=harbour.CONTROLLERS, help="only episodes with this controller")
+    export_parser.add_argument(
+        "--one-frame", action="store_true", help="csv, npz: move every harbour to the environment's centre"
+    )
+    export_parser.add_argument(
+        "--reward", default="paper", choices=("paper", "sparse"), help="memmap, minari: the reward"
+    )
+    export_parser.add_argument(
+        "--observation", default="scaled", choices=("scaled", "pixels"), help="memmap, minari: the observation"
+    )
+    export_parser.set_defaults(run=_export)
     return parser
 
 
-def _read(given: argparse.Namespace, one_frame: bool = False) -> HumanData:
-    return read(given.file, checksum=None if given.any_file else SHA256, one_frame=one_frame)
+def _read(options: argparse.Namespace, one_frame: bool = False) -> HumanData:
+    return read(options.file, checksum=None if options.any_file else SHA256, one_frame=one_frame)
 
 
-def _download(given: argparse.Namespace) -> None:
-    print(download(given.url, given.to))
+def _download(options: argparse.Namespace) -> None:
+    print(download(options.url, options.to))
 
 
-def _check(given: argparse.Namespace) -> None:
-    data = _read(given)
+def _check(options: argparse.Namespace) -> None:
+    data = _read(options)
     episodes, presses = data
-    is_released = "any file was allowed" if given.any_file else f"SHA-256 {SHA256}"
     people = episodes["person"].unique()
-    print(f"{given.file or default_path()}: {is_released}")
+    checksum = "any file was allowed" if options.any_file else f"SHA-256 {SHA256}"
+    print(f"{options.file or default_path()}: {checksum}")
     print(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses; contents fit together")
-    print(f"episodes without a press {(episodes['presses'] == 0).sum()}, with a single one "
-          f"{(episodes['presses'] == 1).sum()}, completely logged {episodes['complete'].sum()}")  # fmt: skip
-    first = torch.stack([(episodes["person"] == person).nonzero()[0, 0] for person in people])
-    for column, name in (("centre", "harbour at"), ("keymap", "key map")):
-        values, counts = episodes[column][first].unique(dim=0, return_counts=True)
-        told = [f"{name} {value.int().tolist()}: {count} people" for value, count in zip(values, counts, strict=True)]
-        print("; ".join(told))
+    num_empty = (episodes["presses"] == 0).sum()
+    num_single = (episodes["presses"] == 1).sum()
+    print(
+        f"episodes without a press {num_empty}, with a single one {num_single}, "
+        f"completely logged {episodes['complete'].sum()}"
+    )
+    first_episodes = torch.stack([(episodes["person"] == person).nonzero()[0, 0] for person in people])
+    _print_counts("harbour at", episodes["centre"][first_episodes])
+    _print_counts("key map", episodes["keymap"][first_episodes])
     print(f"longest press {presses['duration'].max():.2f} s")
-    singles, ways = validation.single_presses(data), validation.first_presses(data)
+    singles = validation.single_presses(data)
     if len(singles.outcome):
         share = validation.agreement(singles)
         print(f"replayed in our physics: {share:.1%} of {len(singles.outcome)} single presses end as recorded")
-    if len(ways.is_inside):
-        print(f"first presses go as far as our physics allows: {ways.is_inside.float().mean():.1%} "
-              f"of {len(ways.is_inside)}")  # fmt: skip
+    firsts = validation.first_presses(data)
+    if len(firsts.is_inside):
+        share = firsts.is_inside.float().mean().item()
+        print(f"first presses go as far as our physics allows: {share:.1%} of {len(firsts.is_inside)}")
     print("To know:", *QUIRKS, sep="\n- ")
 
 
-def _summary(given: argparse.Namespace) -> None:
-    data = _read(given)
-    by = {column: statistics.figures_by(data, column) for column in ("controller", "block", "person")}
-    curve = statistics.choice_curve(data)
-    if given.json:
-        curve = [None if share != share else share for share in curve.tolist()]
-        print(json.dumps({"all": statistics.figures(data), **by, "congruent_by_offset": curve}, indent=1))
+def _print_counts(name: str, values: Tensor) -> None:
+    """Print how many people have each of the values `[people]` or `[people, K]`."""
+    distinct, counts = values.unique(dim=0, return_counts=True)
+    print(
+        "; ".join(
+            f"{name} {value.int().tolist()}: {count} people" for value, count in zip(distinct, counts, strict=True)
+        )
+    )
+
+
+def _summary(options: argparse.Namespace) -> None:
+    data = _read(options)
+    overall = statistics.figures(data)
+    by_controller = statistics.figures_by(data, "controller")
+    by_block = statistics.figures_by(data, "block")
+    by_person = statistics.figures_by(data, "person")
+    curve = statistics.choice_curve(data).tolist()
+    if options.json:
+        summary = {
+            "all": overall,
+            "controller": by_controller,
+            "block": by_block,
+            "person": by_person,
+            "congruent_by_offset": [None if math.isnan(share) else share for share in curve],
+        }
+        print(json.dumps(summary, indent=1))
         return
     print(f"{'':24}{'episodes':>8}  {'score':>7}  {'success':>7}  {'too fast':>8}  {'out':>6}  {'no fuel':>7}  presses")
-    _print_row("all", statistics.figures(data))
-    for option in by["controller"]:
-        _print_row(harbour.CONTROLLERS[option], by["controller"][option])
-    for block, figures in by["block"].items():
+    _print_row("all", overall)
+    for option, figures in by_controller.items():
+        _print_row(harbour.CONTROLLERS[option], figures)
+    for block, figures in by_block.items():
         _print_row(f"episodes {60 * block + 1} to {60 * block + 60}", figures)
-    best = int(scores_of_people(data).nan_to_num(nan=-torch.inf).argmax())
-    _print_row(f"best person ({best})", by["person"][best])
+    best = int(scores_by_person(data).nan_to_num(nan=-torch.inf).argmax())
+    _print_row(f"best person ({best})", by_person[best])
     print("congruent boat chosen, by degrees between the bearing and its nearest direction:")
     bins = zip(OFFSET_EDGES[:-1], OFFSET_EDGES[1:], curve, strict=True)
     print(", ".join(f"{low}-{high}: {share:.3f}" for low, high, share in bins))
@@ -143,21 +195,32 @@ def _print_row(name: str, figures: Figures) -> None:
     )
 
 
-def _export(given: argparse.Namespace) -> None:
-    is_raw = given.format in ("csv", "npz")
+def _export(options: argparse.Namespace) -> None:
+    is_table = options.format in _TABLE_FORMATS
     data = select(
-        _read(given, one_frame=given.one_frame or not is_raw),
-        complete=given.complete,
-        successes=given.successes,
-        best_people=given.best_people,
-        controller=given.controller,
+        _read(options, one_frame=options.one_frame or not is_table),
+        complete=options.complete,
+        successes=options.successes,
+        best_people=options.best_people,
+        controller=options.controller,
     )
-    if is_raw:
-        (export.write_csv if given.format == "csv" else export.write_npz)(data, Path(given.to))
+    if is_table:
+        _export_tables(data, options)
     else:
-        batch = transitions(data, reward=given.reward, observation=given.observation)
-        if given.format == "memmap":
-            export.write_memmap(batch, Path(given.to))
-        else:
-            minari.export(batch, given.to)
-    print(f"{given.to}: {len(data.episodes)} episodes, {len(data.presses)} presses")
+        _export_transitions(data, options)
+    print(f"{options.to}: {len(data.episodes)} episodes, {len(data.presses)} presses")
+
+
+def _export_tables(data: HumanData, options: argparse.Namespace) -> None:
+    if options.format == "csv":
+        export.write_csv(data._asdict(), Path(options.to), axes=("x", "y"))
+    else:
+        export.write_npz(data._asdict(), Path(options.to))
+
+
+def _export_transitions(data: HumanData, options: argparse.Namespace) -> None:
+    rows = transitions(data, reward=options.reward, observation=options.observation)
+    if options.format == "memmap":
+        export.write_memmap(rows, Path(options.to))
+    else:
+        minari.export(rows, options.to)

@@ -14,20 +14,21 @@ from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers import Sampler
 
+from hpamdp.data.demonstrations import TRAJECTORY
+from hpamdp.data.errors import DataError
+from hpamdp.data.export import write_memmap
 from hpamdp.data.human.episodes import select
-from hpamdp.data.human.errors import HumanDataError
-from hpamdp.data.human.export import write_memmap
 from hpamdp.data.human.released_file import SHA256, default_path, load_bytes, read
-from hpamdp.data.human.transitions import TRAJECTORY, transitions
-from hpamdp.env.boatdock.episode import MAX_PRESSES
+from hpamdp.data.human.transitions import transitions
+from hpamdp.env.boatdock.episode import MAX_PRESSES, ObservationForm, RewardForm
 
-_FORMAT = 1  # raise it when the transitions of the same file come out differently
+_FORMAT = 1  # to be raised whenever the transitions of the same file change
 
 
 def slices(length: int) -> SliceSampler:
-    """Return a sampler of `batch_size // length` runs of presses from one episode each.
+    """Return a sampler of `batch_size // length` slices, each of `length` successive presses of one episode.
 
-    An episode of fewer than `length` presses is taken whole, so a batch has `batch_size` rows at most.
+    Shorter episodes are sampled whole, so a batch can have fewer than `batch_size` rows.
     """
     return SliceSampler(slice_len=length, traj_key=TRAJECTORY, strict_length=False, cache_values=True)
 
@@ -38,24 +39,25 @@ def whole_episodes() -> SliceSampler:
 
 
 class HumanExperienceReplay(BaseDatasetExperienceReplay):
-    """What people did, sampled by press, slice or episode, in the keys and observations of BoatDockEnv.
+    """The recorded presses, sampled by press, slice or episode, in the keys and observations of BoatDockEnv.
 
-    The memory-mapped files are made at first use and shared by every process that asks for the same. Their rows are
-    those of `hpamdp.data.human.transitions.transitions`, which says what was filled in where the recording is silent.
+    The rows are those of `hpamdp.data.human.transitions`, which says what is filled in where the recording is silent.
+    Their memory-mapped files are made at first use and shared by all processes that ask for the same rows.
 
     Args:
-        batch_size: rows a sample.
-        path: the released file; None: where `released_file.default_path` expects it.
+        batch_size: rows in a sample.
+        path: the released file; None: `released_file.default_path`.
         root: folder of the memory-mapped files; None: the user's cache.
         complete, successes, best_people, controller: which episodes, as in `hpamdp.data.human.episodes.select`.
         reward, observation, has_choice: as in `hpamdp.data.human.transitions.transitions`.
-        sampler: TorchRL's; None draws presses at random. `slices(length)` and `whole_episodes()` keep them together.
-        transform: TorchRL's, run on every sample.
+        sampler: a TorchRL sampler; None: presses at random. `slices(length)` and `whole_episodes()` keep successive
+            presses together.
+        transform: a TorchRL transform, applied to every sample.
         checksum: the SHA-256 that the file must have; None: any.
         options: further arguments of TorchRL's TensorDictReplayBuffer.
 
     Raises:
-        HumanDataError: the file is not there or not the right one, an argument is wrong, or nothing is left.
+        DataError: the file is missing or not the right one, an argument is out of range, or no episode is left.
     """
 
     def __init__(
@@ -68,30 +70,43 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         successes: bool = False,
         best_people: int | None = None,
         controller: str | None = None,
-        reward: str = "paper",
-        observation: str = "scaled",
+        reward: RewardForm = "paper",
+        observation: ObservationForm = "scaled",
         has_choice: bool = True,
         sampler: Sampler | None = None,
         transform: Callable[[TensorDict], TensorDict] | None = None,
         checksum: str | None = SHA256,
         **options: Any,
     ) -> None:
-        self.root = user_cache_path("hpamdp") / "datasets" if root is None else root
-        which = dict(complete=complete, successes=successes, best_people=best_people, controller=controller)
-        form = dict(reward=reward, observation=observation, has_choice=has_choice)
+        self.root = user_cache_path("hpamdp") / "datasets" if root is None else Path(root)
         if checksum is None:
             checksum = hashlib.sha256(load_bytes(default_path() if path is None else Path(path))).hexdigest()
-        self._name = _name(checksum=checksum, **which, **form)
+        self._name = _name(
+            checksum=checksum,
+            complete=complete,
+            successes=successes,
+            best_people=best_people,
+            controller=controller,
+            reward=reward,
+            observation=observation,
+            has_choice=has_choice,
+        )
         if not self._is_downloaded():
-            made = transitions(select(read(path, checksum=checksum, one_frame=True), **which), **form)
+            data = select(
+                read(path, checksum=checksum, one_frame=True),
+                complete=complete,
+                successes=successes,
+                best_people=best_people,
+                controller=controller,
+            )
+            rows = transitions(data, reward=reward, observation=observation, has_choice=has_choice)
             try:
-                write_memmap(made, self.data_path)
-            except HumanDataError:
-                if not self._is_downloaded():  # else another process was faster
+                write_memmap(rows, self.data_path)
+            except DataError:
+                if not self._is_downloaded():  # otherwise another process was faster
                     raise
-        storage = TensorStorage(TensorDict.load_memmap(self.data_path))
         super().__init__(
-            storage=storage,
+            storage=TensorStorage(TensorDict.load_memmap(self.data_path)),
             sampler=sampler,
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
@@ -114,5 +129,6 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
 
 
 def _name(**settings: Any) -> str:
-    said = json.dumps({**settings, "format": _FORMAT}, sort_keys=True)
-    return f"human-{hashlib.sha256(said.encode()).hexdigest()[:16]}"
+    """Return the name of the folder with the rows of these settings."""
+    text = json.dumps({**settings, "format": _FORMAT}, sort_keys=True)
+    return f"human-{hashlib.sha256(text.encode()).hexdigest()[:16]}"

@@ -1,32 +1,33 @@
-"""Parts of the recording: complete logs, successes, the best people, one boat."""
+"""Scores of the episodes, and subsets of them: complete logs, successes, the best people, one controller."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from hpamdp.data.human.errors import HumanDataError
+from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FULL_TANK, HumanData
 from hpamdp.env.boatdock import harbour, physics
 
 
 def score(data: HumanData) -> Tensor:
-    """Return the episodes' scores `[E]`: 5 x the tank left (fraction) on success, else -1."""
+    """Return the episodes' scores `[E]`: 5 times the fuel left (fraction of a tank) on success, else -1."""
     return harbour.score(data.episodes["outcome"], data.episodes["tank"] / FULL_TANK)
 
 
-def scores_of_people(data: HumanData) -> Tensor:
-    """Return each person's mean score `[people]`, NaN for numbers that no episode has."""
+def scores_by_person(data: HumanData) -> Tensor:
+    """Return the mean score of each person `[P]`, P - 1 being the highest number in `person`; NaN without episodes."""
     person = data.episodes["person"]
     return torch.bincount(person, score(data)) / torch.bincount(person)
 
 
 def keep(data: HumanData, mask: Tensor) -> HumanData:
-    """Return the episodes of `mask` `[E]` with their presses, numbered anew."""
-    number = mask.cumsum(0) - 1
+    """Return the episodes of `mask` `[E]` with their presses, whose `episode` is the row in the new table."""
+    new_row = mask.cumsum(0) - 1
     episode = data.presses["episode"]
     presses = data.presses[mask[episode]].clone()
-    return HumanData(data.episodes[mask].clone(), presses.set("episode", number[presses["episode"]]))
+    presses["episode"] = new_row[presses["episode"]]
+    return HumanData(data.episodes[mask].clone(), presses)
 
 
 def select(
@@ -40,13 +41,14 @@ def select(
     """Return the episodes that meet every condition.
 
     Args:
-        complete: only those whose log misses no press.
-        successes: only those that docked.
-        best_people: only those of this many people, by their mean score over all their episodes in `data`.
-        controller: only those with the `congruent` or the `incongruent` boat.
+        complete: only episodes whose log misses no press.
+        successes: only episodes that ended in the dock.
+        best_people: only episodes of this many people, those of the highest mean score over all their episodes in
+            `data`; None: of all.
+        controller: only episodes with the `congruent` or the `incongruent` controller; None: with either.
 
     Raises:
-        HumanDataError: a condition that makes no sense, or that nothing meets.
+        DataError: a condition is out of range, or no episode meets them all.
     """
     episodes = data.episodes
     mask = torch.ones(len(episodes), dtype=torch.bool)
@@ -55,15 +57,15 @@ def select(
     if successes:
         mask &= episodes["outcome"] == physics.SUCCESS
     if best_people is not None:
-        scores = scores_of_people(data).nan_to_num(nan=-torch.inf)
-        num = int(scores.isfinite().sum())
-        if not 1 <= best_people <= num:
-            raise HumanDataError(f"best_people={best_people}, but must be 1 to {num}")
+        scores = scores_by_person(data).nan_to_num(nan=-torch.inf)
+        num_people = int(scores.isfinite().sum())
+        if not 1 <= best_people <= num_people:
+            raise DataError(f"best_people={best_people}, but must be 1 to {num_people}")
         mask &= torch.isin(episodes["person"], scores.topk(best_people).indices)
     if controller is not None:
         if controller not in harbour.CONTROLLERS:
-            raise HumanDataError(f"controller={controller!r}, but must be one of {', '.join(harbour.CONTROLLERS)}")
+            raise DataError(f"controller={controller!r}, but must be one of {', '.join(harbour.CONTROLLERS)}")
         mask &= episodes["controller"] == harbour.CONTROLLERS.index(controller)
     if not mask.any():
-        raise HumanDataError("no episode meets all the conditions")
+        raise DataError("no episode meets all the conditions")
     return keep(data, mask)

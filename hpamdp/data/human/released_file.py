@@ -1,8 +1,8 @@
-"""The released recording of people at the task: read, checked, and put into two tables.
+"""The released recording of people at the task, read into two tables.
 
 The file is `BDtrajectory40.mat`, released with *A Benchmark for Hierarchical Parameterized Action Markov Decision
-Process* (MIT licence): 40 people, 360 episodes each. What a user should know of it (`QUIRKS` says it in one place):
-the log drops presses that overlapped another, so only a twentieth of the episodes are completely logged.
+Process* (MIT licence): 40 people, 360 episodes each. The log drops presses that overlapped another, so only a
+twentieth of the episodes are completely logged; `QUIRKS` lists what else to know before using it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import torch
 from platformdirs import user_cache_path
 from tensordict import TensorDict
 
+from hpamdp.data.errors import DataError
 from hpamdp.data.human import schema
-from hpamdp.data.human.errors import HumanDataError
 from hpamdp.data.human.matfile import read_variable
 from hpamdp.env.boatdock import harbour, physics
 
@@ -26,13 +26,13 @@ FILE_NAME = "BDtrajectory40.mat"
 SHA256 = "9de16874b43de9e377c2c10749cb2bd435a6db3ca7cead445b826d64ec399d20"
 PATH_VARIABLE = "HPAMDP_HUMAN_DATA"  # environment variable with the file's path
 
-FRAMES_A_SECOND = 60
-FULL_TANK = int(physics.TANK * FRAMES_A_SECOND)
-EPISODES_A_BLOCK = 60
-_LOG_TOLERANCE = 2.5  # frames by which tank and logged presses may differ in a complete log
-_MAX_BYTES = 64 * 2**20  # of a file that is read at all; the released one has 4 million
+FRAMES_PER_SECOND = 60
+FULL_TANK = int(physics.TANK * FRAMES_PER_SECOND)
+EPISODES_PER_BLOCK = 60
+_LOG_TOLERANCE = 2.5  # frames by which the tank and the logged presses may differ in a complete log
+_MAX_BYTES = 64 * 2**20  # larger files are not read; the released one has 4 million
 
-# The file's outcomes 1 to 4, as the environment numbers them.
+# The environment's numbers of the file's outcomes 1 to 4.
 _OUTCOMES = np.array([physics.OUT_OF_FUEL, physics.SUCCESS, physics.TOO_FAST, physics.OUT_OF_BOUNDS])
 
 QUIRKS = (
@@ -45,16 +45,17 @@ QUIRKS = (
 
 
 class HumanData(NamedTuple):
-    """What people did: one row an episode, one row a logged press. Lengths are screen px (y points down).
+    """The recording: a table of episodes and a table of logged presses. Lengths are in screen px (y points down).
 
-    episodes `[E]`: `person`, `index` (of the person's episodes), `block` (of 60), `controller` (0 incongruent,
-    1 congruent), `keymap` (1 or 2), `presses` (logged), `outcome` (as `physics.OUTCOMES`), `tank` (frames left of 360),
-    all int64; `complete` bool; `start`, `goal`, `centre` `[E, 2]`.
-
-    presses `[N]`, the transitions: `episode` (row of the other table), `press` (its number in the episode), `key`
-    int64; `is_final` bool; `position`, `next_position` `[N, 2]` (where this press and the next began, the latter NaN
-    where the press is final); `duration` (s), `speed` (px/s, at release), `distance` (to the goal, when the press
-    began), `gas`, float32.
+    Attributes:
+        episodes: `[E]`, with the int64 columns `person`, `index` (number of the person's episode), `block` (of 60
+            episodes), `controller` (0 incongruent, 1 congruent), `keymap` (1 or 2), `presses` (how many are logged),
+            `outcome` (index of `physics.OUTCOMES`) and `tank` (frames of fuel left, of 360); `complete` (bool); and
+            `start`, `goal`, `centre` (float32 `[E, 2]`).
+        presses: `[N]`, with the int64 columns `episode` (row of `episodes`), `press` (number in the episode) and `key`;
+            `is_final` (bool); and float32 `position` and `next_position` (`[N, 2]`, where this press and the next one
+            began, the latter NaN for a final press), `duration` (s), `speed` (px/s, at release), `distance` (to the
+            goal when the press began) and `gas`.
     """
 
     episodes: TensorDict
@@ -62,9 +63,9 @@ class HumanData(NamedTuple):
 
 
 def default_path() -> Path:
-    """Return where the file is expected: what the environment variable says, else the user's cache."""
-    given = os.environ.get(PATH_VARIABLE)
-    return Path(given) if given else user_cache_path("hpamdp") / FILE_NAME
+    """Return where the file is expected: the path in the environment variable, else a path in the user's cache."""
+    path = os.environ.get(PATH_VARIABLE)
+    return Path(path) if path else user_cache_path("hpamdp") / FILE_NAME
 
 
 def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_frame: bool = False) -> HumanData:
@@ -72,12 +73,12 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
 
     Args:
         path: the file; None: `default_path`.
-        checksum: the SHA-256 that the file must have; None: any, so long as its contents fit together.
-        one_frame: move every position so that all harbours have the environment's centre, (640, 512); half the
-            people saw theirs at (672, 504).
+        checksum: the SHA-256 that the file must have; None: any, as long as the contents are consistent.
+        one_frame: whether to move every position so that all harbours have the environment's centre, (640, 512);
+            half the people saw theirs at (672, 504).
 
     Raises:
-        HumanDataError: there is no such file, it is not the one that was released, or its contents don't fit together.
+        DataError: there is no such file, it is not the released one, or its contents are inconsistent.
     """
     path = default_path() if path is None else Path(path)
     data = load_bytes(path)
@@ -86,79 +87,85 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
     try:
         columns = schema.columns(read_variable(data, "trajectories"))
         schema.check(columns)
-    except HumanDataError as error:
-        raise HumanDataError(f"{path}: {error}") from error
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
     return _tables(columns, one_frame)
 
 
 def load_bytes(path: Path) -> bytes:
-    """Return a file's bytes, unless there are too many for a recording."""
+    """Return a file's bytes.
+
+    Raises:
+        DataError: the file is missing, unreadable or too large for a recording.
+    """
     try:
         size = path.stat().st_size
         if size > _MAX_BYTES:
-            raise HumanDataError(f"{path}: {size} bytes; a recording has at most {_MAX_BYTES}")
+            raise DataError(f"{path}: {size} bytes; a recording has at most {_MAX_BYTES}")
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise HumanDataError(
-            f"{path}: there is no such file; set {PATH_VARIABLE} to the path of {FILE_NAME}, or get it with "
+        raise DataError(
+            f"{path}: there is no such file; set {PATH_VARIABLE} to the path of {FILE_NAME}, or fetch it with "
             "`python -m hpamdp.data.human download --url URL`"
         ) from error
     except OSError as error:
-        raise HumanDataError(f"{path}: cannot be read ({error.strerror})") from error
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def check_sum(data: bytes, checksum: str, path: Path) -> None:
-    """Raise HumanDataError unless the bytes have this SHA-256."""
+    """Check the SHA-256 of a file's bytes.
+
+    Raises:
+        DataError: it is another one.
+    """
     found = hashlib.sha256(data).hexdigest()
     if found != checksum:
-        raise HumanDataError(
+        raise DataError(
             f"{path}: SHA-256 {found[:12]}… ({len(data)} bytes), but the released file has {checksum[:12]}…; "
             "it is truncated, altered or another file"
         )
 
 
 def _tables(columns: schema.Columns, one_frame: bool) -> HumanData:
-    """Put checked columns into the two tables."""
-    num = columns.num_presses
-    episode = np.repeat(np.arange(len(num)), num)
-    first = np.cumsum(num) - num
-    press = np.arange(len(episode)) - first[episode]
-    is_final = press == num[episode] - 1
+    """Return the two tables of checked columns."""
     fields = columns.fields
-    shift = np.array(harbour.CENTRE) - fields["center"] if one_frame else np.zeros_like(fields["center"])
+    num_presses = columns.num_presses
+    num_episodes = len(num_presses)
+    episode = np.repeat(np.arange(num_episodes), num_presses)
+    first = np.cumsum(num_presses) - num_presses
+    press = np.arange(len(episode)) - first[episode]
+    is_final = press == num_presses[episode] - 1
+    shift = np.zeros_like(fields["center"])
+    if one_frame:
+        shift = np.array(harbour.CENTRE) - fields["center"]
     duration = fields["actions"].sum(1)
-    burnt = np.bincount(episode, duration, minlength=len(num)) * FRAMES_A_SECOND
+    pressed = np.bincount(episode, duration, minlength=num_episodes) * FRAMES_PER_SECOND
     tank = fields["tank"][:, 0]
-    nowhere = np.full((len(episode), 2), np.nan)
-    nowhere[~is_final] = fields["next_obs"]
+    next_position = np.full((len(episode), 2), np.nan)
+    next_position[~is_final] = fields["next_obs"]
 
-    def table(size: int, **values: np.ndarray) -> TensorDict:
-        single = {np.dtype(np.float64): np.float32}
-        arrays = {k: v.astype(single.get(v.dtype, v.dtype)) for k, v in values.items()}
-        return TensorDict({k: torch.from_numpy(v) for k, v in arrays.items()}, batch_size=[size])
-
-    episodes = table(
-        len(num),
+    episodes = _table(
+        num_episodes,
         person=columns.person,
-        index=columns.index,
-        block=columns.index // EPISODES_A_BLOCK,
+        index=columns.episode_index,
+        block=columns.episode_index // EPISODES_PER_BLOCK,
         controller=fields["boatchoice"][:, 0].astype(np.int64),
         keymap=fields["incongkm"][:, 0].astype(np.int64),
-        presses=num,
+        presses=num_presses,
         outcome=_OUTCOMES[fields["outcome"][:, 0].astype(np.int64) - 1],
         tank=tank.astype(np.int64),
-        complete=np.abs(tank + burnt - FULL_TANK) <= _LOG_TOLERANCE,
+        complete=np.abs(tank + pressed - FULL_TANK) <= _LOG_TOLERANCE,
         start=fields["SG"][:, [0, 2]] + shift,
         goal=fields["SG"][:, [1, 3]] + shift,
         centre=fields["center"] + shift,
     )
-    presses = table(
+    presses = _table(
         len(episode),
         episode=episode,
         press=press,
         is_final=is_final,
         position=schema.positions(columns) + shift[episode],
-        next_position=nowhere + shift[episode],
+        next_position=next_position + shift[episode],
         key=fields["actions"].argmax(1),
         duration=duration,
         speed=schema.SPEED_UNIT * fields["velocity"].sum(1),
@@ -166,3 +173,12 @@ def _tables(columns: schema.Columns, one_frame: bool) -> HumanData:
         gas=fields["gas"][:, 0],
     )
     return HumanData(episodes, presses)
+
+
+def _table(size: int, **columns: np.ndarray) -> TensorDict:
+    """Return a table of these columns, with float64 made float32."""
+    table = TensorDict(batch_size=[size])
+    for name, values in columns.items():
+        dtype = np.float32 if values.dtype == np.float64 else values.dtype
+        table[name] = torch.from_numpy(values.astype(dtype))
+    return table

@@ -1,13 +1,17 @@
-"""People's presses as they would be if every boat came to rest before the next press, as the environment's boats do.
+"""Recorded presses converted to rest-to-rest presses, the only ones that the environment has.
 
-Two things in the recording mislead whoever copies it. A press that begins while the boat glides ends the glide, so
-a press often brought its boat less far than it would here. And presses that overlapped another are missing, among them
-most of those that ended their episodes: four of five final presses in the log are too short, or aimed past the dock, to
-have done it. A policy that copies all this taps where it should press, and runs dry. Here
-- a press lasts as long as takes a gliding boat to where it was when the next press began (P inverted);
-- presses that moved the boat less than `TAP` are gone;
-- so are final presses that, by our physics, would not have ended as their episodes did.
-Where the final press is gone, the last one left leads to where it began, and the episode is cut, not over.
+A learner that imitates the presses as they were recorded learns presses that are too short, for two reasons. A press
+that begins while the boat still glides ends the glide, so a recorded press often moved its boat less far than the same
+press does in the environment. And presses that overlapped another are missing from the log, among them most of those
+that ended their episodes: four of five final presses in the log are too short to have done so, or aimed past the dock.
+
+A rest-to-rest press starts from rest and lasts until the boat has come to rest again:
+- A press gets the duration that takes the boat, from rest to rest, to where the next press began.
+- Presses that moved the boat by less than `TAP` are left out.
+- Final presses are left out where, by our physics, they would not have ended their episode as it did.
+
+Where the final press is left out, the last remaining press leads to where the final one began, and the episode is
+truncated, not terminated.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from hpamdp.data.human.released_file import FRAMES_A_SECOND, FULL_TANK, HumanData
+from hpamdp.data.human.released_file import FRAMES_PER_SECOND, FULL_TANK, HumanData
 from hpamdp.env.boatdock import harbour, physics
 
 TAP = 4.0  # px
@@ -24,34 +28,48 @@ CENTRE = torch.tensor(harbour.CENTRE)
 
 
 def to_rest_to_rest(data: HumanData) -> HumanData:
-    """Return the recording with presses that start from rest and glide out; the tanks are what these presses leave.
+    """Return the recording with rest-to-rest presses.
+
+    Each episode's `tank` is what these presses leave of a full one.
 
     Args:
         data: read with `one_frame=True`.
     """
     presses = data.presses
-    of = data.episodes[presses["episode"]]
-    heading = torch.stack(harbour.direction(of["controller"].int(), of["keymap"].int(), presses["key"].int()), 1)
-    is_final, duration = presses["is_final"], presses["duration"]
+    is_final = presses["is_final"]
+    episodes = data.episodes[presses["episode"]]  # the episode of each press
+    heading = torch.stack(
+        harbour.direction(episodes["controller"].int(), episodes["keymap"].int(), presses["key"].int()), 1
+    )
     moved = ((presses["next_position"] - presses["position"]) * heading).sum(1).nan_to_num()
-    reach = torch.minimum(moved.clamp(min=0.0), physics.total_distance(duration))
-    duration = torch.where(is_final, duration, physics.press_for(reach))
-    is_kept = torch.where(is_final, _ends_alike(presses, of, heading), reach >= TAP)
-    kept = presses[is_kept].clone().set("duration", duration[is_kept]).set("speed", physics.speed(duration[is_kept]))
+    reach = torch.minimum(moved.clamp(min=0.0), physics.total_distance(presses["duration"]))
+    duration = torch.where(is_final, presses["duration"], physics.press_for(reach))
+    is_kept = torch.where(is_final, _ends_as_recorded(presses, episodes, heading), reach >= TAP)
+
+    kept = presses[is_kept].clone()
+    kept["duration"] = duration[is_kept]
+    kept["speed"] = physics.speed(kept["duration"])
     episode = kept["episode"]
-    goes_on = episode[:-1] == episode[1:]
-    kept["press"] = torch.arange(len(episode)) - torch.searchsorted(episode, episode)
-    kept["next_position"][:-1][goes_on] = kept["position"][1:][goes_on]
-    burnt = torch.zeros(len(data.episodes)).index_add(0, episode, kept["duration"]) * FRAMES_A_SECOND
-    tank = (FULL_TANK - burnt).clamp(min=0.0).round().long()
-    counts = torch.bincount(episode, minlength=len(data.episodes))
-    return HumanData(data.episodes.clone().update({"tank": tank, "presses": counts}), kept)
+    first = torch.searchsorted(episode, episode)
+    kept["press"] = torch.arange(len(episode)) - first
+    has_next = episode[:-1] == episode[1:]
+    kept["next_position"][:-1][has_next] = kept["position"][1:][has_next]
+
+    pressed = torch.zeros(len(data.episodes)).index_add(0, episode, kept["duration"])
+    converted = data.episodes.clone()
+    converted["tank"] = (FULL_TANK - pressed * FRAMES_PER_SECOND).clamp(min=0.0).round().long()
+    converted["presses"] = torch.bincount(episode, minlength=len(data.episodes))
+    return HumanData(converted, kept)
 
 
-def _ends_alike(presses: TensorDict, of: TensorDict, heading: Tensor) -> Tensor:
-    """Return whether a press from rest with a full tank ends by itself as its episode did, bool `[N]`."""
-    position, goal = presses["position"] - CENTRE, of["goal"] - CENTRE
+def _ends_as_recorded(presses: TensorDict, episodes: TensorDict, heading: Tensor) -> Tensor:
+    """Return whether a press, from rest and with a full tank, ends as its episode did, bool `[N]`."""
+    x, y = (presses["position"] - CENTRE).unbind(1)
+    goal_x, goal_y = (episodes["goal"] - CENTRE).unbind(1)
+    dir_x, dir_y = heading.unbind(1)
     tank = torch.full_like(presses["duration"], physics.TANK)
-    sailed = physics.press(*position.unbind(1), tank, *goal.unbind(1), *heading.unbind(1), presses["duration"])
-    ran_dry = (of["outcome"] == physics.OUT_OF_FUEL) & (sailed.outcome == physics.SAILING)
-    return (sailed.outcome == of["outcome"]) | ran_dry
+    sailed = physics.press(x, y, tank, goal_x, goal_y, dir_x, dir_y, presses["duration"])
+    outcome = episodes["outcome"]
+    # A full tank outlasts any press, so a press that ran dry just comes to rest here.
+    ran_dry = (outcome == physics.OUT_OF_FUEL) & (sailed.outcome == physics.SAILING)
+    return (sailed.outcome == outcome) | ran_dry

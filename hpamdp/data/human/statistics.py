@@ -1,8 +1,6 @@
-"""What people reached: scores, shares, choices, and how far below the best plan they stayed."""
+"""What people achieved: scores, shares of outcomes and choices, and how far they stayed below the best plan."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -13,28 +11,34 @@ from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
 
-_COINCIDES = 30.0  # degrees off the congruent boat's nearest direction up to which it is the better boat
+# The congruent controller is taken for the better one where the goal's bearing is less than this many degrees off its
+# nearest direction.
+_CONGRUENT_IS_BETTER_BELOW = 30.0
 
 
 def layouts(data: HumanData) -> harbour.Layout:
     """Return the episodes' layouts, px from the harbour's centre."""
-    start, goal = (data.episodes[name] - data.episodes["centre"] for name in ("start", "goal"))
-    return harbour.Layout(*start.unbind(1), *goal.unbind(1))
+    start_x, start_y = (data.episodes["start"] - data.episodes["centre"]).unbind(1)
+    goal_x, goal_y = (data.episodes["goal"] - data.episodes["centre"]).unbind(1)
+    return harbour.Layout(start_x, start_y, goal_x, goal_y)
 
 
 def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
-    """Return the figures of the episodes of `mask` `[E]`, under the names of `hpamdp.env.boatdock.reference`.
+    """Return the mean figures of the episodes of `mask` `[E]`, by the names of `hpamdp.env.boatdock.reference`.
 
-    `score_error` is the mean score's standard error, over episodes; `episodes` their number.
+    `score_error` is the standard error of the mean score over episodes, `episodes` the number of episodes.
     """
-    mask = torch.ones(len(data.episodes), dtype=torch.bool) if mask is None else mask
-    episodes, scores = data.episodes[mask], score(data)[mask]
+    if mask is None:
+        mask = torch.ones(len(data.episodes), dtype=torch.bool)
+    episodes = data.episodes[mask]
+    scores = score(data)[mask]
     is_congruent = episodes["controller"] == harbour.CONGRUENT
-    coincides = harbour.bearing_offset(layouts(data))[mask] < _COINCIDES
+    congruent_is_better = harbour.bearing_offset(layouts(data))[mask] < _CONGRUENT_IS_BETTER_BELOW
     shares = {
         name: episodes["outcome"] == code for code, name in enumerate(physics.OUTCOMES) if code != physics.SAILING
     }
-    shares |= {"option_congruent": is_congruent, "oracle_agreement": is_congruent == coincides}
+    shares["option_congruent"] = is_congruent
+    shares["oracle_agreement"] = is_congruent == congruent_is_better
     return {
         "episodes": len(scores),
         "score": scores.double().mean().item(),
@@ -45,39 +49,46 @@ def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
 
 
 def figures_by(data: HumanData, column: str) -> dict[int, Figures]:
-    """Return the figures for every value of a column of the episodes: `person`, `block`, `controller`, `keymap`."""
+    """Return the figures for every value of a column of `episodes`: `person`, `block`, `controller` or `keymap`."""
     values = data.episodes[column]
     return {int(value): figures(data, values == value) for value in values.unique()}
 
 
 def offset_bins(data: HumanData) -> Tensor:
-    """Return the bin of each episode `[E]` between OFFSET_EDGES, by the bearing's offset."""
+    """Return the bin of each episode's bearing offset among those of `OFFSET_EDGES`, `[E]`."""
     edges = torch.tensor(OFFSET_EDGES[1:-1], dtype=torch.float32)
     return torch.bucketize(harbour.bearing_offset(layouts(data)), edges)
 
 
 def choice_curve(data: HumanData, mask: Tensor | None = None) -> np.ndarray:
-    """Return the share choosing the congruent boat by the bearing's offset `[6]`; NaN where there is no episode."""
-    mask = torch.ones(len(data.episodes), dtype=torch.bool) if mask is None else mask
-    bins, num = offset_bins(data)[mask], len(OFFSET_EDGES) - 1
-    congruent = (data.episodes["controller"][mask] == harbour.CONGRUENT).double()
-    return (torch.bincount(bins, congruent, num) / torch.bincount(bins, minlength=num)).numpy()
+    """Return the share of congruent choices in each bin of `offset_bins`, `[6]`; NaN where there is no episode."""
+    if mask is None:
+        mask = torch.ones(len(data.episodes), dtype=torch.bool)
+    bins = offset_bins(data)[mask]
+    num_bins = len(OFFSET_EDGES) - 1
+    is_congruent = (data.episodes["controller"][mask] == harbour.CONGRUENT).double()
+    return (torch.bincount(bins, is_congruent, num_bins) / torch.bincount(bins, minlength=num_bins)).numpy()
 
 
 def best_scores(data: HumanData) -> Tensor:
-    """Return the best possible score of each episode with the incongruent and the congruent boat `[E, 2]`.
+    """Return the best possible score of each episode with the incongruent and the congruent controller, `[E, 2]`.
 
     Takes about a second for a thousand episodes.
     """
     return planner.best_plans(layouts(data), data.episodes["keymap"]).score
 
 
-def optimality_gaps(data: HumanData, best: Tensor) -> Mapping[str, Tensor]:
-    """Return what every episode fell short by `[E]`, given `best_scores`.
+def optimality_gaps(data: HumanData, best: Tensor) -> dict[str, Tensor]:
+    """Return by how much each episode's score stayed below the best possible one, each `[E]`.
 
-    `gap` of the best plan with the better boat, the sum of `choice_gap` (lost by choosing the worse boat) and
-    `press_gap` (lost with the boat that was chosen).
+    `gap` is the distance to the best plan with the better controller: the sum of `choice_gap`, lost by choosing the
+    worse controller, and `press_gap`, lost with the one that was chosen.
+
+    Args:
+        data: the recording.
+        best: `best_scores` of it.
     """
+    scores = score(data)
     chosen = best.gather(1, data.episodes["controller"].unsqueeze(1)).squeeze(1)
     better = best.max(1).values
-    return {"gap": better - score(data), "choice_gap": better - chosen, "press_gap": chosen - score(data)}
+    return {"gap": better - scores, "choice_gap": better - chosen, "press_gap": chosen - scores}

@@ -1,13 +1,14 @@
-"""People's presses as BoatDockEnv would have given them: the same keys, the same observation, the same rewards.
+"""The recorded presses as BoatDockEnv would have returned them: the same keys, observations and rewards.
 
-What the recording does not say is filled in like this:
-- Fuel before a press is a full tank less the logged presses, which is too much where presses are missing from the log
-  (`complete` says where not); after the final press it is what the recorded tank says.
-- The velocity observed is that at the release of the logged press before.
-- A final press ends on the dock's circle where the boat docked or arrived too fast (where the course meets it; where
-  people's boats met it off the course, at the point nearest to where the press began), else where our physics puts it.
-  It is terminal in any case, so nothing bootstraps from it; only the progress reward depends on it.
+What the recording does not hold is filled in:
+- The fuel before a press is a full tank less the logged presses. That is too much where presses are missing from the
+  log (`complete` marks the episodes where none is). After the final press it is the recorded tank.
+- The observed velocity is the one at which the previous logged press was released.
+- A final press that docked or was too fast ends on the dock's circle: where its course meets the circle or, if it does
+  not, at the point of the circle nearest to where the press began. Other final presses end where our physics puts them.
+  In any case the state is terminal, so nothing bootstraps from it, and only the progress reward depends on it.
 - Where not even the first press was logged, the first observation shows the boat already on its way.
+
 Episodes without a logged press give no transition.
 """
 
@@ -18,122 +19,161 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.data.human.errors import HumanDataError
-from hpamdp.data.human.released_file import FRAMES_A_SECOND, HumanData
+from hpamdp.data.demonstrations import TRAJECTORY
+from hpamdp.data.errors import DataError
+from hpamdp.data.human.released_file import FRAMES_PER_SECOND, HumanData
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics
-from hpamdp.env.boatdock.episode import BoatState, Reading, Rules
+from hpamdp.env.boatdock.episode import BoatState, ObservationForm, RewardForm, Rules
 
-TRAJECTORY = ("collector", "traj_ids")
-_REWARDS, _OBSERVATIONS = ("paper", "sparse"), ("scaled", "pixels")
+_REWARDS = ("paper", "sparse")
+_OBSERVATIONS = ("scaled", "pixels")
 
 
 def transitions(
-    data: HumanData, *, reward: str = "paper", observation: str = "scaled", has_choice: bool = True
+    data: HumanData, *, reward: RewardForm = "paper", observation: ObservationForm = "scaled", has_choice: bool = True
 ) -> TensorDict:
-    """Return the presses as a batch of transitions `[N]`, in the order of episodes and presses.
+    """Return the presses as transitions `[N]`, in the order of episodes and presses.
 
     At the root: `observation` `[N, 16]` (14 with `pixels`), `option` `[N]`, `("action", "discrete")` `[N]`,
     `("action", "parameters")` `[N, 3]` (0 for the keys that were not pressed), `is_decision`, `done`, `terminated`,
     `truncated` `[N, 1]`, `outcome` `[N]`, `fuel` `[N, 1]`, and `("collector", "traj_ids")` `[N]`, the episode. Under
-    `next`: all of these but action, option and trajectory, and `reward` `[N, 1]`.
+    `next`: all of these but action, option and episode, and `reward` `[N, 1]`.
 
     Args:
-        data: read with `one_frame=True`, so that every harbour lies where the environment's does.
+        data: read with `one_frame=True`, so that every harbour has the environment's centre.
         reward, observation: as in BoatDockEnv.
-        has_choice: the boat is chosen at the first press, as with `controller="choose"`: `option` is among the keys and
-            the first observation doesn't show it yet. Otherwise it is given from the start, and there is no `option`.
+        has_choice: whether the controller is chosen at the first press, as with `controller="choose"`: there is an
+            `option`, and the first observation does not show the controller yet. Otherwise it is known from the start,
+            and there is no `option`.
 
     Raises:
-        HumanDataError: a reward or observation that there is not, or harbours that lie elsewhere.
+        DataError: no such reward or observation, or the harbours have different centres.
     """
-    for name, value, allowed in (("reward", reward, _REWARDS), ("observation", observation, _OBSERVATIONS)):
-        if value not in allowed:
-            raise HumanDataError(f"{name}={value!r}, but must be one of {', '.join(allowed)}")
+    _check_one_of("reward", reward, _REWARDS)
+    _check_one_of("observation", observation, _OBSERVATIONS)
     if not (data.episodes["centre"] == torch.tensor(harbour.CENTRE)).all():
-        raise HumanDataError("the harbours lie in two frames; read the file with one_frame=True")
+        raise DataError("the harbours have different centres; read the file with one_frame=True")
     rules = Rules(controller="choose" if has_choice else "random", reward=reward, observation=observation)
-    of = data.episodes[data.presses["episode"]]  # the episode of each press, `[N]`
-    key, duration = data.presses["key"], data.presses["duration"]
-    before, after = _states(data, of, has_choice)
-    is_first = (data.presses["press"] == 0).unsqueeze(-1)
-    root, then = _seen(before, rules), _seen(after, rules)
-    then |= {keys.REWARD: episode.reward_of(before, after, rules).unsqueeze(-1), keys.IS_DECISION: then[keys.DONE]}
-    durations = torch.zeros(len(key), harbour.NUM_KEYS).scatter(1, key.unsqueeze(1), duration.unsqueeze(1))
-    root |= {keys.IS_DECISION: is_first, keys.ACTION: {"discrete": key.clone(), "parameters": durations}}
-    root["collector"] = {"traj_ids": data.presses["episode"].clone()}
+    presses = data.presses
+    episodes = data.episodes[presses["episode"]]  # the episode of each press
+    before, after = _states(presses, episodes, has_choice)
+
+    rows = _read(before, rules)
+    key = presses["key"].unsqueeze(1)
+    rows[keys.DISCRETE] = presses["key"].clone()
+    rows[keys.PARAMETERS] = torch.zeros(len(key), harbour.NUM_KEYS).scatter(1, key, presses["duration"].unsqueeze(1))
     if has_choice:
-        root[keys.OPTION] = of["controller"]
-    return TensorDict({**root, "next": then}, batch_size=[len(key)])
+        rows[keys.OPTION] = episodes["controller"]
+    rows[keys.IS_DECISION] = (presses["press"] == 0).unsqueeze(-1)
+    rows[TRAJECTORY] = presses["episode"].clone()
+    following = _read(after, rules)
+    following[keys.REWARD] = episode.reward_of(before, after, rules).unsqueeze(-1)
+    following[keys.IS_DECISION] = following[keys.DONE].clone()
+    rows["next"] = following
+    return rows
 
 
-def _states(data: HumanData, of: TensorDict, has_choice: bool) -> tuple[BoatState, BoatState]:
+def _check_one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise DataError(f"{name}={value!r}, but must be one of {', '.join(allowed)}")
+
+
+def _states(presses: TensorDict, episodes: TensorDict, has_choice: bool) -> tuple[BoatState, BoatState]:
     """Return the boats before and after each press, px from the harbour's centre."""
-    presses, centre = data.presses, torch.tensor(harbour.CENTRE)
-    is_first, is_final, duration = presses["press"] == 0, presses["is_final"], presses["duration"]
-    controller = of["controller"].to(torch.int32)
-    keymap = of["keymap"].to(torch.int32)
+    centre = torch.tensor(harbour.CENTRE)
+    is_first = presses["press"] == 0
+    is_final = presses["is_final"]
+    duration = presses["duration"]
+    controller = episodes["controller"].to(torch.int32)
+    keymap = episodes["keymap"].to(torch.int32)
+    num_presses = presses["press"].to(torch.int32)
+
+    start = episodes["start"] - centre
+    goal = episodes["goal"] - centre
+    position = presses["position"] - centre
     heading = torch.stack(harbour.direction(controller, keymap, presses["key"].to(torch.int32)), 1)
-    after_velocity = presses["speed"].unsqueeze(1) * heading
-    velocity = torch.where(is_first.unsqueeze(1), 0.0, after_velocity.roll(1, 0))
-    left, after_left = _fuel(duration, is_first, is_final, of["tank"])
-    position, goal = presses["position"] - centre, of["goal"] - centre
-    place = torch.where(
-        is_final.unsqueeze(1), _final_place(position, goal, left, heading, duration, of["outcome"]),
-        presses["next_position"] - centre,
-    )  # fmt: skip
-    not_chosen = torch.where(is_first, harbour.NOT_CHOSEN, controller).to(torch.int32)
-    number = presses["press"].to(torch.int32)
-    start = of["start"] - centre
+    next_velocity = presses["speed"].unsqueeze(1) * heading
+    velocity = torch.where(is_first.unsqueeze(1), 0.0, next_velocity.roll(1, 0))
+    fuel, next_fuel = _fuel(duration, is_first, is_final, episodes["tank"])
+    final_position = _final_position(position, goal, fuel, heading, duration, episodes["outcome"])
+    next_position = torch.where(is_final.unsqueeze(1), final_position, presses["next_position"] - centre)
+
+    shown_controller = controller
+    if has_choice:
+        shown_controller = torch.where(is_first, harbour.NOT_CHOSEN, controller).to(torch.int32)
     before = BoatState(
-        *start.unbind(1),
-        *goal.unbind(1),
-        *position.unbind(1),
-        *velocity.unbind(1),
-        fuel=left,
-        controller=not_chosen if has_choice else controller,
+        start_x=start[:, 0],
+        start_y=start[:, 1],
+        goal_x=goal[:, 0],
+        goal_y=goal[:, 1],
+        x=position[:, 0],
+        y=position[:, 1],
+        velocity_x=velocity[:, 0],
+        velocity_y=velocity[:, 1],
+        fuel=fuel,
+        controller=shown_controller,
         keymap=keymap,
-        presses=number,
-        outcome=torch.full_like(number, physics.SAILING),
-        episode=torch.zeros_like(number),
+        presses=num_presses,
+        outcome=torch.full_like(num_presses, physics.SAILING),
+        episode=torch.zeros_like(num_presses),
     )
-    (x, y), (velocity_x, velocity_y) = place.unbind(1), after_velocity.unbind(1)
-    # Where the final press is gone (`settled`) the episode is cut, not over: its last state bootstraps.
-    episode_number = presses["episode"]
-    is_last = torch.cat([episode_number[1:] != episode_number[:-1], torch.ones_like(is_final[:1])])
-    outcome = torch.where(is_final, of["outcome"], torch.where(is_last, physics.TIME_LIMIT, physics.SAILING)).int()
-    moved = dict(x=x, y=y, velocity_x=velocity_x, velocity_y=velocity_y, fuel=after_left)
-    return before, before._replace(**moved, controller=controller, presses=number + 1, outcome=outcome)
+    # Where the final press was left out (`to_rest_to_rest`) the episode is truncated: its last state bootstraps.
+    number = presses["episode"]
+    is_last = torch.cat([number[1:] != number[:-1], torch.ones_like(is_final[:1])])
+    outcome_if_not_final = torch.where(is_last, physics.TIME_LIMIT, physics.SAILING)
+    after = before._replace(
+        x=next_position[:, 0],
+        y=next_position[:, 1],
+        velocity_x=next_velocity[:, 0],
+        velocity_y=next_velocity[:, 1],
+        fuel=next_fuel,
+        controller=controller,
+        presses=num_presses + 1,
+        outcome=torch.where(is_final, episodes["outcome"], outcome_if_not_final).int(),
+    )
+    return before, after
 
 
 def _fuel(duration: Tensor, is_first: Tensor, is_final: Tensor, tank: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the seconds of fuel before and after each press `[N]`: a full tank less the logged presses.
+    """Return the fuel before and after each press, seconds `[N]`: a full tank less the logged presses.
 
-    There was never less than the tank that was left at the end, whatever the frames by which the two clocks differ.
+    It is never less than the tank left at the end, from which the logged durations can differ by a few frames.
+
+    Args:
+        duration: of each press, seconds `[N]`.
+        is_first, is_final: whether the press is its episode's first or final one, `[N]`.
+        tank: frames of fuel left at the end of each press's episode, `[N]`.
     """
-    elapsed = duration.double().cumsum(0)
-    at_start = (elapsed - duration)[is_first]
-    elapsed = elapsed - at_start[is_first.cumsum(0) - 1]
-    last = tank / FRAMES_A_SECOND
-    left = torch.maximum(physics.TANK - (elapsed - duration), last).float()
-    return left, torch.where(is_final, last, torch.maximum(physics.TANK - elapsed, last)).float()
+    total = duration.double().cumsum(0)  # over all episodes
+    total_at_start = (total - duration)[is_first]
+    elapsed = total - total_at_start[is_first.cumsum(0) - 1]
+    left_at_end = tank / FRAMES_PER_SECOND
+    before = torch.maximum(physics.TANK - (elapsed - duration), left_at_end).float()
+    after = torch.maximum(physics.TANK - elapsed, left_at_end)
+    return before, torch.where(is_final, left_at_end, after).float()
 
 
-def _final_place(
+def _final_position(
     position: Tensor, goal: Tensor, fuel: Tensor, heading: Tensor, duration: Tensor, outcome: Tensor
 ) -> Tensor:
-    """Return where a final press ended `[N, 2]`; see the module's docstring."""
-    columns = (*position.unbind(1), *goal.unbind(1), *heading.unbind(1))
-    to_dock = physics.distance_to_dock(*columns).unsqueeze(1)
-    on_course = position + torch.where(to_dock.isfinite(), to_dock, 0.0) * heading
-    outward = (position - goal) / (position - goal).norm(dim=1, keepdim=True)
-    dock = torch.where(to_dock.isfinite(), on_course, goal + physics.DOCK_RADIUS * outward)
-    sailed = physics.press(*columns[:2], fuel, *columns[2:], duration)
-    is_dock = (outcome == physics.SUCCESS) | (outcome == physics.TOO_FAST)
-    return torch.where(is_dock.unsqueeze(1), dock, torch.stack([sailed.x, sailed.y], 1))
+    """Return where each press would end if it were its episode's final one `[N, 2]`; see the module's docstring."""
+    x, y = position.unbind(1)
+    goal_x, goal_y = goal.unbind(1)
+    dir_x, dir_y = heading.unbind(1)
+    to_dock = physics.distance_to_dock(x, y, goal_x, goal_y, dir_x, dir_y).unsqueeze(1)
+    meets_dock = to_dock.isfinite()
+    on_course = position + torch.where(meets_dock, to_dock, 0.0) * heading
+    from_goal = position - goal
+    nearest = goal + physics.DOCK_RADIUS * (from_goal / from_goal.norm(dim=1, keepdim=True))
+    on_circle = torch.where(meets_dock, on_course, nearest)
+    sailed = physics.press(x, y, fuel, goal_x, goal_y, dir_x, dir_y, duration)
+    reached_dock = (outcome == physics.SUCCESS) | (outcome == physics.TOO_FAST)
+    return torch.where(reached_dock.unsqueeze(1), on_circle, torch.stack([sailed.x, sailed.y], 1))
 
 
-def _seen(state: BoatState, rules: Rules) -> dict[str, Tensor]:
-    row = torch.arange(len(state.x), dtype=torch.int32)
-    reading: Reading = episode.read(state, counter_rng.seed_tensor(0), row, rules)
-    return reading._asdict()
+def _read(state: BoatState, rules: Rules) -> TensorDict:
+    """Return what the environment would show of these boats, without noise."""
+    num = len(state.x)
+    reading = episode.read(state, counter_rng.seed_tensor(0), torch.arange(num, dtype=torch.int32), rules)
+    return TensorDict(reading._asdict(), batch_size=[num])

@@ -7,7 +7,7 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -18,13 +18,18 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.actions import invalid_action
+from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.episode import BoatState, Rules
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
+from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.columns import where
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
@@ -34,10 +39,12 @@ _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 class BoatDockEnv(PAMDPEnv):
     """Dock boats in `num_envs` harbours at once.
 
-    Action leaves: `("action", "discrete")` int64 `[N]` in {0, 1, 2}; `("action", "parameters")` float32 `[N, 3]`, seconds in
-    [0, 2], one for each key, of which only the pressed key's counts (values outside are clipped, NaN and infinite ones
-    refused); with `controller="choose"` also `option` int64 `[N]` (0 incongruent, 1 congruent), read at an episode's
-    first press and held until its end.
+    Action leaves:
+    - `("action", "discrete")` int64 `[N]` in {0, 1, 2}: the key to press;
+    - `("action", "parameters")` float32 `[N, 3]`: how long to press each key, seconds in [0, 2], of which only the
+      pressed key's counts; values outside are clipped, NaN and infinite ones refused;
+    - with `controller="choose"`, `option` int64 `[N]` (0 incongruent, 1 congruent): read at an episode's first press
+      and held until its end.
 
     Args:
         num_envs: how many boats.
@@ -68,7 +75,28 @@ class BoatDockEnv(PAMDPEnv):
     can_change_option: ClassVar[bool] = False
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
-    result_keys: ClassVar[tuple[str, ...]] = (keys.OUTCOME, keys.FUEL)
+    result_keys = (keys.OUTCOME, episode.FUEL)
+    choice_setting: ClassVar[str] = "env.controller=choose"
+    no_choice_setting: ClassVar[str] = "env.controller=congruent, incongruent, random"
+    table_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "score"),
+        Metric("human_normalised", "random 0, people 1"),
+        Metric("success", "success", "share"),
+        Metric("too_fast", "too fast", "share"),
+        Metric("out_of_bounds", "out of bounds", "share"),
+        Metric("out_of_fuel", "out of fuel", "share"),
+        Metric("time_limit", "time limit", "share"),
+        Metric("steps", "presses an episode", "count"),
+        Metric("option_congruent", "congruent boat", "share"),
+        Metric("oracle_agreement", "oracle's choice", "share"),
+        Metric("optimality_gap", "gap to the ceiling"),
+    )
+    curve_metrics: ClassVar[tuple[Metric, ...]] = (
+        Metric("score", "Score"),
+        Metric("success", "Episodes that succeed", "share"),
+        Metric("oracle_agreement", "Better boat chosen", "share"),
+        Metric("option_congruent", "Congruent boat chosen", "share"),
+    )
 
     def __init__(
         self,
@@ -88,18 +116,23 @@ class BoatDockEnv(PAMDPEnv):
         seed: int = 0,
         first_env: int = 0,
     ) -> None:
-        each = (motor_noise, motor_noise) if isinstance(motor_noise, int | float) else tuple(motor_noise)
-        rules = Rules(controller, keymap, reward, observation, each, sensor_noise, slip)
+        motor_noises = [motor_noise, motor_noise] if isinstance(motor_noise, int | float) else motor_noise
+        if len(motor_noises) != 2:
+            raise ValueError(f"BoatDockEnv: motor_noise={motor_noises}, but must be one number or two")
+        incongruent, congruent = motor_noises
+        rules = Rules(controller, keymap, reward, observation, (incongruent, congruent), sensor_noise, slip)
         _check_arguments(num_envs, rules)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
-        self._pure_step, self._pure_reset, self._pure_read = episode.step, episode.reset, episode.read
+        self._pure_step = episode.step
+        self._pure_reset = episode.reset
+        self._pure_read = episode.read
         if compile_physics:
-            self._pure_step, self._pure_reset, self._pure_read = (
-                torch.compile(function, **episode.COMPILE_ARGUMENTS)
-                for function in (episode.step, episode.reset, episode.read)
-            )
+            arguments: Any = episode.COMPILE_ARGUMENTS
+            self._pure_step = torch.compile(episode.step, **arguments)
+            self._pure_reset = torch.compile(episode.reset, **arguments)
+            self._pure_read = torch.compile(episode.read, **arguments)
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
         self._has_human, self._oracle = human, None
@@ -138,7 +171,7 @@ class BoatDockEnv(PAMDPEnv):
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `outcome`, `fuel` (fraction), `score` and `success` `[M]` of finished (or abandoned) episodes."""
-        outcome, fuel = last.get(keys.OUTCOME), last.get(keys.FUEL).squeeze(-1)
+        outcome, fuel = last.get(keys.OUTCOME), last.get(episode.FUEL).squeeze(-1)
         score = harbour.score(outcome, fuel)
         return {"outcome": outcome, "fuel": fuel, "score": score, "success": outcome == physics.SUCCESS}
 
@@ -160,7 +193,31 @@ class BoatDockEnv(PAMDPEnv):
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of `measure_boats`."""
-        return measure_boats(played)
+        return measure_boats(played, self._controller_of_run)
+
+    @property
+    def _controller_of_run(self) -> str:
+        """`chosen`, where the agent chooses, else as set."""
+        return "chosen" if self.has_choice else self.rules.controller
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return the figures of people, of the best of them and of the ceiling on the same layouts."""
+        ceiling = {**super().references(measured)["ceiling"], "success": 1.0}
+        ceiling["human_normalised"] = human_normalised(ceiling["score"], self._controller_of_run)
+        if self.has_choice:
+            ceiling["oracle_agreement"] = 1.0
+        return {**human_references(self._controller_of_run), "ceiling": ceiling}
+
+    def summary_entries(self) -> dict[str, str]:
+        """Return which `controller` the boats have, `chosen` where the agent chooses."""
+        return {"controller": self._controller_of_run}
+
+    @classmethod
+    def draw_figures(cls, evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
+        """Return `trajectories.png` and, where the agent chose its boat, `choices.png`."""
+        from hpamdp.env.boatdock import figures  # matplotlib takes long to import
+
+        return figures.draw(evaluation, summary)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns."""
@@ -192,7 +249,8 @@ class BoatDockEnv(PAMDPEnv):
         self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
         floats = torch.zeros(self.num_envs, device=self.device)
         integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
-        self._state = BoatState(*[floats] * 9, *[integers] * 4, episode=integers - 1)
+        columns = [floats] * 9 + [integers] * 4 + [integers - 1]
+        self._state = BoatState(*columns)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask, given = None, None
@@ -252,9 +310,13 @@ class BoatDockEnv(PAMDPEnv):
         )
         if not is_action.all():
             row = int((~is_action).nonzero()[0])
-            raise ValueError(
-                f"step: environment {row} got option={option[row].item()} (allowed 0, 1), key={key[row].item()} "
-                f"(allowed 0, 1, 2), durations={durations[row].tolist()} (the pressed key's must be finite)"
+            raise invalid_action(
+                row,
+                {
+                    "option": (option[row].item(), "allowed 0 to 1"),
+                    "key": (key[row].item(), "allowed 0 to 2"),
+                    "durations": (durations[row].tolist(), "the pressed key's must be finite"),
+                },
             )
         mask = tensordict.get("_step", None)
         if mask is not None:
@@ -286,8 +348,6 @@ def _check_arguments(num_envs: int, rules: Rules) -> None:
         raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
     if not 0.0 <= rules.slip <= 1.0:
         raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
-    if len(rules.motor_noise) != 2:
-        raise ValueError(f"BoatDockEnv: motor_noise={list(rules.motor_noise)}, but must be one number or two")
     for name, values in (("motor_noise", rules.motor_noise), ("sensor_noise", (rules.sensor_noise,))):
         for value in values:
             if not 0.0 <= value < float("inf"):

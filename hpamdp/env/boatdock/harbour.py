@@ -1,4 +1,4 @@
-"""The harbour: its place on the screen, the two controllers with their key maps, and where boats start and dock."""
+"""The harbour: its position on the screen, the two controllers and their key maps, and where boats start and dock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NOT_CHOSEN = -1
 
 _COS30 = math.sqrt(3.0) / 2.0
 _CONGRUENT_KEYS = ((-_COS30, 0.5), (0.0, -1.0), (_COS30, 0.5))
-# Key directions by [controller and key map][key]: incongruent with key map 1, with key map 2, congruent.
+# Directions by row and key. Rows: incongruent with key map 1, incongruent with key map 2, congruent.
 DIRECTIONS = (
     ((_COS30, -0.5), (-_COS30, -0.5), (0.0, 1.0)),
     ((0.0, 1.0), (_COS30, -0.5), (-_COS30, -0.5)),
@@ -35,11 +35,11 @@ def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, 
 
     Args:
         controller: INCONGRUENT or CONGRUENT, `[*B]`.
-        keymap: 1 or 2, `[*B]`; it concerns the incongruent controller only.
+        keymap: 1 or 2, `[*B]`; only the incongruent controller depends on it.
         key: 0, 1 or 2, `[*B]`.
     """
-    # Arithmetic instead of a table: a gather keeps the compiled step from being vectorised. The incongruent boat's
-    # directions are the congruent ones reversed, in another order of keys.
+    # Arithmetic instead of a table, because a gather keeps the compiled step from being vectorised. The incongruent
+    # boat's directions are the opposite of the congruent ones, in another order of keys.
     reordered = torch.where(keymap == 1, torch.where(key == 0, 0, 3 - key), torch.where(key == 2, 2, 1 - key))
     congruent = controller == CONGRUENT
     column = torch.where(congruent, key, reordered)
@@ -56,45 +56,57 @@ class Layout(NamedTuple):
     goal_y: Tensor
 
 
-# Draws of an episode's key by purpose: three for each try at a layout, then the rest.
+# Indices of an episode's random numbers: three for each try at a layout, then the others.
 _TRIES = 4
-_DRAW_ANGLE, DRAW_CONTROLLER, DRAW_KEYMAP = 3 * _TRIES, 3 * _TRIES + 1, 3 * _TRIES + 2
+_INDEX_ANGLE = 3 * _TRIES
+INDEX_CONTROLLER = 3 * _TRIES + 1
+INDEX_KEYMAP = 3 * _TRIES + 2
 
 
-def draw_layout(key: Tensor) -> Layout:
-    """Draw start and goal uniformly in the disc, both again while they are under MIN_SEPARATION apart.
+def sample_layout(key: Tensor) -> Layout:
+    """Sample start and goal uniformly in the disc, again while they are less than MIN_SEPARATION apart.
+
+    A try samples the two squared radii and the angle between the points: the distance depends on nothing else. The
+    angle of the pair as a whole is sampled last. After four tries 2 in 100,000 layouts are still too close; these get
+    their goal on the far side of the centre, which avoids a loop that depends on the data.
 
     Args:
         key: int32 `[*B]` from `counter_rng.key_for`.
-
-    A try is two squared radii and the angle between the points, which is all that the distance depends on; the angle of
-    the pair comes last. Four tries leave 2 in 100,000 layouts too close; those get their goal on the far side of the
-    centre, which keeps the function free of loops that depend on the data.
     """
 
-    def attempt(first_draw: int) -> tuple[Tensor, Tensor, Tensor]:
+    def attempt(first_index: int) -> tuple[Tensor, Tensor, Tensor]:
         return (
-            counter_rng.uniform(key, first_draw),
-            counter_rng.uniform(key, first_draw + 1),
-            2.0 * math.pi * counter_rng.uniform(key, first_draw + 2),
+            counter_rng.uniform(key, first_index),
+            counter_rng.uniform(key, first_index + 1),
+            2.0 * math.pi * counter_rng.uniform(key, first_index + 2),
         )
 
     def is_near(start: Tensor, goal: Tensor, turn: Tensor) -> Tensor:
         squared = start + goal - 2.0 * (start * goal).sqrt() * turn.cos()
         return squared < (MIN_SEPARATION / LAYOUT_RADIUS) ** 2
 
-    # Each try is judged on its own, and the first good one is taken.
+    # Each try is judged on its own. From the last to the first, each replaces what came after it unless it is too near,
+    # so that the first good try remains.
     tries = [attempt(3 * i) for i in range(_TRIES)]
     near = [is_near(*each) for each in tries]
     start, goal, turn = tries[-1]
-    goal, turn = torch.where(near[-1], 0.25, goal), torch.where(near[-1], math.pi, turn)
+    goal = torch.where(near[-1], 0.25, goal)
+    turn = torch.where(near[-1], math.pi, turn)
     for each, is_too_near in zip(tries[-2::-1], near[-2::-1], strict=True):
-        start, goal, turn = (torch.where(is_too_near, o, n) for n, o in zip(each, (start, goal, turn), strict=True))
+        start = torch.where(is_too_near, start, each[0])
+        goal = torch.where(is_too_near, goal, each[1])
+        turn = torch.where(is_too_near, turn, each[2])
 
-    angle = 2.0 * math.pi * counter_rng.uniform(key, _DRAW_ANGLE)
-    start, goal = LAYOUT_RADIUS * start.sqrt(), LAYOUT_RADIUS * goal.sqrt()
-    turn = angle + turn
-    return Layout(start * angle.cos(), start * angle.sin(), goal * turn.cos(), goal * turn.sin())
+    angle = 2.0 * math.pi * counter_rng.uniform(key, _INDEX_ANGLE)
+    start_radius = LAYOUT_RADIUS * start.sqrt()
+    goal_radius = LAYOUT_RADIUS * goal.sqrt()
+    goal_angle = angle + turn
+    return Layout(
+        start_radius * angle.cos(),
+        start_radius * angle.sin(),
+        goal_radius * goal_angle.cos(),
+        goal_radius * goal_angle.sin(),
+    )
 
 
 def separation(layout: Layout) -> Tensor:
@@ -103,14 +115,14 @@ def separation(layout: Layout) -> Tensor:
 
 
 def fixed_layouts(num: int, seed: int) -> Layout:
-    """Draw `num` layouts that no training episode can meet: they come from a stream of their own."""
-    zeros = torch.zeros(num, dtype=torch.int32)
+    """Return `num` layouts for evaluation; training meets none of them, since they come from a stream of their own."""
     rows = torch.arange(num, dtype=torch.int32)
-    return draw_layout(counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.EVALUATION, rows, zeros))
+    episode = torch.zeros(num, dtype=torch.int32)
+    return sample_layout(counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.EVALUATION, rows, episode))
 
 
 def bearing_offset(layout: Layout) -> Tensor:
-    """Return degrees `[*B]` in [0, 60] between the goal's bearing and the congruent boat's nearest direction."""
+    """Return the degrees, in [0, 60], between the goal's bearing and the congruent boat's nearest direction, `[*B]`."""
     bearing = torch.rad2deg(torch.atan2(layout.goal_y - layout.start_y, layout.goal_x - layout.start_x))
     # The congruent directions lie at 30, 150 and 270 degrees (y down), 120 apart.
     return ((bearing - 30.0 + 60.0) % 120.0 - 60.0).abs()
@@ -122,5 +134,5 @@ def score(outcome: Tensor, fuel: Tensor) -> Tensor:
 
 
 def fuel_fraction(seconds: Tensor) -> Tensor:
-    """Return fuel as a fraction of a full tank."""
+    """Return seconds of fuel as a fraction of a full tank."""
     return seconds / TANK

@@ -1,4 +1,4 @@
-"""How often people choose each controller for the layouts at hand."""
+"""How often people choose each controller in the layouts at hand."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGE
 
 
 def human_spec(num_envs: int, device: torch.device) -> Composite:
-    """Return the spec of `people_shares` under the name of what is chosen."""
+    """Return the spec of `human_shares`, as the entry `option`."""
     shares = Bounded(0.0, 1.0, shape=(num_envs, len(harbour.CONTROLLERS)), device=device)
     return Composite(option=shares, shape=(num_envs,))
 
 
 def human_shares(state: BoatState) -> Tensor:
-    """Return the shares of people choosing the incongruent and the congruent boat `[N, 2]`, by the bearing's offset."""
+    """Return the shares of people who choose the incongruent and the congruent boat `[N, 2]`, by the bearing offset."""
     layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
     offset = harbour.bearing_offset(layout)
     bins = torch.bucketize(offset, offset.new_tensor(OFFSET_EDGES[1:-1]))

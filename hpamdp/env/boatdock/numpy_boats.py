@@ -1,10 +1,11 @@
-"""BoatDockEnv spoken to in numpy: Gymnasium's spaces, and the checks between its actions and our tensors.
+"""BoatDockEnv with NumPy in and out: Gymnasium's spaces, and the checks between its actions and our tensors.
 
-Action formats, for one boat (batched spaces are Gymnasium's own, every leaf with a leading `[N]`):
+Formats of an action, for one boat (batched spaces are Gymnasium's own: every leaf has a leading `[N]`):
 
-- `dict`: `{"key": 0..2, "duration": [3] seconds in [0, 2], one a key, only the pressed key's counts}`, and with
-  `controller="choose"` also `"option": 0 (incongruent) or 1 (congruent)`, read at an episode's first press.
-- `tuple`, the field's convention: `(key, (seconds [1], seconds [1], seconds [1]))`, and with `controller="choose"` the
+- `dict`: `{"key": 0 to 2, "duration": [3] seconds in [0, 2]}`, a duration for each key, of which only the pressed
+  key's counts; with `controller="choose"` also `"option": 0 (incongruent) or 1 (congruent)`, which is read at an
+  episode's first press.
+- `tuple`, the field's convention: `(key, (seconds [1], seconds [1], seconds [1]))`; with `controller="choose"` the
   option comes first: `(option, key, (...))`.
 """
 
@@ -27,34 +28,36 @@ from hpamdp.env.boatdock.episode import OBSERVATION_NAMES, SCALED_NAMES, Rules
 ActionFormat = Literal["dict", "tuple"]
 
 _OPTION_SHAPES = {"start": (2,), "goal": (2,), "controller": (), "keymap": ()}
-# Gaussian numbers made from 23-bit uniform ones stay within 5.8 standard deviations.
+# Gaussian numbers that are made from 23-bit uniform ones stay within 5.8 standard deviations.
 _LARGEST_NORMAL = 6.0
 
 
 def action_space(has_choice: bool, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
-    """Return one boat's action space; see the module's docstring."""
-    num_discrete, longest = harbour.NUM_KEYS, physics.MAX_DURATION
+    """Return the action space of one boat; see the module's docstring."""
     option = spaces.Discrete(len(harbour.CONTROLLERS))
+    key = spaces.Discrete(harbour.NUM_KEYS)
     if action_format == "dict":
-        press = {"key": spaces.Discrete(num_discrete), "duration": spaces.Box(0.0, longest, (num_discrete,))}
-        return spaces.Dict({"option": option, **press} if has_choice else press)
-    durations = spaces.Tuple([spaces.Box(0.0, longest, (1,)) for _ in range(num_discrete)])
-    press = (spaces.Discrete(num_discrete), durations)
-    return spaces.Tuple((option, *press) if has_choice else press)
+        duration = spaces.Box(0.0, physics.MAX_DURATION, (harbour.NUM_KEYS,))
+        leaves: dict[str, spaces.Space] = {"key": key, "duration": duration}
+        if has_choice:
+            leaves["option"] = option
+        return spaces.Dict(leaves)
+    durations = spaces.Tuple([spaces.Box(0.0, physics.MAX_DURATION, (1,)) for _ in range(harbour.NUM_KEYS)])
+    return spaces.Tuple((option, key, durations) if has_choice else (key, durations))
 
 
 def observation_space(rules: Rules) -> spaces.Box:
-    """Return one boat's observation space: float32 with the finite bounds that layouts, motion and noise leave."""
+    """Return the observation space of one boat: float32, bounded by what layouts, motion and noise can reach."""
     is_pixels = rules.observation == "pixels"
     unit = 1.0 if is_pixels else 1.0 / physics.HARBOUR_RADIUS
     top_speed = 1.01 * (float(physics.speed(torch.tensor(physics.MAX_DURATION))) if is_pixels else 1.0)
-    # A px more than the geometry allows, for rounding.
+    # One px more than the geometry allows, for rounding.
     reach = physics.HARBOUR_RADIUS + 1.0 + _LARGEST_NORMAL * rules.sensor_noise
     bounds = {
         "radius": (0.0, 2.0 * physics.HARBOUR_RADIUS * unit),
         "controller": (-1.0, 1.0),
         "fuel": (0.0, 1.0),
-        # In units of the distance at the start, which counts as a dock's radius at least.
+        # In units of the distance at the start, which counts as at least the radius of the dock.
         "distance": (0.0, 2.0 * 2.0**0.5 * reach / physics.DOCK_RADIUS),
     }
     for axis, centre in zip("xy", harbour.CENTRE if is_pixels else (0.0, 0.0), strict=True):
@@ -68,7 +71,7 @@ def observation_space(rules: Rules) -> spaces.Box:
 
 
 class NumpyBoats:
-    """BoatDockEnv spoken to in numpy: one boat (`batch=()`) or many (`batch=(N,)`)."""
+    """BoatDockEnv with NumPy in and out: one boat (`batch=()`) or many (`batch=(N,)`)."""
 
     def __init__(self, env: BoatDockEnv, batch: tuple[int, ...], action_format: ActionFormat) -> None:
         if action_format not in ("dict", "tuple"):
@@ -82,33 +85,35 @@ class NumpyBoats:
         self._leaf_names = ("option", "key", "duration") if env.has_choice else ("key", "duration")
 
     def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
-        """Start new episodes (in the rows of `mask`, default all) and return the observations `[N, obs]`."""
+        """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, observation_dim]`."""
         given = self._layout(options or {})
         if mask is not None:
             given["_reset"] = torch.from_numpy(mask.copy()).to(self.env.device).unsqueeze(-1)
         if seed is not None:
             if options:
-                # Refuses a bad layout while the boats are still as they were.
+                # Refuse an invalid layout before the seed changes anything.
                 self.env.reset(given.clone())
             self.env.set_seed(seed, static_seed=True)
         self.is_reset = True
         return to_numpy(self.env.reset(given)[keys.OBSERVATION])
 
     def step(self, action: Any, ignored: np.ndarray | None = None) -> TensorDictBase:
-        """Press a key in every boat and return what BoatDockEnv does; in `ignored` rows any action passes."""
+        """Press a key in every boat and return the next state of BoatDockEnv; `ignored` rows may hold any action."""
         if not self.is_reset:
             raise gymnasium.error.ResetNeeded("step: call reset first")
         leaves = self._leaves(action)
         if ignored is not None:
             for leaf in leaves.values():
                 leaf[torch.from_numpy(ignored)] = 0
-        n = self.env.num_envs
-        option = {keys.OPTION: leaves["option"]} if self.env.has_choice else {}
-        press = TensorDict(discrete=leaves["key"], parameters=leaves["duration"], batch_size=[n])
-        return self.env.step(TensorDict({**option, keys.ACTION: press}, batch_size=[n], device=self.env.device))["next"]
+        td = TensorDict(batch_size=self.env.batch_size, device=self.env.device)
+        td[keys.DISCRETE] = leaves["key"]
+        td[keys.PARAMETERS] = leaves["duration"]
+        if self.env.has_choice:
+            td[keys.OPTION] = leaves["option"]
+        return self.env.step(td)["next"]
 
     def infos(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Return the info values, `[N]` each (`score` means nothing before the end), and which boats are done."""
+        """Return the infos, `[N]` each, and which boats are done; `score` is meaningless for the others."""
         state = self.env.state
         fuel = state.fuel / physics.TANK
         values = {
@@ -121,6 +126,7 @@ class NumpyBoats:
         return values, to_numpy(state.outcome != physics.SAILING)
 
     def _layout(self, options: Mapping[str, Any]) -> TensorDict:
+        """Check the options of a reset and return them as tensors."""
         unknown = set(options) - set(_OPTION_SHAPES)
         if unknown:
             raise ValueError(f"reset: unknown options {sorted(unknown)}; allowed: {', '.join(_OPTION_SHAPES)}")
@@ -134,7 +140,7 @@ class NumpyBoats:
         return TensorDict(given, batch_size=[self.env.num_envs], device=self.env.device)
 
     def _leaves(self, action: Any) -> dict[str, torch.Tensor]:
-        """Check an action's structure, types and shapes and return its leaves, `[N, ...]` each."""
+        """Check the structure, types and shapes of an action and return its leaves, `[N, ...]` each."""
         names = ", ".join(self._leaf_names)
         if self._is_tuple:
             if not isinstance(action, (tuple, list)) or len(action) != len(self._leaf_names):
@@ -161,7 +167,7 @@ class NumpyBoats:
         try:
             array = np.asarray(value)
         except (TypeError, ValueError):
-            raise ValueError(f"{name} is no array, but {_describe(value)}") from None
+            raise ValueError(f"{name} must be an array, but is {_describe(value)}") from None
         if array.dtype.kind not in ("iu" if is_integer else "iuf"):
             raise ValueError(f"{name} has type {array.dtype}, but must be {'integer' if is_integer else 'a number'}")
         if array.shape != self._batch + shape:
@@ -173,9 +179,11 @@ def _describe(value: Any) -> str:
     kind = type(value).__name__
     if isinstance(value, Mapping):
         return f"a {kind} with keys {', '.join(map(str, value))}"
-    return f"a {kind} of length {len(value)}" if isinstance(value, (tuple, list)) else f"a {kind}"
+    if isinstance(value, (tuple, list)):
+        return f"a {kind} of length {len(value)}"
+    return f"a {kind}"
 
 
 def to_numpy(tensor: torch.Tensor) -> np.ndarray:
-    """Copy a tensor into an array of its own, so that nobody who holds it sees or makes a change."""
+    """Return a copy of a tensor as an array that shares no memory with it."""
     return tensor.cpu().numpy().copy()

@@ -1,4 +1,4 @@
-"""What the planner knows of the boats at hand: the better controller and each controller's next press."""
+"""The oracle of an environment: the better controller of each boat and each controller's next press, by the planner."""
 
 from __future__ import annotations
 
@@ -12,22 +12,33 @@ from hpamdp.env.boatdock.episode import BoatState, Rules
 
 
 def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
-    """Return the spec of what `BoatDockOracle.read` gives."""
-    n, plans = num_envs, _num_plans(rules)
+    """Return the spec of what `BoatDockOracle.read` returns."""
+    shape = (num_envs, _num_plans(rules))
     return Composite(
-        option=Categorical(len(harbour.CONTROLLERS), shape=(n,), device=device),
-        discrete=Categorical(harbour.NUM_KEYS, shape=(n, plans), device=device),
-        parameters=Bounded(0.0, physics.MAX_DURATION, shape=(n, plans), device=device),
-        shape=(n,),
+        option=Categorical(len(harbour.CONTROLLERS), shape=(num_envs,), device=device),
+        discrete=Categorical(harbour.NUM_KEYS, shape=shape, device=device),
+        parameters=Bounded(0.0, physics.MAX_DURATION, shape=shape, device=device),
+        shape=(num_envs,),
     )
 
 
 def _num_plans(rules: Rules) -> int:
+    """Return how many plans each boat has: one for each controller that it may get."""
     return len(harbour.CONTROLLERS) if rules.controller == "choose" else 1
 
 
 class BoatDockOracle:
-    """Holds the best plan of every boat; plans at the start of an episode and, with noise, anew before every press."""
+    """Keep the best plan of every boat, made at the start of an episode and, with noise, again before every press.
+
+    Args:
+        num_envs: number of boats.
+        rules: of the environment.
+        device: of the tensors.
+
+    Attributes:
+        option: the better controller, int64 `[N]`.
+        keys, durations: of the planned presses, `[N, num_plans, MAX_PRESSES]`.
+    """
 
     def __init__(self, num_envs: int, rules: Rules, device: torch.device) -> None:
         self.rules = rules
@@ -42,30 +53,34 @@ class BoatDockOracle:
         plans = [self._plan_with(boats, controller) for controller in range(_num_plans(self.rules))]
         stacked = planner.Plan(*(torch.stack(fields, 1) for fields in zip(*plans, strict=True)))
         self.option[rows] = planner.better_option(stacked)
-        self.keys[rows], self.durations[rows] = stacked.keys, stacked.durations
+        self.keys[rows] = stacked.keys
+        self.durations[rows] = stacked.durations
 
     def _plan_with(self, boats: BoatState, controller: int) -> planner.Plan:
+        """Return the boats' plans with this controller, or with the one that they already have."""
         if self.rules.controller == "choose":
-            held = torch.full_like(boats.controller, controller)
+            controllers = torch.full_like(boats.controller, controller)
         else:
-            held = boats.controller
-        return planner.best_plan(boats.x, boats.y, boats.goal_x, boats.goal_y, boats.fuel, held, boats.keymap)
+            controllers = boats.controller
+        return planner.best_plan(boats.x, boats.y, boats.goal_x, boats.goal_y, boats.fuel, controllers, boats.keymap)
 
     def read(self, state: BoatState) -> TensorDict:
-        """Return `option` `[N]` and each option's next press, `discrete` and `parameters` `[N, num_options]`."""
-        pressed = state.presses.long()
+        """Return `option` `[N]` and the next press of each plan, `discrete` and `parameters` `[N, num_plans]`."""
+        num_presses = state.presses.long()  # since the plan was made
         if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
-            pressed = torch.zeros_like(pressed)
-        index = pressed.clamp(max=planner.MAX_PRESSES - 1).view(-1, 1, 1).expand(-1, self.keys.shape[1], 1)
-        # Past the plan's end nothing is pressed: there is no plan that still docks.
-        is_planned = (pressed < planner.MAX_PRESSES).unsqueeze(-1)
+            num_presses = torch.zeros_like(num_presses)
+        index = num_presses.clamp(max=planner.MAX_PRESSES - 1).view(-1, 1, 1).expand(-1, self.keys.shape[1], 1)
+        keys = self.keys.gather(-1, index).squeeze(-1)
+        durations = self.durations.gather(-1, index).squeeze(-1)
+        # After the end of a plan the duration is 0.
+        is_planned = (num_presses < planner.MAX_PRESSES).unsqueeze(-1)
         return TensorDict(
             {
                 "option": self.option.clone(),
-                "discrete": self.keys.gather(-1, index).squeeze(-1),
-                "parameters": torch.where(is_planned, self.durations.gather(-1, index).squeeze(-1), 0.0),
+                "discrete": keys,
+                "parameters": torch.where(is_planned, durations, 0.0),
             },
-            batch_size=pressed.shape,
-            device=pressed.device,
+            batch_size=num_presses.shape,
+            device=num_presses.device,
         )

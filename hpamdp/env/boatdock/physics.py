@@ -1,12 +1,13 @@
-"""The boat's motion: one press of a key as closed forms on batches of columns.
+"""The boat's motion: one press of a key in closed form, on batches of columns.
 
-Units: pixels, seconds, pixels a second; screen axes (y points down). Positions are taken from the harbour's centre,
-which keeps float32 exact to about 1e-5 px. Every function is pure, takes and returns tensors of one shape `[*B]`, has
-no Python loop over environments and no data-dependent branch: one code path for CPU and CUDA, eager and compiled.
+Units: pixels, seconds, pixels a second; screen axes (y points down). Positions are relative to the harbour's centre,
+which keeps float32 exact to about 1e-5 px. Every function is pure, takes and returns tensors of one shape `[*B]`, and
+has no Python loop over environments and no branch that depends on the data: the same code runs on CPU and CUDA, eager
+and compiled.
 
-A press of x seconds accelerates the boat from rest along the key's direction, then it glides to rest along the same
-curve run backwards, GLIDE times as long. The path is a straight segment, so the first crossing of the dock circle and
-of the harbour circle, and the speed there, have closed forms.
+A press of x seconds accelerates the boat from rest along the key's direction; then the boat glides to rest along the
+same speed curve run backwards, stretched by GLIDE. The path is a straight segment, so the first crossing of the dock
+circle and of the harbour circle, and the speed there, have closed forms.
 """
 
 from __future__ import annotations
@@ -18,20 +19,20 @@ from torch import Tensor
 
 HARBOUR_RADIUS = 120.0
 DOCK_RADIUS = 15.0
-GLIDE = 0.95  # the glide's length over the pressed stretch's
-DOCKING_SPEED = 74.0  # px/s, the fastest arrival that still docks
+GLIDE = 0.95  # length and duration of the glide, as multiples of those of the pressed stretch
+DOCKING_SPEED = 74.0  # px/s, the highest speed of arrival that docks
 TANK = 6.0  # seconds of pressing in a full tank
 MAX_DURATION = 2.0  # seconds
 
 SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(6)
 OUTCOMES = ("sailing", "success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit")
 
-# Below this much fuel (seconds) the tank counts as dry: float32 cannot tell it from rounding.
+# With less fuel than this (seconds) the tank counts as empty: the rest is rounding in float32.
 _DRY = 1e-6
 
 
 class Press(NamedTuple):
-    """What one press did, every field `[*B]`."""
+    """The result of one press, every field `[*B]`; see `press`."""
 
     x: Tensor
     y: Tensor
@@ -51,19 +52,20 @@ def pressed_distance(duration: Tensor) -> Tensor:
 
 
 def total_distance(duration: Tensor) -> Tensor:
-    """Return the distance (px) from rest to rest of a press of `duration` seconds: press and glide."""
+    """Return the distance (px) that a press of `duration` seconds covers from rest to rest, with its glide."""
     return (1.0 + GLIDE) * pressed_distance(duration)
 
 
 def duration_for(distance: Tensor) -> Tensor:
     """Return the seconds of pressing that cover `distance` px while the key is down: the inverse of P.
 
-    Newton's method from the cubic term's root, which the quartic term moves by under 4 % on [0, 2] s; P is increasing
-    and convex there, and three steps reach float32 accuracy. Negative distances count as 0.
+    Newton's method, started at the root of the cubic term with a first-order correction for the quartic one, which
+    changes the root by under 4 % on [0, 2] s. P is increasing and convex there, and three steps reach float32
+    accuracy. Negative distances count as 0.
     """
     distance = distance.clamp(min=0.0)
-    # The offset keeps the root's slope and the division finite at 0; it moves the answer by under 1e-4 s only where
-    # the distance itself is under 1e-10 px.
+    # The offset keeps the root's slope and the division finite at 0. It changes the result by up to 1e-4 s, and only
+    # where the distance is under 1e-10 px.
     root = ((3.0 / 100.0) * distance + 1e-12) ** (1.0 / 3.0)
     duration = root * (1.0 + root / 60.0)
     for _ in range(3):
@@ -72,22 +74,22 @@ def duration_for(distance: Tensor) -> Tensor:
 
 
 def press_for(distance: Tensor) -> Tensor:
-    """Return the seconds of the press that brings the boat `distance` px further, from rest to rest."""
+    """Return the seconds of the press that moves the boat by `distance` px from rest to rest."""
     return duration_for(distance / (1.0 + GLIDE))
 
 
 def distance_to_dock(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, dir_x: Tensor, dir_y: Tensor) -> Tensor:
-    """Return how far (px) the course runs before it meets the dock circle; `inf` where it never does."""
+    """Return the distance (px) along the course to the dock circle; `inf` where the course misses it."""
     ahead = (goal_x - x) * dir_x + (goal_y - y) * dir_y
     aside = (goal_x - x) * dir_y - (goal_y - y) * dir_x
     half_chord_squared = DOCK_RADIUS**2 - aside * aside
     entry = ahead - half_chord_squared.clamp(min=0.0).sqrt()
-    # Clamped: a boat that rounding put a hair inside the circle meets it at once.
+    # Clamped: a boat that rounding has put just inside the circle meets it at once.
     return torch.where((half_chord_squared >= 0.0) & (ahead > 0.0), entry.clamp(min=0.0), torch.inf)
 
 
 def distance_to_harbour(x: Tensor, y: Tensor, dir_x: Tensor, dir_y: Tensor) -> Tensor:
-    """Return how far (px) the course runs before it leaves the harbour circle."""
+    """Return the distance (px) along the course to the harbour circle."""
     ahead = x * dir_x + y * dir_y
     aside = x * dir_y - y * dir_x
     return ((HARBOUR_RADIUS**2 - aside * aside).clamp(min=0.0).sqrt() - ahead).clamp(min=0.0)
@@ -99,15 +101,15 @@ def press(
     """Press a key for `duration` seconds and glide until the first event.
 
     Args:
-        x, y: the boat at rest, px from the harbour's centre, `[*B]`.
+        x, y: position of the boat, at rest, px from the harbour's centre, `[*B]`.
         fuel: seconds of pressing left in the tank, `[*B]`.
-        goal_x, goal_y: the dock's centre, px from the harbour's centre, `[*B]`.
-        dir_x, dir_y: the key's unit direction, `[*B]`.
-        duration: seconds, `[*B]`, in [0, MAX_DURATION]; cut short when the tank runs dry.
+        goal_x, goal_y: centre of the dock, px from the harbour's centre, `[*B]`.
+        dir_x, dir_y: unit direction of the key, `[*B]`.
+        duration: seconds in [0, MAX_DURATION], `[*B]`; cut short when the tank is empty.
 
     Returns:
-        Where the boat is at the event or at rest, the fuel left (s), the speed (px/s) at which the press ended
-        (released, ran dry or met the event) and the outcome (int32; SAILING when it came to rest with fuel left).
+        The position at the event or at rest, the fuel left (s), the speed (px/s) when the acceleration ended (by the
+        key's release, an empty tank or the event) and the outcome (int32; SAILING at rest with fuel left).
     """
     duration = torch.minimum(duration, fuel)
     pressed = pressed_distance(duration)
@@ -118,7 +120,7 @@ def press(
     leaves = (to_harbour < total) & ~docks
     travelled = torch.where(docks, to_dock, torch.where(leaves, to_harbour, total))
 
-    # While the key is down the virtual press time grows to `duration`; in the glide it runs back to 0.
+    # The time on the speed curve: it grows to `duration` while the key is down and runs back to 0 in the glide.
     in_glide = travelled > pressed
     virtual = duration_for(torch.where(in_glide, (total - travelled) / GLIDE, travelled))
     virtual = torch.minimum(virtual, duration)

@@ -1,14 +1,15 @@
 """The ceiling: for each boat the plan of up to three presses that docks with the most fuel left, without noise.
 
-Distance grows with the cube of the pressing time, so the seconds are concave in the lengths of the legs:
+The distance grows with the cube of the pressing time, so the seconds are concave in the lengths of the legs:
 - The last press is the shortest one that reaches the dock: its glide ends on the dock circle.
 - Consecutive presses use different keys: one long leg takes fewer seconds than the same course in two legs.
-- Detours are dear, so the best plan has as few legs as harbour and dock allow: mostly two, and a fourth never pays.
+- Detours are expensive, so the best plan has as few legs as harbour and dock allow: mostly two, and never four.
 
-What is left to search for are the lengths of the first two of three legs. A leg of length 0 is no press, so the same
-search holds the plans of one and two presses. A coarse grid over every sequence of keys finds the local minima, and
-grids that shrink around the best of them find the optimum. Concavity puts most optima of three presses on the border of
-what is allowed (a leg that ends just short of harbour or dock), so the grid runs along the borders and is denser there.
+This leaves the lengths of the first two of three legs to search for. A leg of length 0 is no press, so the same search
+covers the plans of one and two presses. A coarse grid over every sequence of keys finds the local minima, and shrinking
+grids around the best of them find the optimum. Because of the concavity most optima of three presses lie on the border
+of the feasible region (a leg that ends just short of harbour or dock), so the grid includes the borders and is denser
+there.
 """
 
 from __future__ import annotations
@@ -32,13 +33,12 @@ from hpamdp.env.boatdock.physics import (
 
 MAX_PRESSES = 3
 
-# Every leg keeps this far (px) from harbour and dock and off a course that only grazes the dock, and the last press
-# reaches a little (px) into the dock, so that rounding changes no outcome when a plan is replayed: it moves a boat by
-# about 1e-5 px, and the contact with the dock by 50 times that on the most grazing course left.
-_CLEARANCE = 0.01
-_OVERSHOOT = 0.002
+# Margins (px) that keep rounding from changing an outcome when a plan is replayed. Rounding moves a boat by about 1e-5
+# px, and its contact with the dock by 50 times that on a course that nearly misses it.
+_CLEARANCE = 0.01  # of all legs from harbour circle and dock, and of the last course from missing the dock
+_OVERSHOOT = 0.002  # by which the last press reaches into the dock
 
-# Sequences of three keys without a repetition in a row. No leg of the harbour takes MAX_DURATION.
+# Sequences of three keys of which no two in a row are equal. No leg inside the harbour takes MAX_DURATION.
 _SEQUENCES = [
     (first, second, last)
     for first in range(NUM_KEYS)
@@ -47,12 +47,12 @@ _SEQUENCES = [
     if first != second and second != last
 ]
 
-_GRID = 17  # points a side of the coarse grid
-_MINIMA = 2  # local minima refined for each sequence of keys
-_ZOOM_GRID = 5  # points a side of the shrinking grids
+_GRID = 17  # points along each side of the coarse grid
+_MINIMA = 2  # local minima that are refined, for each sequence of keys
+_ZOOM_GRID = 5  # points along each side of the shrinking grids
 _ZOOM_ROUNDS = 14
-_ZOOM = 0.6  # by which they shrink every round
-_CHUNK = 64  # boats searched together: bounds the memory, and fits the cache
+_ZOOM = 0.6  # factor by which they shrink each round
+_CHUNK = 64  # boats that are searched together: bounds the memory, and fits the cache
 
 
 class Plan(NamedTuple):
@@ -80,7 +80,7 @@ class _Course(NamedTuple):
 
 
 def _reach(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, dir_x: Tensor, dir_y: Tensor) -> Tensor:
-    """Return how long (px) a leg may be that ends at rest inside the harbour and short of the dock."""
+    """Return the length (px) of the longest leg that ends at rest inside the harbour and short of the dock."""
     to_dock = distance_to_dock(x, y, goal_x, goal_y, dir_x, dir_y)
     return (torch.minimum(to_dock, distance_to_harbour(x, y, dir_x, dir_y)) - _CLEARANCE).clamp(min=0.0)
 
@@ -96,44 +96,64 @@ def _durations(course: _Course, first: Tensor, second: Tensor, max_presses: int)
         course: fields broadcast against `first` and `second`.
         first: length of the first leg as a fraction of its reach.
         second: length of the second leg as a fraction of the interval from which the last leg meets the dock.
-        max_presses: with 2 the first leg has length 0, with 1 the second too.
+        max_presses: with 2 the first leg has length 0, with 1 also the second.
     """
-    goal = course.goal_x, course.goal_y
-    first_key, second_key, last_key = course[4:6], course[6:8], course[8:10]
-    reach = _reach(course.x, course.y, *goal, *first_key) if max_presses > 2 else torch.zeros_like(course.x)
-    first_length = first * reach
-    x, y = course.x + first_length * course.first_x, course.y + first_length * course.first_y
+    goal_x = course.goal_x
+    goal_y = course.goal_y
+    if max_presses > 2:
+        first_reach = _reach(course.x, course.y, goal_x, goal_y, course.first_x, course.first_y)
+    else:
+        first_reach = torch.zeros_like(course.x)
+    first_length = first * first_reach
+    x = course.x + first_length * course.first_x
+    y = course.y + first_length * course.first_y
 
-    # How far the dock lies aside of the last leg's line is linear in the second leg's length.
-    aside = (course.goal_x - x) * course.last_y - (course.goal_y - y) * course.last_x
+    # The distance of the dock from the line of the last leg is linear in the length of the second leg.
+    aside = (goal_x - x) * course.last_y - (goal_y - y) * course.last_x
     slope = course.second_x * course.last_y - course.second_y * course.last_x
-    middle, half_width = aside / slope, (DOCK_RADIUS - _CLEARANCE) / slope.abs()
-    reach = _reach(x, y, *goal, *second_key) if max_presses > 1 else torch.zeros_like(x)
-    # A leg of under half the clearance would mend nothing but rounding, at the price of some hundredths of a second.
+    middle = aside / slope
+    half_width = (DOCK_RADIUS - _CLEARANCE) / slope.abs()
+    if max_presses > 1:
+        second_reach = _reach(x, y, goal_x, goal_y, course.second_x, course.second_y)
+    else:
+        second_reach = torch.zeros_like(x)
+    # A leg shorter than half the clearance would only correct rounding, and cost some hundredths of a second.
     shortest = torch.where(middle - half_width > 0.5 * _CLEARANCE, middle - half_width, 0.0)
-    longest = torch.minimum(middle + half_width, reach)
+    longest = torch.minimum(middle + half_width, second_reach)
     second_length = shortest + second * (longest - shortest)
-    x, y = x + second_length * course.second_x, y + second_length * course.second_y
+    x = x + second_length * course.second_x
+    y = y + second_length * course.second_y
 
-    last_length = distance_to_dock(x, y, *goal, *last_key)
-    # The harbour is convex: the boat reaches the dock before it leaves if and only if they meet inside.
-    contact_x, contact_y = x + last_length * course.last_x, y + last_length * course.last_y
-    inside = contact_x.square() + contact_y.square() <= (HARBOUR_RADIUS - _CLEARANCE) ** 2
-    last_seconds = torch.where((shortest <= longest) & inside, press_for(last_length + _OVERSHOOT), torch.inf)
+    last_length = distance_to_dock(x, y, goal_x, goal_y, course.last_x, course.last_y)
+    # The harbour is convex: the boat docks before it leaves if and only if the point of contact lies inside.
+    contact_x = x + last_length * course.last_x
+    contact_y = y + last_length * course.last_y
+    is_inside = contact_x.square() + contact_y.square() <= (HARBOUR_RADIUS - _CLEARANCE) ** 2
+    last_seconds = torch.where((shortest <= longest) & is_inside, press_for(last_length + _OVERSHOOT), torch.inf)
     return _leg_seconds(first_length), _leg_seconds(second_length), last_seconds
 
 
-def _at(course: _Course, index: Tensor) -> _Course:
-    return _Course(*(field.gather(1, index) for field in course))
+def _total_seconds(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> Tensor:
+    """Return the sum of `_durations`."""
+    first_seconds, second_seconds, last_seconds = _durations(course, first, second, max_presses)
+    return first_seconds + second_seconds + last_seconds
 
 
 def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the sequence and the two fractions of each boat's candidates, `[N, S * _MINIMA]`; course `[N, S]`."""
+    """Find the local minima of the coarse grid.
+
+    Args:
+        course: fields `[N, S]`, with a column for each of the S sequences of keys.
+        max_presses: see `_durations`.
+
+    Returns:
+        The index of the sequence and the two fractions of each boat's best minima, `[N, S * _MINIMA]` each.
+    """
     fractions = torch.linspace(0.0, 0.5 * math.pi, _GRID, device=course.x.device).sin().square()  # denser at the ends
-    # Without a first leg its fraction has no meaning, and one row of the grid is enough.
+    # Without a first leg one row of the grid is enough.
     first, second = torch.meshgrid(fractions if max_presses > 2 else fractions[:1], fractions, indexing="ij")
     grid = _Course(*(field[..., None, None] for field in course))
-    seconds = sum(_durations(grid, first, second, max_presses)).expand(*course.x.shape, *first.shape)
+    seconds = _total_seconds(grid, first, second, max_presses).expand(*course.x.shape, *first.shape)
     lowest_nearby = -max_pool2d(-seconds, kernel_size=3, stride=1, padding=1)
     minima = torch.where(seconds <= lowest_nearby, seconds, torch.inf).flatten(2)
     cell = minima.topk(_MINIMA, largest=False).indices.flatten(1)
@@ -142,7 +162,7 @@ def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Te
 
 
 def _zoom(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> tuple[Tensor, Tensor]:
-    """Return the fractions `[N, C]` to which shrinking grids around `first` and `second` lead; course `[N, C]`."""
+    """Refine the fractions `first` and `second` of C candidates, `[N, C]`, by shrinking grids; course `[N, C]`."""
     offset = torch.linspace(-1.0, 1.0, _ZOOM_GRID, device=first.device)
     first_offset, second_offset = torch.cartesian_prod(offset, offset).unbind(1)
     course = _Course(*(field[..., None] for field in course))
@@ -150,16 +170,17 @@ def _zoom(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> t
     for _ in range(_ZOOM_ROUNDS):
         near_first = (first[..., None] + width * first_offset).clamp(0.0, 1.0)
         near_second = (second[..., None] + width * second_offset).clamp(0.0, 1.0)
-        best = sum(_durations(course, near_first, near_second, max_presses)).argmin(-1, keepdim=True)
-        first, second = near_first.gather(-1, best).squeeze(-1), near_second.gather(-1, best).squeeze(-1)
+        best = _total_seconds(course, near_first, near_second, max_presses).argmin(-1, keepdim=True)
+        first = near_first.gather(-1, best).squeeze(-1)
+        second = near_second.gather(-1, best).squeeze(-1)
         width *= _ZOOM
     return first, second
 
 
 def _search(course: _Course, max_presses: int) -> tuple[Tensor, Tensor]:
-    """Return each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`; course `[N, S]`."""
+    """Return the index of each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`; course `[N, S]`."""
     sequence, first, second = _local_minima(course, max_presses)
-    candidates = _at(course, sequence)
+    candidates = _Course(*(field.gather(1, sequence) for field in course))
     first, second = _zoom(candidates, first, second, max_presses)
     durations = torch.stack(_durations(candidates, first, second, max_presses), dim=-1)
     best = durations.sum(-1).argmin(1, keepdim=True)
@@ -179,52 +200,64 @@ def best_plan(
     """Return the best plan of every boat, from wherever it rests.
 
     Args:
-        x, y: the boat at rest, px from the harbour's centre, `[N]`.
-        goal_x, goal_y: the dock's centre, px from the harbour's centre, `[N]`.
+        x, y: position of the boat, at rest, px from the harbour's centre, `[N]`.
+        goal_x, goal_y: centre of the dock, px from the harbour's centre, `[N]`.
         fuel: seconds of pressing left in the tank, `[N]`.
         controller: INCONGRUENT or CONGRUENT, `[N]`.
         keymap: 1 or 2, `[N]`.
-        max_presses: the longest plan considered, 1 to 3.
+        max_presses: of a plan, 1 to 3.
+
+    Raises:
+        ValueError: `max_presses` is out of range.
     """
     if not 1 <= max_presses <= MAX_PRESSES:
         raise ValueError(f"max_presses must be 1 to {MAX_PRESSES}, got {max_presses}")
     sequences = torch.tensor(_SEQUENCES, device=x.device)
-    legs = [direction(controller[:, None], keymap[:, None], key[None, :]) for key in sequences.unbind(1)]
-    boats = [field[:, None].to(torch.float32) for field in (x, y, goal_x, goal_y)]
-    course = _Course(*torch.broadcast_tensors(*boats, *(component for leg in legs for component in leg)))
+    first_key, second_key, last_key = sequences.unbind(1)
+    course = _Course(
+        *torch.broadcast_tensors(
+            x[:, None].to(torch.float32),
+            y[:, None].to(torch.float32),
+            goal_x[:, None].to(torch.float32),
+            goal_y[:, None].to(torch.float32),
+            *direction(controller[:, None], keymap[:, None], first_key),
+            *direction(controller[:, None], keymap[:, None], second_key),
+            *direction(controller[:, None], keymap[:, None], last_key),
+        )
+    )
     chunks = zip(*(field.split(_CHUNK) for field in course), strict=True)
     found = [_search(_Course(*chunk), max_presses) for chunk in chunks]
     keys = sequences[torch.cat([sequence for sequence, _ in found])]
     durations = torch.cat([seconds for _, seconds in found])
 
-    left = fuel.to(torch.float32) - durations.sum(1)
-    solved = left >= 0.0
-    pressed = (durations > 0.0) & solved[:, None]
-    # Legs of length 0 are no presses: the others move to the front.
-    order = (~pressed).to(torch.int8).argsort(dim=1, stable=True)
+    fuel_left = fuel.to(torch.float32) - durations.sum(1)
+    is_solved = fuel_left >= 0.0
+    is_press = (durations > 0.0) & is_solved[:, None]
+    # Legs of length 0 are no presses: move the others to the front.
+    order = (~is_press).to(torch.int8).argsort(dim=1, stable=True)
     return Plan(
-        keys=torch.where(pressed, keys, 0).gather(1, order),
-        durations=torch.where(pressed, durations, 0.0).gather(1, order),
-        num_presses=pressed.sum(1),
-        score=torch.where(solved, 5.0 * fuel_fraction(left), -1.0),
+        keys=torch.where(is_press, keys, 0).gather(1, order),
+        durations=torch.where(is_press, durations, 0.0).gather(1, order),
+        num_presses=is_press.sum(1),
+        score=torch.where(is_solved, 5.0 * fuel_fraction(fuel_left), -1.0),
     )
 
 
 def best_plans(layout: Layout, keymap: Tensor) -> Plan:
-    """Return the best plans from the start with a full tank, `[N, 2]`: INCONGRUENT, then CONGRUENT.
+    """Return the best plans from the start with a full tank, `[N, 2]`: with the incongruent and the congruent boat.
 
     Args:
         layout: fields `[N]`.
         keymap: 1 or 2, `[N]`.
     """
-    options = len(CONTROLLERS)
-    boats = [field.repeat_interleave(options) for field in (*layout, keymap)]
-    fuel = torch.full_like(boats[0], TANK)
+    num_options = len(CONTROLLERS)
+    x, y, goal_x, goal_y, keymaps = (field.repeat_interleave(num_options) for field in (*layout, keymap))
+    fuel = torch.full_like(x, TANK)
     controller = torch.tensor([INCONGRUENT, CONGRUENT], device=fuel.device).repeat(len(keymap))
-    plan = best_plan(*boats[:4], fuel, controller, boats[4])
-    return Plan(*(field.unflatten(0, (len(keymap), options)) for field in plan))
+    plan = best_plan(x, y, goal_x, goal_y, fuel, controller, keymaps)
+    return Plan(*(field.unflatten(0, (len(keymap), num_options)) for field in plan))
 
 
 def better_option(plans: Plan) -> Tensor:
-    """Return the controller whose plan scores higher, `[N]` int64, from `best_plans`."""
+    """Return the controller with the higher score in `best_plans`, int64 `[N]`."""
     return plans.score.argmax(1)

@@ -14,23 +14,31 @@ from hpamdp.env.boatdock import harbour, physics
 
 Point = tuple[float, float]
 
-_BACKGROUND, _WATER, _RIM = "#f6f4ef", "#d6e7ec", "#a5c2cb"
-_INK, _FAINT = "#2d3e48", "#7d8b92"
-_PRESSED, _GLIDE, _HULL = "#2f6690", "#86aecb", "#1d3f58"
+_BACKGROUND = "#f6f4ef"
+_WATER = "#d6e7ec"
+_RIM = "#a5c2cb"
+_INK = "#2d3e48"
+_FAINT = "#7d8b92"
+_PRESSED = "#2f6690"
+_GLIDE = "#86aecb"
+_HULL = "#1d3f58"
 _DOCK, _DOCK_EDGE = "#f4dfb0", "#c8963e"
-_GOOD, _GOOD_EDGE, _BAD, _BAD_EDGE = "#c3e3c6", "#3c8a55", "#f1cbbd", "#b9503a"
-_LOW_FUEL = 0.25
+_GOOD, _GOOD_EDGE = "#c3e3c6", "#3c8a55"
+_BAD, _BAD_EDGE = "#f1cbbd", "#b9503a"
+_GAUGE_COLOUR = "#e3e1da"
+_LOW_FUEL = 0.25  # below it the gauge turns red
 
-# Shapes are drawn _SMOOTH times too large and averaged down; text comes after, because Pillow smooths text itself.
+# Shapes are drawn _SMOOTH times too large and averaged down. Text is written afterwards: Pillow smooths it itself.
 _SMOOTH = 3
-_PAPER = 480.0  # units of paper from edge to edge, whatever the picture's size
-_SCALE = 1.66  # units of paper a px of the harbour's plane
-_COMPASS, _ARROW = (54.0, 403.0), 26.0  # where the keys' arrows start, and their length
-_GAUGE = (346.0, 18.0, 462.0, 28.0)
+_PAPER = 480.0  # units of paper from edge to edge, whatever the size of the picture
+_SCALE = 1.66  # units of paper for each px of the harbour
+_COMPASS = (54.0, 403.0)  # where the arrows of the keys start
+_ARROW = 26.0  # their length
+_GAUGE = (346.0, 18.0, 462.0, 28.0)  # left, top, right, bottom
 
 
 class Leg(NamedTuple):
-    """One press: px from the harbour's centre, and the share of the way that the key was down."""
+    """The track of one press: px from the harbour's centre, and the share of it during which the key was down."""
 
     start: Point
     end: Point
@@ -43,14 +51,14 @@ class Scene:
 
     Attributes:
         start, goal, boat: positions.
-        heading: where the bow points, of any length; (0, 0) before the first press.
+        heading: direction of the bow, of any length; (0, 0) before the first press.
         legs: the track so far.
         fuel: fraction of the tank.
-        presses: how many presses so far.
-        controller: 0, 1, or -1 while none is chosen.
+        presses: number of presses so far.
+        controller: 0, 1, or -1 before one is chosen.
         keymap: 1 or 2.
-        outcome: a name out of `physics.OUTCOMES`.
-        score: shown where it is given.
+        outcome: one of `physics.OUTCOMES`.
+        score: shown at the end of an episode, unless it is None.
     """
 
     start: Point
@@ -67,7 +75,7 @@ class Scene:
 
 
 class _Canvas:
-    """A picture addressed in units of paper, so that one code draws every size."""
+    """A picture addressed in units of paper, so that the same code draws every size."""
 
     def __init__(self, image: Image.Image) -> None:
         self.image = image
@@ -133,10 +141,12 @@ def _along(start: Point, end: Point, share: float) -> Point:
 
 
 def _colours(scene: Scene) -> tuple[str, str]:
-    """Return fill and edge of what carries the outcome."""
+    """Return the fill and edge colours that show the outcome."""
     if scene.outcome == physics.OUTCOMES[physics.SUCCESS]:
         return _GOOD, _GOOD_EDGE
-    return (_DOCK, _DOCK_EDGE) if scene.outcome == physics.OUTCOMES[physics.SAILING] else (_BAD, _BAD_EDGE)
+    if scene.outcome == physics.OUTCOMES[physics.SAILING]:
+        return _DOCK, _DOCK_EDGE
+    return _BAD, _BAD_EDGE
 
 
 def _draw_places(canvas: _Canvas, scene: Scene) -> None:
@@ -162,24 +172,26 @@ def _draw_boat(canvas: _Canvas, scene: Scene) -> None:
     if length == 0.0:
         canvas.disc((x, y), 7.0, _HULL, _BACKGROUND, 1.6)
         return
-    forth_x, forth_y = scene.heading[0] / length, scene.heading[1] / length
-    # A hull seen from above, bow first: (forward, sideways) in units of paper.
+    forward_x = scene.heading[0] / length
+    forward_y = scene.heading[1] / length
+    # The hull from above, from the bow around: (forward, sideways) in units of paper.
     hull = [(13.0, 0.0), (7.5, 4.6), (0.0, 6.2), (-9.0, 5.0), (-9.0, -5.0), (0.0, -6.2), (7.5, -4.6)]
-    turned = [(x + f * forth_x - s * forth_y, y + f * forth_y + s * forth_x) for f, s in hull]
+    turned = [(x + f * forward_x - s * forward_y, y + f * forward_y + s * forward_x) for f, s in hull]
     canvas.polygon(turned, _HULL, _BACKGROUND, 1.6)
-    canvas.disc((x - 3.0 * forth_x, y - 3.0 * forth_y), 2.4, _BACKGROUND)
+    canvas.disc((x - 3.0 * forward_x, y - 3.0 * forward_y), 2.4, _BACKGROUND)
 
 
 def _draw_gauge(canvas: _Canvas, fuel: float) -> None:
     left, top, right, bottom = _GAUGE
-    canvas.bar(_GAUGE, "#e3e1da")
+    canvas.bar(_GAUGE, _GAUGE_COLOUR)
     if fuel > 0.0:
-        # Never narrower than high, or the round ends would not fit.
+        # At least as wide as high, so that the round ends fit.
         width = max(fuel * (right - left), bottom - top)
         canvas.bar((left, top, left + width, bottom), _PRESSED if fuel >= _LOW_FUEL else _BAD_EDGE)
 
 
 def _directions(scene: Scene) -> tuple[Point, ...]:
+    """Return the directions of the keys; none before a controller is chosen."""
     if scene.controller == harbour.NOT_CHOSEN:
         return ()
     return harbour.DIRECTIONS[2 if scene.controller == harbour.CONGRUENT else scene.keymap - 1]

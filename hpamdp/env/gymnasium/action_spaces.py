@@ -1,16 +1,18 @@
-"""Gymnasium's parameterised action spaces, read as keys whose parameters lie side by side.
+"""Gymnasium's parameterised action spaces: discrete actions whose parameters lie side by side in one vector.
 
-Accepted are a `Tuple` that begins with a `Discrete(K)`, the keys, and a `Dict` of a `Discrete(K)` and one other entry,
-whatever their names. A `Discrete` may start anywhere. The parameters are one of these:
+Accepted are a `Tuple` that begins with a `Discrete(K)`, the discrete actions, and a `Dict` of a `Discrete(K)` and one
+other entry, with any names. The `Discrete` may have any `start`. The parameters are one of these:
 
-- a `Tuple` of K boxes, one a key: `Tuple(Discrete(K), Tuple(Box, ...))` is the field's convention. A key without
-  parameters has a box of shape `(0,)`. In a `Tuple` the K boxes may also follow the `Discrete` directly.
-- a `Dict` of K boxes, which belong to the keys in the space's order (Gymnasium sorts the names of a plain dict), or, if
-  all names end in different numbers, in the order of these.
-- one `Box` for all keys. With `parameter_dims` it is split among the keys, side by side, and always passed whole.
-  Without, every key takes the whole box: our action holds a copy of it for each key, and the pressed key's is passed.
+- a `Tuple` of K boxes, one for each discrete action: `Tuple(Discrete(K), Tuple(Box, ...))` is the field's convention. A
+  discrete action without parameters has a box of shape `(0,)`. In a `Tuple` the K boxes may also follow the `Discrete`
+  directly.
+- a `Dict` of K boxes, which belong to the discrete actions in the order of the space (Gymnasium sorts the names of a
+  plain dict) or, if all names end in different numbers, in the order of these numbers.
+- one `Box` for all discrete actions. With `parameter_dims` it is split among them, side by side, and always passed as a
+  whole. Without, each discrete action takes the whole box: the vector holds one copy for each, and the chosen action's
+  copy is passed.
 
-Boxes hold floats within finite bounds, in any shape.
+Boxes hold floats with finite bounds, in any shape.
 """
 
 from __future__ import annotations
@@ -25,23 +27,23 @@ from gymnasium import spaces
 
 _ACCEPTED = (
     "accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P, where P is a Tuple or a Dict of K Boxes or "
-    "one Box for all keys, and Tuple(Discrete(K), Box, ..., Box) with K Boxes"
+    "one Box for all discrete actions, and Tuple(Discrete(K), Box, ..., Box) with K Boxes"
 )
 
 
 class ActionSpace:
-    """A parameterised action space, and how its actions are made from a key and the parameters of all keys.
+    """A parameterised action space, and the way from a discrete action and its parameters to the space's own format.
 
     Args:
         space: see the module's docstring.
-        parameter_dims: how many parameters each key takes of one box for all keys.
+        parameter_dims: number of parameters that each discrete action takes of one box for all.
 
     Attributes:
-        parameter_dims: how many parameters each key takes, K entries.
-        low, high: the parameters' bounds, float32 `[sum(parameter_dims)]`.
+        parameter_dims: number of parameters of each discrete action, K entries.
+        low, high: bounds of the parameters, float32 `[sum(parameter_dims)]`.
 
     Raises:
-        ValueError: the space is none of those, or its box cannot be split that way.
+        ValueError: the space has none of the accepted forms, or its box cannot be split as `parameter_dims` says.
     """
 
     def __init__(self, space: spaces.Space, parameter_dims: Sequence[int] | None = None) -> None:
@@ -51,7 +53,7 @@ class ActionSpace:
         self._has_one_box = isinstance(parameters, spaces.Box)
         self._box_names, self._boxes = self._read_boxes(parameters)
         if not self._has_one_box and len(self._boxes) != num_discrete:
-            raise self._refusal(f"{num_discrete} keys, but {len(self._boxes)} Boxes")
+            raise self._refusal(f"{num_discrete} discrete actions, but {len(self._boxes)} Boxes")
         if parameter_dims is not None:
             self._check_split(parameter_dims, num_discrete)
         elif self._has_one_box:
@@ -60,35 +62,38 @@ class ActionSpace:
         self._slices = [slice(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
         self.parameter_dims = tuple(sizes if parameter_dims is None else parameter_dims)
         if sum(self.parameter_dims) == 0:
-            raise self._refusal("no key has a parameter")
+            raise self._refusal("no discrete action has a parameter")
         self.low = np.concatenate([_float32(box.low) for box in self._boxes])
         self.high = np.concatenate([_float32(box.high) for box in self._boxes])
 
-    def to_native(self, key: int, parameters: np.ndarray) -> Any:
-        """Return the space's action for a key in 0..K-1 and the parameters `[sum(parameter_dims)]` of all keys.
+    def to_native(self, discrete: int, parameters: np.ndarray) -> Any:
+        """Return an action in the space's own format.
 
-        Values outside their bounds are clipped; a NaN, which is no value, becomes the lower bound.
+        Args:
+            discrete: the discrete action, 0 to K - 1.
+            parameters: of all discrete actions, `[sum(parameter_dims)]`. Values outside their bounds are clipped; NaN
+                becomes the lower bound.
         """
-        pressed = self._discrete.dtype.type(self._discrete.start + key)
+        native_discrete = self._discrete.dtype.type(self._discrete.start + discrete)
         values: Any
         if self._has_one_box:
-            index = key % len(self._boxes)
+            index = discrete % len(self._boxes)  # 0 where the box is split: there is only one then
             values = _fill(self._boxes[index], parameters[self._slices[index]])
         else:
             values = tuple(_fill(box, parameters[own]) for box, own in zip(self._boxes, self._slices, strict=True))
             if self._box_names is not None:
                 values = dict(zip(self._box_names, values, strict=True))
         if self._part_names is not None:
-            return dict(zip(self._part_names, (pressed, values), strict=True))
-        return (pressed, *values) if self._is_flat else (pressed, values)
+            return dict(zip(self._part_names, (native_discrete, values), strict=True))
+        return (native_discrete, *values) if self._is_flat else (native_discrete, values)
 
     def _read_parts(self) -> tuple[spaces.Discrete, spaces.Space]:
-        """Return the keys and the parameters, and keep how the two make an action."""
+        """Return the space of the discrete actions and that of the parameters, and note how the two are combined."""
         space = self._space
         self._part_names: tuple[str, str] | None = None
         self._is_flat = False
         if isinstance(space, spaces.Dict) and len(space.spaces) == 2:
-            # The Discrete first, if it is the only one.
+            # Stable: puts the Discrete first, and keeps the order if both or neither are one.
             names = sorted(space.spaces, key=lambda name: not isinstance(space.spaces[name], spaces.Discrete))
             self._part_names = (names[0], names[1])
             parts = [space.spaces[name] for name in names]
@@ -98,33 +103,37 @@ class ActionSpace:
         else:
             raise self._refusal("not of these forms")
         if not isinstance(parts[0], spaces.Discrete):
-            raise self._refusal("no Discrete for the keys")
+            raise self._refusal("no Discrete for the discrete actions")
         return parts[0], spaces.Tuple(parts[1:]) if self._is_flat else parts[1]
 
     def _read_boxes(self, parameters: spaces.Space) -> tuple[list[str] | None, list[spaces.Box]]:
+        """Return the parameters' boxes in the order of the discrete actions, and their names if they have some."""
         names = None
         if isinstance(parameters, spaces.Dict):
             names = _in_order(list(parameters.spaces))
-            boxes = [parameters.spaces[name] for name in names]
+            parts = [parameters.spaces[name] for name in names]
         elif isinstance(parameters, spaces.Tuple):
-            boxes = list(parameters.spaces)
+            parts = list(parameters.spaces)
         else:
-            boxes = [parameters]
-        for box in boxes:
-            if not isinstance(box, spaces.Box) or box.dtype.kind != "f":
-                raise self._refusal("parameters must be Boxes of floats")
-            low, high = _float32(box.low), _float32(box.high)
-            with np.errstate(over="ignore", invalid="ignore"):
-                if not np.isfinite(high - low).all():
-                    raise self._refusal("parameters must have finite bounds")
-            if not (low < high).all():
-                raise self._refusal("a parameter's lower bound must be less than its upper one")
-        return names, boxes
+            parts = [parameters]
+        return names, [self._checked_box(part) for part in parts]
+
+    def _checked_box(self, box: spaces.Space) -> spaces.Box:
+        if not isinstance(box, spaces.Box) or box.dtype.kind != "f":
+            raise self._refusal("parameters must be Boxes of floats")
+        low = _float32(box.low)
+        high = _float32(box.high)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if not np.isfinite(high - low).all():
+                raise self._refusal("parameters must have finite bounds")
+        if not (low < high).all():
+            raise self._refusal("a parameter's lower bound must be less than its upper bound")
+        return box
 
     def _check_split(self, parameter_dims: Sequence[int], num_discrete: int) -> None:
         given = f"parameter_dims={list(parameter_dims)}"
         if not self._has_one_box:
-            raise self._refusal(f"{given} goes with one Box for all keys, but there is a Box for each")
+            raise self._refusal(f"{given} is for one Box for all discrete actions, but each has a Box of its own")
         size = int(np.prod(self._boxes[0].shape))
         if len(parameter_dims) != num_discrete or min(parameter_dims) < 0 or sum(parameter_dims) != size:
             allowed = f"{num_discrete} numbers of at least 0 that add up to {size}"
@@ -135,7 +144,7 @@ class ActionSpace:
 
 
 def _in_order(names: list[str]) -> list[str]:
-    """Return names in the order of the numbers in which they end, if all end in different ones, else as they are."""
+    """Return the names in the order of the numbers at their ends if these all differ, else in the order given."""
     endings = [re.search(r"\d+$", str(name)) for name in names]
     numbers = [int(ending.group()) for ending in endings if ending is not None]
     if len(set(numbers)) < len(names):
@@ -144,7 +153,8 @@ def _in_order(names: list[str]) -> list[str]:
 
 
 def _fill(box: spaces.Box, values: np.ndarray) -> np.ndarray:
-    # In the box's own precision, in which its bounds may lie a rounding within the float32 ones. fmax passes NaN by.
+    """Return the values clipped to the box, in its shape and dtype; NaN becomes the lower bound."""
+    # Clipped in the box's own precision: its bounds may differ from the float32 ones by rounding. fmax skips NaN.
     values = np.fmin(np.fmax(values.astype(box.dtype), box.low.ravel()), box.high.ravel())
     return values.reshape(box.shape)
 
@@ -155,5 +165,5 @@ def _float32(bounds: np.ndarray) -> np.ndarray:
 
 
 def written(space: spaces.Space) -> str:
-    """Return a space in one line, for an error."""
+    """Return a space as one line of text, for an error."""
     return textwrap.shorten(repr(space), 300, placeholder=" ...")

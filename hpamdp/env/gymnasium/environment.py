@@ -1,4 +1,4 @@
-"""The way in: other people's Gymnasium environments with parameterised actions, as one batched TorchRL environment."""
+"""Any Gymnasium environment with parameterised actions, as one batched TorchRL environment."""
 
 from __future__ import annotations
 
@@ -16,41 +16,45 @@ from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
 
 from hpamdp import keys
+from hpamdp.env.actions import check_action_values
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.four_value import FourValueEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
+from hpamdp.messages import one_line
 
-_SUCCESS, _SEED = "success", "seed"
-# The seeds of training and of evaluation's fixed episodes come from streams of their own.
+_SUCCESS = "success"
+_SEED = "seed"
+# Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
 
 
 class GymnasiumEnv(PAMDPEnv):
-    """Play `num_envs` copies of a Gymnasium environment, one after another in this process.
+    """`num_envs` copies of a Gymnasium environment, stepped one after another in this process.
 
-    Which spaces are accepted, and what becomes of them, is told in `hpamdp.env.gymnasium.action_spaces` and
-    `hpamdp.env.gymnasium.observation_spaces`. Parameters outside their bounds are clipped; the pressed key's must be finite. The
-    leaf `success` bool `[N]` is what a step's info says under `is_success` or `success`, False if it says nothing.
+    `hpamdp.env.gymnasium.action_spaces` and `hpamdp.env.gymnasium.observation_spaces` tell which spaces are accepted
+    and how they are converted. Parameters outside their bounds are clipped; those of the chosen action must be finite.
+    The leaf `success` bool `[N]` is `is_success` or `success` in the info of a step, False if it has neither.
 
-    A copy's first reset has a seed made from `seed` and the copy's number, those that follow have none. `reset` also
-    takes the seeds to use: a tensordict with `seed` int `[N]`.
+    A copy's first reset is seeded from `seed` and the copy's number, later resets are not seeded. `reset` also takes
+    the seeds to use: a tensordict with `seed` int `[N]`.
 
     Args:
-        num_envs: how many copies.
+        num_envs: number of copies.
         id: as `gymnasium.make` takes it; with `module:Name-v0` the module, which registers the name, is imported.
-        entry_point: instead of `id`, a class or function, `package.module:name`, that gives the environment. One that
-            is no `gymnasium.Env` is taken to have the old four-value interface of `gym`: see `FourValueEnv`.
-        kwargs: what the environment is made with.
-        max_steps: episodes are truncated after that many steps; None: by the environment's own time limit.
-        parameter_dims: how many parameters each key takes of one box for all keys; None: each takes the whole box.
+        entry_point: instead of `id`, a class or function `package.module:name` that returns the environment. An
+            environment that is no `gymnasium.Env` must have the four-value interface of `gym`: see `FourValueEnv`.
+        kwargs: passed to the environment's constructor.
+        max_steps: steps after which an episode is truncated; None: the environment's own time limit.
+        parameter_dims: how many parameters each discrete action takes of one box for all; None: each takes the whole
+            box.
         observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
-        device: where the tensors live.
-        seed: see above.
-        first_env: number of the first copy, where other processes have those before.
+        device: of the tensors.
+        seed: of the episodes, see above.
+        first_env: number of the first copy, where other processes have the copies before it.
 
     Raises:
-        ValueError: an argument, a space or an action that cannot be; after such an action no copy has moved.
+        ValueError: an argument, a space or an action is invalid; after an invalid action no copy has moved.
     """
 
     result_keys = (_SUCCESS,)
@@ -71,10 +75,11 @@ class GymnasiumEnv(PAMDPEnv):
     ) -> None:
         _check_arguments(num_envs, id, entry_point, max_steps)
         super().__init__(device=device, batch_size=[num_envs])
-        self.num_envs, self.first_env = num_envs, first_env
+        self.num_envs = num_envs
+        self.first_env = first_env
         self._name = f"GymnasiumEnv: {id if entry_point is None else entry_point}"
         self.envs = [self._make(id, entry_point, kwargs or {}, max_steps) for _ in range(num_envs)]
-        self.is_closed = False  # from here on there is something to close
+        self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         limit = getattr(self.envs[0].spec, "max_episode_steps", None) if max_steps is None else max_steps
         if limit is None:
             raise ValueError(f"{self._name}: has no time limit of its own; set env.max_steps")
@@ -86,52 +91,56 @@ class GymnasiumEnv(PAMDPEnv):
             raise ValueError(f"{self._name}: {error}") from error
         self.parameter_dims = self._actions.parameter_dims
         self._make_specs()
-        self._seen = np.zeros((num_envs, self.observations.dim), np.float32)
-        self._terminated, self._truncated, self._success = np.zeros((3, num_envs), bool)
-        self._tells_success = False
+        self._observation = np.zeros((num_envs, self.observations.dim), np.float32)
+        self._terminated = np.zeros(num_envs, bool)
+        self._truncated = np.zeros(num_envs, bool)
+        self._success = np.zeros(num_envs, bool)
+        self._reports_success = False
         self._set_seed(seed)
 
     @property
     def is_shardable(self) -> bool:
-        """Whether no running statistics are kept."""
+        """Whether no running statistics are kept, which all environments must share."""
         return self.observations.statistics is None
 
     def fixed_episodes(self, seed: int) -> TensorDict:
-        """Return seeds to `reset` with, one for each copy, other than those with which training begins."""
+        """Return seeds to `reset` with, one for each copy, from another stream than those of training."""
         seeds = torch.tensor(_seeds(seed, self.num_envs, _FIXED), device=self.device)
         return TensorDict({_SEED: seeds}, batch_size=self.batch_size, device=self.device)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return `success` bool `[M]`, if the info of any step so far told it."""
-        self._tells_success |= bool(last.get(_SUCCESS).any())  # steps in another process
-        return {_SUCCESS: last.get(_SUCCESS)} if self._tells_success else {}
+        """Return `success` bool `[M]` if any info so far had it."""
+        success = last.get(_SUCCESS)
+        # A success in `last` may have been reported to a copy in another process.
+        self._reports_success |= bool(success.any())
+        return {_SUCCESS: success} if self._reports_success else {}
 
     def set_scaling_from(self, other: GymnasiumEnv) -> None:
-        """Scale observations by the running statistics of `other`, now and in future, and add nothing to them.
+        """Scale observations by the running statistics of `other`, now and later, without updating them.
 
-        Without running statistics that changes nothing.
+        Without running statistics this changes nothing.
 
         Raises:
-            ValueError: the two scale differently, or have other observations.
+            ValueError: the two differ in their scaling or in the length of their observations.
         """
         self.observations.share(other.observations)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the running statistics, if there are some; where episodes stand cannot be had."""
+        """Return the running statistics, if there are any; the state of the episodes is unknown."""
         statistics = self.observations.statistics
         return {} if statistics is None else statistics.columns()
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Go on with running statistics; episodes start anew.
+        """Continue with saved running statistics; new episodes start.
 
         Raises:
-            ValueError: they are of other observations.
+            ValueError: the statistics are of observations of another length.
         """
         if self.observations.statistics is not None and columns:
             self.observations.statistics.set_columns(columns)
 
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
-        """Take saved running statistics, which are all that the state columns are."""
+        """Continue with saved running statistics: they are the whole `env_state`."""
         self.set_env_state(columns)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
@@ -144,32 +153,35 @@ class GymnasiumEnv(PAMDPEnv):
     def _make(
         self, id: str | None, entry_point: str | None, kwargs: Mapping[str, Any], max_steps: int | None
     ) -> gymnasium.Env:
-        kwargs = copy.deepcopy(dict(kwargs))  # no copy of the environment may change another's
+        kwargs = copy.deepcopy(dict(kwargs))  # the copies of the environment must not share what they may change
         try:
             if entry_point is None:
+                assert id is not None  # checked by `_check_arguments`
                 return gymnasium.make(id, max_episode_steps=max_steps, disable_env_checker=True, **kwargs)
             env = self._load(entry_point)(**kwargs)
         except (gymnasium.error.Error, ImportError) as error:
-            raise ValueError(f"{self._name}: {_one_line(error)}") from error
+            raise ValueError(f"{self._name}: {one_line(error)}") from error
         except TypeError as error:
-            cause = error.__cause__ or error  # Gymnasium raises what a constructor raises anew
+            cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
             if not _is_about_the_call(cause):
                 raise
-            raise ValueError(f"{self._name}: {_one_line(cause)}") from error
-        env = env if isinstance(env, gymnasium.Env) else FourValueEnv(env)
+            raise ValueError(f"{self._name}: {one_line(cause)}") from error
+        if not isinstance(env, gymnasium.Env):
+            env = FourValueEnv(env)
         return env if max_steps is None else gymnasium.wrappers.TimeLimit(env, max_steps)
 
     def _load(self, entry_point: str) -> Any:
         module_name, _, name = entry_point.partition(":")
         if not all(part.isidentifier() for part in (*module_name.split("."), name)):
             raise ValueError(f"{self._name}: must be a class or function, as package.module:name")
-        made = getattr(importlib.import_module(module_name), name, None)
-        if not callable(made):
+        entry = getattr(importlib.import_module(module_name), name, None)
+        if not callable(entry):
             raise ValueError(f"{self._name}: there is no class or function {name} in {module_name}")
-        return made
+        return entry
 
     def _make_specs(self) -> None:
-        n, device = self.num_envs, self.device
+        n = self.num_envs
+        device = self.device
         self.observation_spec = Composite(
             {
                 keys.OBSERVATION: Unbounded(shape=(n, self.observations.dim), device=device),
@@ -177,11 +189,14 @@ class GymnasiumEnv(PAMDPEnv):
             },
             shape=(n,),
         )
-        self.action_spec = self.make_action_spec(*map(torch.from_numpy, (self._actions.low, self._actions.high)))
+        low = torch.from_numpy(self._actions.low)
+        high = torch.from_numpy(self._actions.high)
+        self.action_spec = self.make_action_spec(low, high)
         self.reward_spec = Unbounded(shape=(n, 1), device=device)
         self.done_spec = self.make_done_spec()
 
     def _set_seed(self, seed: int | None) -> None:
+        # Of each copy's next reset; None after its first one.
         self._next_seeds: list[int | None] = [
             *_seeds(0 if seed is None else seed, self.num_envs, _TRAINING, self.first_env)
         ]
@@ -191,48 +206,42 @@ class GymnasiumEnv(PAMDPEnv):
         given = None if tensordict is None else tensordict.get(_SEED, None)
         if given is not None and (given.shape != (self.num_envs,) or given.is_floating_point() or (given < 0).any()):
             raise ValueError(f"reset: {_SEED} must be integers of at least 0 in shape [{self.num_envs}]")
-        rows, seen = np.arange(self.num_envs) if mask is None else _rows(mask), []
+        rows = list(range(self.num_envs)) if mask is None else _rows(mask)
+        observations = []
         for row in rows:
             seed = self._next_seeds[row] if given is None else given[row].item()
             self._next_seeds[row] = None
-            seen.append(self._flat(row, self.envs[row].reset(seed=seed)[0]))
-        self._keep(rows, seen)
-        for flags in (self._terminated, self._truncated, self._success):
-            flags[rows] = False
+            observation, _ = self.envs[row].reset(seed=seed)
+            observations.append(self._flat(row, observation))
+        self._keep(rows, observations)
+        self._terminated[rows] = False
+        self._truncated[rows] = False
+        self._success[rows] = False
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        pressed, parameters = self._checked_action(tensordict)
-        is_on = ~(self._terminated | self._truncated)
-        if "_step" in tensordict.keys():
-            is_on &= np.isin(np.arange(self.num_envs), _rows(tensordict.get("_step")))
-        rows, seen, rewards = is_on.nonzero()[0], [], np.zeros((self.num_envs, 1), np.float32)
-        for row in rows:
-            action = self._actions.to_native(int(pressed[row]), parameters[row])
-            observation, reward, terminated, truncated, info = self.envs[row].step(action)
-            seen.append(self._flat(row, observation))
-            rewards[row] = np.asarray(reward).item()
-            self._terminated[row], self._truncated[row] = terminated, truncated and not terminated
-            told = info.get("is_success", info.get(_SUCCESS))
-            self._tells_success |= told is not None
-            self._success[row] = bool(told)
-        self._keep(rows, seen)
-        return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device))
-
-    def _checked_action(self, tensordict: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
-        """Return the keys `[N]` and the parameters `[N, num_parameters]`."""
         self.check_action(tensordict)
-        dims = self.parameter_dims
-        pressed, parameters = (tensordict.get(name).detach().cpu().numpy() for name in (keys.DISCRETE, keys.PARAMETERS))
-        is_own = np.repeat(np.arange(len(dims)), dims) == pressed[:, None]
-        is_action = (pressed >= 0) & (pressed < len(dims)) & (np.isfinite(parameters) | ~is_own).all(-1)
-        if not is_action.all():
-            row = (~is_action).nonzero()[0][0]
-            raise ValueError(
-                f"step: environment {row} got discrete={pressed[row]} (allowed 0 to {len(dims) - 1}), "
-                f"parameters={parameters[row].tolist()} (the pressed key's must be finite)"
-            )
-        return pressed, parameters
+        check_action_values(tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS), self.parameter_dims)
+        discrete = tensordict.get(keys.DISCRETE).tolist()
+        parameters = tensordict.get(keys.PARAMETERS).detach().cpu().numpy()
+        is_running = ~(self._terminated | self._truncated)
+        if "_step" in tensordict.keys():
+            is_running &= np.isin(np.arange(self.num_envs), _rows(tensordict.get("_step")))
+        rows = is_running.nonzero()[0].tolist()
+        observations = []
+        rewards = np.zeros((self.num_envs, 1), np.float32)
+        for row in rows:
+            action = self._actions.to_native(discrete[row], parameters[row])
+            observation, reward, terminated, truncated, info = self.envs[row].step(action)
+            observations.append(self._flat(row, observation))
+            rewards[row] = np.asarray(reward).item()
+            self._terminated[row] = terminated
+            self._truncated[row] = truncated and not terminated
+            success = info.get("is_success", info.get(_SUCCESS))
+            self._reports_success |= success is not None
+            self._success[row] = bool(success)
+        self._keep(rows, observations)
+        return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device))
 
     def _flat(self, row: int, observation: Any) -> np.ndarray:
         try:
@@ -240,16 +249,20 @@ class GymnasiumEnv(PAMDPEnv):
         except ValueError as error:
             raise ValueError(f"{self._name}: environment {row}: {error}") from error
 
-    def _keep(self, rows: np.ndarray, seen: list[np.ndarray]) -> None:
-        if seen:
-            self._seen[rows] = self.observations.scaled(np.stack(seen))
+    def _keep(self, rows: list[int], observations: list[np.ndarray]) -> None:
+        """Scale the new observations of these rows and keep them."""
+        if observations:
+            self._observation[rows] = self.observations.scaled(np.stack(observations))
 
     def _read(self) -> TensorDict:
-        flags = {keys.TERMINATED: self._terminated, keys.TRUNCATED: self._truncated}
-        flags[keys.DONE] = self._terminated | self._truncated
-        leaves = {keys.OBSERVATION: self._seen, _SUCCESS: self._success}
-        leaves |= {name: flag[:, None] for name, flag in flags.items()}
-        # Copies, so that the next step changes nothing that was returned.
+        leaves = {
+            keys.OBSERVATION: self._observation,
+            _SUCCESS: self._success,
+            keys.TERMINATED: self._terminated[:, None],
+            keys.TRUNCATED: self._truncated[:, None],
+            keys.DONE: (self._terminated | self._truncated)[:, None],
+        }
+        # torch.tensor copies, so that the next step does not change what was returned.
         tensors = {name: torch.tensor(leaf, device=self.device) for name, leaf in leaves.items()}
         return TensorDict(tensors, batch_size=self.batch_size, device=self.device)
 
@@ -265,20 +278,17 @@ def _check_arguments(num_envs: int, id: str | None, entry_point: str | None, max
 
 
 def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:
-    """Return a seed for each of `num` copies from number `first` on, in 31 bits, which every generator takes."""
+    """Return 31-bit seeds, which every generator takes, for the `num` copies from number `first` on."""
     rows = range(first, first + num)
     return [int(np.random.SeedSequence((seed, row, stream)).generate_state(1)[0] >> 1) for row in rows]
 
 
-def _rows(mask: Tensor) -> np.ndarray:
-    return mask.reshape(-1).nonzero().squeeze(-1).cpu().numpy()
+def _rows(mask: Tensor) -> list[int]:
+    """Return the rows of a mask `[N]` or `[N, 1]` that are True."""
+    return mask.reshape(-1).nonzero().squeeze(-1).tolist()
 
 
 def _is_about_the_call(error: BaseException) -> bool:
-    """Return whether an error is about the arguments of a call from here or from Gymnasium, not from deeper inside."""
+    """Return whether a TypeError is about a call's arguments: raised by the caller, here or in Gymnasium."""
     frame, _ = list(traceback.walk_tb(error.__traceback__))[-1]
     return frame.f_globals["__name__"] in (__name__, "gymnasium.envs.registration")
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -1,7 +1,8 @@
-"""The best mean payoff, but for a share of random choices that falls.
+"""The option with the highest mean reward, and a random option with a probability that falls over time.
 
-Source: Sutton and Barto 2018, *Reinforcement Learning: An Introduction*, section 2.2; the share that falls with 1 / t:
-Auer, Cesa-Bianchi and Fischer 2002, figure 3. Forgetting forms: see `Payoffs`.
+Source: Sutton and Barto 2018, *Reinforcement Learning: An Introduction*, section 2.2; probability proportional to
+1 / t: Auer, Cesa-Bianchi and Fischer 2002, *Finite-time analysis of the multiarmed bandit problem*, figure 3.
+Forgetting: see `RewardStatistics`.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class EpsilonGreedy(Bandit):
-    """Choose at random with probability epsilon(t), else the option with the highest mean payoff.
+    """Choose a random option with probability epsilon(t), else the option with the highest mean reward.
 
     Args:
         specs: of the problem.
-        epsilon_scale: epsilon(t) = epsilon_scale / t at decision t, between `epsilon_final` and 1.
-        epsilon_final: where it ends; for payoffs that stand still 0 is right.
-        memory, discount, window: which payoffs count, as in `Payoffs`.
+        epsilon_scale: epsilon(t) = epsilon_scale / t at decision t, clipped to [`epsilon_final`, 1].
+        epsilon_final: lower bound of epsilon(t); 0 suits stationary rewards.
+        memory, discount, window: which rewards count, as in `RewardStatistics`.
     """
 
     def __init__(
@@ -36,12 +37,14 @@ class EpsilonGreedy(Bandit):
         window: PositiveInt,
     ) -> None:
         super().__init__(specs, memory, discount, window)
-        self.epsilon_scale, self.epsilon_final = epsilon_scale, epsilon_final
+        self.epsilon_scale = epsilon_scale
+        self.epsilon_final = epsilon_final
 
     def sample(self, num: int) -> Tensor:
-        """Return `num` choices."""
-        device = self.rewards.counts.device
-        time = self.rewards.num_decisions + torch.arange(1, num + 1, device=device)
-        is_random = torch.rand(num, device=device) < (self.epsilon_scale / time).clamp(self.epsilon_final, 1.0)
+        """Return `num` choices; all are random as long as an option is untried."""
+        device = self.statistics.counts.device
+        time = self.statistics.num_decisions + torch.arange(1, num + 1, device=device)
+        epsilon = (self.epsilon_scale / time).clamp(self.epsilon_final, 1.0)
+        is_random = torch.rand(num, device=device) < epsilon
         anything = torch.randint(self.specs.num_options, (num,), device=device)
-        return torch.where(is_random | self.rewards.is_untried.any(), anything, self.best())
+        return torch.where(is_random | self.statistics.is_untried.any(), anything, self.best())

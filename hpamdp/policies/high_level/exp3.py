@@ -1,14 +1,16 @@
-"""Exp3: exponential weights over importance-weighted payoffs, which holds against payoffs that drift in any way.
+"""Exp3: exponential weights over importance-weighted rewards, for rewards that change in any way.
 
 Source: Auer, Cesa-Bianchi, Freund and Schapire 2002, *The nonstochastic multiarmed bandit problem*, figure 1.
 
 Differs from the source:
-- payoffs are scaled to [0, 1] by the range seen so far;
-- the gains may be discounted or limited to a window (see `Payoffs`), where Exp3.S mixes the weights;
-- many decisions are due at once; each payoff counts with the probability under which its option was chosen.
+- rewards are scaled to [0, 1] by the range seen so far;
+- gains may be discounted or limited to a window (see `RewardStatistics`), whereas Exp3.S mixes the weights;
+- many decisions are due at the same time; each reward is weighted by the probability its option was chosen with.
 """
 
 from __future__ import annotations
+
+from typing import ClassVar
 
 import torch
 from pydantic import PositiveInt
@@ -20,17 +22,22 @@ from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, R
 from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
-PROBABILITY = "option_probability"  # of the held option when it was chosen
+PROBABILITY = "option_probability"  # of the held option at its decision, float32 [*B]
 
 
 class Exp3(Bandit):
-    """Choose by p = (1 - exploration) softmax(exploration / K x gains) + exploration / K.
+    """Choose with probability (1 - exploration) softmax(exploration / K x gains) + exploration / K, for K options.
 
     Args:
         specs: of the problem.
-        exploration: gamma of the source, which also scales the gains.
-        memory, discount, window: which payoffs count, as in `Payoffs`.
+        exploration: gamma of the source: the fraction of uniform choices, and the scale of the gains.
+        memory, discount, window: which rewards count, as in `RewardStatistics`.
     """
+
+    modes: ClassVar[tuple[str, ...]] = ("train",)
+
+    low: Tensor
+    high: Tensor
 
     def __init__(
         self,
@@ -44,13 +51,14 @@ class Exp3(Bandit):
         super().__init__(specs, memory, discount, window)
         self.out_keys = [*self.out_keys, PROBABILITY]
         self.exploration = exploration
+        # Of the scaled rewards over their probabilities, where `statistics` has the rewards themselves.
         self.gains = RewardStatistics(specs.num_options, memory, discount, window)
         self.register_buffer("low", torch.tensor(torch.inf, dtype=torch.float64))
         self.register_buffer("high", torch.tensor(-torch.inf, dtype=torch.float64))
 
     @property
     def probabilities(self) -> Tensor:
-        """The exploring choice's distribution, `[num_options]`."""
+        """Probabilities of an exploring choice, `[num_options]`."""
         num = self.specs.num_options
         weights = (self.exploration / num * self.gains.sums).softmax(0)
         return (1.0 - self.exploration) * weights + self.exploration / num
@@ -61,10 +69,12 @@ class Exp3(Bandit):
 
     def sample(self, num: int) -> Tensor:
         """Return `num` choices."""
-        return self.probabilities.multinomial(num, replacement=True) if num else self.gains.recent_options.new_zeros(0)
+        if num == 0:  # which `multinomial` refuses
+            return torch.zeros(0, dtype=torch.long, device=self.gains.sums.device)
+        return self.probabilities.multinomial(num, replacement=True)
 
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return the choices and the probabilities that they had."""
+        """Return the options and the probabilities they were chosen with, `[*B]` each."""
         option = self.select(td)
         return {keys.OPTION: option, PROBABILITY: self.probabilities.float()[option]}
 
@@ -72,15 +82,20 @@ class Exp3(Bandit):
         """Return uniformly random options and their probabilities, `[*B]` each."""
         chosen = super().choose_uniformly(td)
         uniform = 1.0 / self.specs.num_options
-        return chosen | {PROBABILITY: torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)}
+        chosen[PROBABILITY] = torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)
+        return chosen
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Add to the gains what the finished decisions earned over the probability of their choice."""
+        """Add the importance-weighted rewards of finished decisions to the gains.
+
+        Return each option's mean reward, unweighted, and its probability.
+        """
         scalars = super().learn(decisions)
         rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()
-        self.low, self.high = torch.minimum(self.low, rewards.min()), torch.maximum(self.high, rewards.max())
+        self.low = torch.minimum(self.low, rewards.min())
+        self.high = torch.maximum(self.high, rewards.max())
         scaled = (rewards - self.low) / (self.high - self.low).clamp(min=1e-12)
         self.gains.add(decisions.get(keys.OPTION), scaled / decisions.get(PROBABILITY))
-        named = zip(self.specs.option_names, self.probabilities.tolist(), strict=True)
-        chances = {f"probability_{name}": probability for name, probability in named}
-        return scalars | chances
+        for name, probability in zip(self.specs.option_names, self.probabilities.tolist(), strict=True):
+            scalars[f"probability_{name}"] = probability
+        return scalars

@@ -1,4 +1,4 @@
-"""Always one option."""
+"""The same option at every decision."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Fixed(Selector):
 
     Args:
         specs: of the problem.
-        option: the option's name or number.
+        option: name or number of the option.
 
     Raises:
         ValueError: the problem has no such option.

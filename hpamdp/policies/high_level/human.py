@@ -1,4 +1,4 @@
-"""People's choice of the option, as measured: a reference for selectors."""
+"""The human choice of the option, as measured: a reference for selectors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class Human(Selector):
-    """Choose each option as often as people do in the same situation, also where the policy is greedy."""
+    """Choose each option with the probability that humans choose it in the same situation, greedy or not."""
 
     needs: ClassVar[tuple[str, ...]] = ("human",)
 
@@ -22,6 +22,6 @@ class Human(Selector):
         self.in_keys = [*self.in_keys, keys.HUMAN_OPTION]
 
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return draws `[*B]` from people's shares `[*B, num_options]`."""
-        shares = td.get(keys.HUMAN_OPTION)
-        return shares.flatten(0, -2).multinomial(1).reshape(shares.shape[:-1])
+        """Return samples, int64 `[*B]`, from the human probabilities `[*B, num_options]`."""
+        probabilities = td.get(keys.HUMAN_OPTION)
+        return probabilities.flatten(0, -2).multinomial(1).reshape(probabilities.shape[:-1])

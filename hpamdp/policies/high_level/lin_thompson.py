@@ -1,10 +1,12 @@
-"""Thompson sampling for payoffs that are linear in features of the observation.
+"""Thompson sampling for rewards that are linear in features of the observation.
 
 Source: Agrawal and Goyal 2013, *Thompson Sampling for Contextual Bandits with Linear Payoffs*, arXiv 1209.3352,
 algorithm 1.
 
-Differs from the source: a model an option; the noise's deviation is the regression's residual one; what is drawn is
-each decision's predicted payoff, which has the distribution that a drawn parameter gives it.
+Differs from the source:
+- each option has a regression of its own;
+- the standard deviation of the noise is that of the regressions' residuals;
+- the predicted reward of each decision is sampled, instead of the parameters; its distribution is the same.
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ from hpamdp.policies.shared.context import LinearBandit
 
 
 class LinThompson(LinearBandit):
-    """Choose the option with the highest draw from the posteriors of the predictions.
+    """Choose the option with the highest sample from the posterior distributions of the expected rewards.
 
-    `exploration` is the factor of the posteriors' deviation, v of the source; 1 is Bayes.
+    `exploration` is the factor of the posteriors' standard deviation, v in the source; 1 is Bayesian.
     """
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
-        """Return draws of the predictions."""
+        """Return samples of the expected rewards."""
         return mean + self.exploration * deviation * torch.randn_like(mean)

@@ -1,10 +1,12 @@
-"""LinUCB: upper confidence bounds on payoffs that are linear in features of the observation.
+"""LinUCB: upper confidence bounds on rewards that are linear in features of the observation.
 
 Source: Li, Chu, Langford and Schapire 2010, *A Contextual-Bandit Approach to Personalized News Article Recommendation*,
-arXiv 1003.0146, algorithm 1 (disjoint models). Discounting: Russac, Vernade and Cappe 2019, arXiv 1909.09146.
+arXiv 1003.0146, algorithm 1 (disjoint models). Discounting: Russac, Vernade and Cappe 2019, *Weighted Linear Bandits
+for Non-Stationary Environments*, arXiv 1909.09146.
 
-Differs from the sources: the width is in units of the regression's residual deviation; the discounted form has one
-Gram matrix.
+Differs from the sources:
+- the width is in units of the residuals' standard deviation;
+- the discounted form has one Gram matrix for each option, not two.
 """
 
 from __future__ import annotations
@@ -15,11 +17,11 @@ from hpamdp.policies.shared.context import LinearBandit
 
 
 class LinUCB(LinearBandit):
-    """Choose the option with the highest prediction + exploration x its deviation.
+    """Choose the option with the highest expected reward + exploration x its standard deviation.
 
-    `exploration` is the factor of the width, alpha of the source.
+    `exploration` is the factor of the width, alpha in the source.
     """
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
-        """Return the upper bounds."""
+        """Return the upper confidence bounds."""
         return mean + self.exploration * deviation

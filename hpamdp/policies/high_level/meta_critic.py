@@ -1,10 +1,10 @@
-"""A critic Q(s, option) over the options' returns, learned off-policy: semi-MDP Q-learning.
+"""A critic Q(s, option) of the options' returns, learned off-policy: semi-MDP Q-learning.
 
-Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2. Ensemble for exploration by upper
-bounds: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
+Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2. Exploration by the upper confidence
+bounds of an ensemble: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
 
-Differs from the sources: the target of an option's return may be mixed with what the low level itself expects of the
-state, which also tells of the options that were not chosen.
+Differs from the sources: the target of an option's return may be mixed with the learners' own values of the state,
+which also exist for the options that were not chosen.
 """
 
 from __future__ import annotations
@@ -27,20 +27,27 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class MetaCritic(Selector):
-    """Choose the option of the highest mean Q of an ensemble.
+    """Choose the option with the highest mean Q of an ensemble.
 
     Args:
         specs: of the problem.
         device: where the networks live.
         hidden_dims, num_members: of the ensemble.
-        exploration: `epsilon` (a share of random options that falls from 1 to `epsilon_final` over `epsilon_decisions`)
-            or `ucb` (mean + `ucb_width` x the deviation between the members).
+        exploration: `epsilon`: a random option with a probability that falls linearly from 1 to `epsilon_final` over
+            `epsilon_decisions` after the warm-up. `ucb`: the highest mean + `ucb_width` x standard deviation over the
+            members.
+        epsilon_final, epsilon_decisions, ucb_width: see `exploration`.
         gamma: discount of a step, for options that end before their episode.
-        bootstrap: share of the learners' own values in the targets, 0: none.
-        buffer_size: decisions remembered; payoffs drift, so that old ones mislead.
-        batch_size, updates_per_decision, max_updates, lr, tau: of the updates; at most `max_updates` in one call.
-        warmup_decisions: random options before anything is learned.
+        bootstrap: weight of the learners' own values in the targets; with 0 they are not used.
+        buffer_size: decisions that are stored. Returns change while the learners improve, so old ones mislead.
+        batch_size: decisions in an update.
+        updates_per_decision, max_updates: updates for each finished decision, and at most in one call of `learn`.
+        warmup_decisions: decisions with random options before the first update.
+        lr: learning rate of Adam.
+        tau: step of the target critics towards the learned ones after each update.
     """
+
+    num_decisions: Tensor
 
     def __init__(
         self,
@@ -65,10 +72,17 @@ class MetaCritic(Selector):
     ) -> None:
         super().__init__(specs)
         self.needs_values = bootstrap > 0.0
-        self.exploration, self.ucb_width, self.gamma, self.bootstrap = exploration, ucb_width, gamma, bootstrap
-        self.epsilon_final, self.epsilon_decisions = epsilon_final, epsilon_decisions
-        self.batch_size, self.updates_per_decision = batch_size, updates_per_decision
-        self.max_updates, self.warmup_decisions, self.tau = max_updates, warmup_decisions, tau
+        self.gamma = gamma
+        self.bootstrap = bootstrap
+        self.exploration = exploration
+        self.epsilon_final = epsilon_final
+        self.epsilon_decisions = epsilon_decisions
+        self.ucb_width = ucb_width
+        self.batch_size = batch_size
+        self.updates_per_decision = updates_per_decision
+        self.max_updates = max_updates
+        self.warmup_decisions = warmup_decisions
+        self.tau = tau
         self.critics = EnsembleMLP(num_members, specs.observation_dim, hidden_dims, specs.num_options)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
@@ -82,17 +96,17 @@ class MetaCritic(Selector):
 
     @property
     def epsilon(self) -> float:
-        """Fraction of random options."""
-        after = int(self.num_decisions) - self.warmup_decisions
-        if after < 0:
+        """Probability of a random option."""
+        decisions_after_warmup = int(self.num_decisions) - self.warmup_decisions
+        if decisions_after_warmup < 0:
             return 1.0
         if self.exploration == "ucb":
             return 0.0
-        return linear_schedule(after, self.epsilon_decisions, self.epsilon_final)
+        return linear_schedule(decisions_after_warmup, self.epsilon_decisions, self.epsilon_final)
 
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return the choices `[*B]`: the best mean where the policy is greedy, else exploring."""
+        """Return the choices `[*B]`: the highest mean Q if the policy is greedy, else exploring."""
         observation = td.get(keys.OBSERVATION)
         q = self.critics(observation.flatten(0, -2))
         value = q.mean(0)
@@ -104,24 +118,27 @@ class MetaCritic(Selector):
         return value.argmax(-1).reshape(observation.shape[:-1])
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Store the finished decisions and, after the warm-up, make the updates that are due."""
+        """Store finished decisions and, after the warm-up, make the updates that are due."""
         self.buffer.extend(self._rows(decisions))
-        before, self.num_decisions = int(self.num_decisions), self.num_decisions + len(decisions)
-        now = int(self.num_decisions)
+        before = int(self.num_decisions)
+        now = before + len(decisions)
+        self.num_decisions = self.num_decisions + len(decisions)
         if now < self.warmup_decisions:
             return {}
         due = int(now * self.updates_per_decision) - int(before * self.updates_per_decision)
         losses = [self._update(self.buffer.sample(self.batch_size)) for _ in range(min(due, self.max_updates))]
-        critic = {"critic": torch.stack(losses).mean().item()} if losses else {}
-        return {**critic, "epsilon": self.epsilon}
+        scalars = {"critic": torch.stack(losses).mean().item()} if losses else {}
+        scalars["epsilon"] = self.epsilon
+        return scalars
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
+        """Return what is stored of decisions `[N]`."""
         after = decisions.get("next")
         goes_on = ~after.get(keys.TERMINATED).squeeze(-1)
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),
             "option": decisions.get(keys.OPTION),
-            "payoff": after.get(keys.OPTION_RETURN).squeeze(-1),
+            "return": after.get(keys.OPTION_RETURN).squeeze(-1),
             "next_state": after.get(keys.OBSERVATION),
             "discount": self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1) * goes_on,
         }
@@ -131,19 +148,20 @@ class MetaCritic(Selector):
 
     def _update(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the critics from decisions `[batch_size]`; return the loss."""
-        q, option = self.critics(rows["state"]), rows["option"].unsqueeze(-1)
+        q = self.critics(rows["state"])
         with torch.no_grad():
-            following = self.target_critics(rows["next_state"]).mean(0).amax(-1)
-            earned = (rows["payoff"] + rows["discount"] * following).unsqueeze(-1)
-            # Without bootstrapping only the chosen option has a target.
-            weight = torch.zeros_like(q[0]).scatter(-1, option, 1.0)
-            target = earned.expand_as(weight)
+            next_value = self.target_critics(rows["next_state"]).mean(0).amax(-1)
+            chosen_target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
+            # Weight of each option's error; without bootstrapping only the chosen option has a target.
+            weight = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)
+            target = chosen_target.expand_as(weight)
             if self.needs_values:
-                target = torch.where(weight > 0.0, earned.lerp(rows["values"], self.bootstrap), rows["values"])
+                mixed = chosen_target.lerp(rows["values"], self.bootstrap)
+                target = torch.where(weight > 0.0, mixed, rows["values"])
                 weight = weight.clamp(min=self.bootstrap)
-            # Each member sees a random half of the rows, which keeps them apart.
-            member = torch.rand(*q.shape[:2], 1, device=q.device) < 0.5 if len(q) > 1 else 1.0
-        loss = ((q - target).square() * weight * member).sum(-1).mean()
+            # Each member sees a random half of the decisions, which keeps the members apart.
+            is_seen = torch.rand(*q.shape[:2], 1, device=q.device) < 0.5 if len(q) > 1 else 1.0
+        loss = ((q - target).square() * weight * is_seen).sum(-1).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()

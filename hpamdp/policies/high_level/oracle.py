@@ -1,4 +1,4 @@
-"""The better option as the environment's planner knows it: the upper line for selectors."""
+"""The best option according to the environment's planner: a reference for selectors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class Oracle(Selector):
-    """Choose the option with which the best plan scores higher."""
+    """Choose the option whose best plan has the highest score."""
 
     needs: ClassVar[tuple[str, ...]] = ("oracle",)
 

@@ -1,9 +1,9 @@
-"""Thompson sampling: choose each option as often as it is likely to be the best.
+"""Thompson sampling: choose each option with the probability that it is the best one.
 
 Source: Russo, Van Roy, Kazerouni, Osband and Wen 2018, *A Tutorial on Thompson Sampling*, arXiv 1707.02038, section 3.
-Forgetting forms: see `Payoffs`.
+Forgetting: see `RewardStatistics`.
 
-Differs from the source: the payoffs' variance is the observed one, the prior of the means is flat.
+Differs from the source: the variance of the rewards is the observed one; the prior of the means is flat.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class Thompson(Bandit):
-    """Choose the option with the highest draw from the Gaussian posteriors of the mean payoffs.
+    """Choose the option with the highest sample from the Gaussian posterior distributions of the mean rewards.
 
     Args:
         specs: of the problem.
-        exploration: factor of the posteriors' deviation; 1 is Bayes.
-        memory, discount, window: which payoffs count, as in `Payoffs`.
+        exploration: factor of the posteriors' standard deviation; 1 is Bayesian.
+        memory, discount, window: which rewards count, as in `RewardStatistics`.
     """
 
     def __init__(
@@ -38,9 +38,10 @@ class Thompson(Bandit):
         self.exploration = exploration
 
     def sample(self, num: int) -> Tensor:
-        """Return `num` choices, each from a draw of its own."""
-        known = self.rewards
-        noise = torch.randn(num, self.specs.num_options, dtype=torch.float64, device=known.counts.device)
-        deviation = self.exploration * known.deviation / known.counts.clamp(min=1e-9).sqrt()
-        drawn = known.means + deviation * noise
-        return torch.where(known.is_untried, 1e9 + noise, drawn).argmax(-1)
+        """Return `num` choices, each from samples of its own."""
+        statistics = self.statistics
+        noise = torch.randn(num, self.specs.num_options, dtype=torch.float64, device=statistics.counts.device)
+        deviation = self.exploration * statistics.deviation / statistics.counts.clamp(min=1e-9).sqrt()
+        sampled_means = statistics.means + deviation * noise
+        # Untried options come first, in random order.
+        return torch.where(statistics.is_untried, 1e9 + noise, sampled_means).argmax(-1)

@@ -1,12 +1,12 @@
-"""Upper confidence bounds on the options' payoffs, for payoffs that stand still (UCB1) or drift.
+"""Upper confidence bounds on the rewards of the options, stationary (UCB1) or not.
 
 Source: UCB1: Auer, Cesa-Bianchi and Fischer 2002, *Finite-time analysis of the multiarmed bandit problem*, figure 1.
 Discounted and sliding-window UCB: Garivier and Moulines 2011, arXiv 0805.3415, equations 2 to 4.
 
 Differs from the sources:
-- payoffs need not lie in [0, 1]: the width is in units of the payoffs' own standard deviation;
-- many environments decide at once: they are served one after another, each pull narrowing its arm's width as if its
-  payoff were already in, so that a thousand boats do not all follow one estimate.
+- rewards need not lie in [0, 1]: the width is in units of their standard deviation;
+- many environments decide at the same time. They are served one after another, and each choice narrows the width of its
+  option as if its reward were already known; otherwise all of them would choose the same option.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class UCB(Bandit):
-    """Choose the option with the highest mean payoff + exploration x deviation x sqrt(2 ln t / n).
+    """Choose the option with the highest mean reward + exploration x standard deviation x sqrt(2 ln t / n).
 
     Args:
         specs: of the problem.
-        exploration: the factor of the width.
-        memory, discount, window: which payoffs count, as in `Payoffs`; with `all` this is UCB1.
+        exploration: factor of the width.
+        memory, discount, window: which rewards count, as in `RewardStatistics`; with `all` this is UCB1.
     """
 
     def __init__(
@@ -42,13 +42,16 @@ class UCB(Bandit):
 
     def sample(self, num: int) -> Tensor:
         """Return `num` choices made one after another, in random order."""
-        known = self.rewards
-        pulls = torch.arange(num, device=known.counts.device)
-        counts = known.counts.unsqueeze(-1) + pulls
-        width = (2.0 * (known.counts.sum() + num).clamp(min=2.0).log() / counts).sqrt()
-        # An arm without payoffs has an infinite bound and, from its first pull on, the mean of all.
-        mean = torch.where(known.is_untried, known.sums.sum() / known.counts.sum().clamp(min=1.0), known.means)
-        # An arm's bound falls with each pull, so taking the best arm `num` times over is taking the `num` best bounds.
-        bounds = mean.unsqueeze(-1) + self.exploration * known.deviation * width
+        statistics = self.statistics
+        total = statistics.counts.sum()
+        earlier_choices = torch.arange(num, device=statistics.counts.device)
+        counts = statistics.counts.unsqueeze(-1) + earlier_choices
+        width = (2.0 * (total + num).clamp(min=2.0).log() / counts).sqrt()
+        # The bound of an untried option is infinite; once it is chosen, its mean is taken to be that of all rewards.
+        mean_of_all = statistics.sums.sum() / total.clamp(min=1.0)
+        means = torch.where(statistics.is_untried, mean_of_all, statistics.means)
+        # bounds[i, j] is the bound of option i after j of these choices. It falls with j, so choosing the highest bound
+        # `num` times in a row means choosing the `num` highest bounds.
+        bounds = means.unsqueeze(-1) + self.exploration * statistics.deviation * width
         chosen = bounds.flatten().topk(num).indices // num
         return chosen[torch.randperm(num, device=chosen.device)]

@@ -1,4 +1,4 @@
-"""A random option at every decision: the lower line for selectors."""
+"""A uniformly random option at every decision: a reference for selectors."""
 
 from __future__ import annotations
 

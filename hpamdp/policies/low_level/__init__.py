@@ -1,0 +1,1 @@
+"""Learners, one a file: which discrete action, with which parameters?"""

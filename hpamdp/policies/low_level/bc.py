@@ -1,7 +1,9 @@
-"""Behaviour cloning: the likeliest press in the data, by maximum likelihood of keys and durations.
+"""Behaviour cloning: maximum likelihood of the discrete actions and their own parameters in a data set.
 
 Source: Pomerleau 1991, *Efficient Training of Artificial Neural Networks for Autonomous Navigation*; the policy is
 H-PPO's (Fan et al. 2019, arXiv 1903.01344, section 4).
+
+TorchRL's BCLoss does not fit: it reads a single action leaf.
 """
 
 from __future__ import annotations
@@ -13,21 +15,23 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 
 class BC(ReplayLearner):
-    """Maximum likelihood of the data's presses; learns from data sets alone.
+    """Maximum-likelihood imitation; learns from data sets alone.
 
     Args:
-        specs: of the problem.
+        specs: sizes and bounds of the problem.
         device: where the network lives.
-        hidden_dims: of the actor.
-        min_scale, max_scale: range of the Gaussian's deviation, in units where the bounds are [-1, 1].
-        buffer_size: transitions that are kept.
-        batch_size, lr, weight_decay: of the updates.
+        hidden_dims: sizes of the actor's hidden layers.
+        min_scale, max_scale: range of the Gaussian's standard deviation, in units where the bounds are [-1, 1].
+        buffer_size: largest number of transitions that are kept.
+        batch_size: transitions in an update.
+        lr: learning rate.
+        weight_decay: of AdamW.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("offline",)
@@ -59,11 +63,12 @@ class BC(ReplayLearner):
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
-        adam = torch.optim.AdamW(self.actor.parameters(), lr=lr, weight_decay=weight_decay, fused=True)
-        self.optimizers = {"actor": adam}
+        optimizer = torch.optim.AdamW(self.actor.parameters(), lr=lr, weight_decay=weight_decay, fused=True)
+        self.optimizers = {"actor": optimizer}
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Take a step up the likelihood of transitions `[batch_size]`."""
-        of_discrete, of_parameters = self.actor(sample["state"]).log_prob(sample["discrete"], sample["unit"])
-        self.optimizer_step("actor", -(of_discrete + of_parameters).mean())
-        return {"discrete_log_prob": of_discrete.mean(), "parameter_log_prob": of_parameters.mean()}
+        """Make one step up the log-likelihood of transitions `[batch_size]`; return scalars."""
+        distribution: HybridDistribution = self.actor(sample["state"])
+        discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
+        self.optimizer_step("actor", -(discrete_log_prob + parameter_log_prob).mean())
+        return {"discrete_log_prob": discrete_log_prob.mean(), "parameter_log_prob": parameter_log_prob.mean()}

@@ -1,26 +1,29 @@
-"""DLPA: plan over keys and parameters in a learned model of the problem.
+"""DLPA: model predictive control over discrete actions and their parameters, in a learned model.
 
-A transition, two reward and a termination predictor are trained on windows of real steps; every press is the first of
-the best sequence that sampling finds in them.
+A transition, two reward and a termination predictor are trained on windows of consecutive real steps. Every action is
+the first one of the best action sequence that a sampling-based planner finds in them.
 
 Source: Zhang, Fu, Miao and Konidaris, *Model-based Reinforcement Learning for Parameterized Action Spaces*, 2024, arXiv
 2404.03037, section 4: the three forms of the model, the H-step loss, the two reward predictors and the planner, which
-extends model predictive path integral control (Williams et al. 2015, arXiv 1509.01149) to keys with parameters.
+extends model predictive path integral control (Williams et al. 2015, arXiv 1509.01149) to parameterised actions.
 
 Differs from the source:
-- the change of the state is predicted, in units of its own deviation over the warm-up data, and learned only from steps
-  that do not terminate: a plan never goes on from one that does;
-- rewards are not squashed, and both reward predictors are used: a plan's return weighs them by the predicted
-  probability of termination, and what comes after by that of having gone on;
-- reward and termination have an ensemble of networks; a plan's return is its mean less `pessimism` deviations;
-- every press is planned from scratch, not from the last plan, which would have to travel with the environment's data;
-  in the boat task's true model a warm start adds .002 to .005 of the ceiling at 5 rounds, .006 to .01 at 3;
-- presses that explore are drawn from the final distribution, some uniformly.
+- the transition predictor's target is the change of the state in units of its standard deviation over the warm-up data,
+  and it is trained only on steps that do not terminate: a plan never continues after one that does;
+- rewards are not squashed, and both reward predictors are used: a plan's return weights them by the predicted
+  probability of termination, and what follows by the probability that the episode continues;
+- reward and termination have an ensemble of networks; a plan's return is the ensemble's mean minus `pessimism` standard
+  deviations;
+- every plan starts from scratch, not from the previous one, which would have to be stored with the environments' data;
+  with the true model of this project's benchmark, a warm start adds .002 to .005 of the best possible score at 5
+  iterations, .006 to .01 at 3;
+- exploring actions are sampled from the plan's final distribution, a fraction of them uniformly.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -28,47 +31,52 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, is_greedy
-from hpamdp.policies.low_level.dlpa_model import PAMDPModel
+from hpamdp.policies.base import is_greedy, option_ends
+from hpamdp.policies.low_level.dlpa_model import PAMDPModel, Prediction
 from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
-Share = Annotated[float, Field(ge=0.0, lt=1.0)]
+FractionBelowOne = Annotated[float, Field(ge=0.0, lt=1.0)]
 Form = Literal["parallel", "masking", "sequential"]
 
-_CHUNK_ROWS = 4096  # states predicted together when planning: fits the cache and bounds the memory
+_CHUNK_ROWS = 4096  # states predicted at once when planning: fits the cache and bounds the memory
 
 
 class Plan(NamedTuple):
-    """A distribution over sequences of presses: a categorical over keys and a Gaussian per parameter and step."""
+    """A distribution over action sequences: at each step a categorical and a Gaussian for each parameter."""
 
-    probability: Tensor  # [N, H, num_keys]
+    probability: Tensor  # [N, H, num_discrete]
     mean: Tensor  # [N, H, num_parameters] in [-1, 1]
     deviation: Tensor  # [N, H, num_parameters]
 
 
 class Planner:
-    """Find good sequences of presses in a model by sampling, weighing the best and sampling anew.
+    """Find good action sequences in a model by iterated sampling, weighting the best more.
 
     Args:
-        model: what maps (state, key, unit) to a Prediction.
+        model: maps states, discrete actions and parameters in [-1, 1] to a `Prediction`.
         specs: of the problem.
-        horizon: presses in a sequence; num_samples: sequences in each of num_iterations rounds, of which the
-            num_elites best make the next distribution.
+        horizon: number of steps in a sequence.
+        num_samples: number of sequences sampled in each iteration.
+        num_elites: number of the best of them that define the next iteration's distribution.
+        num_iterations: number of iterations.
         temperature: of the elites' weights exp(return / temperature).
-        momentum: the old distribution's share in the new one.
-        min_deviation: the smallest deviation of a parameter, in [-1, 1] units.
-        gamma: discount of a press.
-        pessimism: deviations between the model's members that are taken off their mean return.
-        precision: in which the model's networks predict when planning.
+        momentum: weight of the old distribution in the new one.
+        min_deviation: smallest standard deviation of a parameter, in [-1, 1] units.
+        gamma: discount of a step.
+        pessimism: number of standard deviations between the ensemble's members that are subtracted from a return.
+        precision: dtype in which the model's networks predict during planning.
+
+    Raises:
+        ValueError: `num_elites` is greater than `num_samples`.
     """
 
     def __init__(
         self,
-        model: Any,
+        model: Callable[[Tensor, Tensor, Tensor], Prediction],
         specs: PAMDPSpecs,
         *,
         horizon: int,
@@ -84,10 +92,18 @@ class Planner:
     ) -> None:
         if num_elites > num_samples:
             raise ValueError(f"num_elites={num_elites}, but must be at most num_samples={num_samples}")
-        self.model, self.specs, self.horizon, self.num_samples = model, specs, horizon, num_samples
-        self.num_elites, self.num_iterations, self.temperature = num_elites, num_iterations, temperature
-        self.momentum, self.min_deviation, self.gamma, self.pessimism = momentum, min_deviation, gamma, pessimism
-        self.precision = getattr(torch, precision)
+        self.model = model
+        self.specs = specs
+        self.horizon = horizon
+        self.num_samples = num_samples
+        self.num_elites = num_elites
+        self.num_iterations = num_iterations
+        self.temperature = temperature
+        self.momentum = momentum
+        self.min_deviation = min_deviation
+        self.gamma = gamma
+        self.pessimism = pessimism
+        self.precision: torch.dtype = getattr(torch, precision)
 
     @torch.no_grad()
     def plan(self, state: Tensor) -> Plan:
@@ -106,16 +122,18 @@ class Planner:
         return plan
 
     def sample(self, plan: Plan) -> tuple[Tensor, Tensor]:
-        """Draw keys `[N, S, H]` and parameters `[N, S, H, num_parameters]` in [-1, 1]."""
+        """Sample discrete actions `[N, S, H]` and parameters `[N, S, H, num_parameters]` in [-1, 1]."""
         discrete = plan.probability.flatten(0, 1).multinomial(self.num_samples, replacement=True)
         discrete = discrete.unflatten(0, plan.probability.shape[:2]).transpose(1, 2)
         noise = torch.randn(*discrete.shape, self.specs.num_parameters, device=discrete.device)
-        return discrete, (plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise).clamp(-1.0, 1.0)
+        unit = plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise
+        return discrete, unit.clamp(-1.0, 1.0)
 
     def returns(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
-        """Return what the model expects of sequences, `[N, S]`, from states `[N, observation_dim]`."""
+        """Return the predicted returns `[N, S]` of action sequences from states `[N, observation_dim]`."""
         rows = state.repeat_interleave(discrete.shape[1], 0)
-        total, survival = 0.0, 1.0
+        total = rows.new_zeros(())
+        survival = rows.new_ones(())
         for h in range(discrete.shape[2]):
             with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
                 predicted = self.model(rows, discrete[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
@@ -124,65 +142,76 @@ class Planner:
             total = total + self.gamma**h * survival * reward.float()
             survival = survival * (1.0 - ends)
             rows = predicted.next_state
-        doubt = self.pessimism * total.std(0, correction=0) if self.pessimism else 0.0
-        return (total.mean(0) - doubt).unflatten(0, discrete.shape[:2])
+        value = total.mean(0)
+        if self.pessimism > 0.0:
+            value = value - self.pessimism * total.std(0, correction=0)
+        return value.unflatten(0, discrete.shape[:2])
 
     def re_estimate(self, plan: Plan, discrete: Tensor, unit: Tensor, returns: Tensor) -> Plan:
-        """Return the distribution of the elites, each key's parameters from the elites that press it alone.
+        """Return the distribution of the elites.
 
-        The parameters of a key that no elite presses stay as they were.
+        The parameters of a discrete action are estimated from the elites that choose it; they stay as they were if
+        there are none.
         """
         value, elite = returns.topk(self.num_elites, 1)
-        discrete, unit = discrete.take_along_dim(elite[..., None], 1), unit.take_along_dim(elite[..., None, None], 1)
-        pressed = (value / self.temperature).softmax(1)[..., None, None] * F.one_hot(discrete, self.specs.num_discrete)
-        weight = pressed @ self.specs.parameter_mask.to(pressed)
-        total = weight.sum(1)
-        weight = weight / total.clamp(min=1e-8).unsqueeze(1)
-        mean = (weight * unit).sum(1)
-        deviation = (weight * (unit - mean.unsqueeze(1)).square()).sum(1).sqrt().clamp(min=self.min_deviation)
-        share = 1.0 - self.momentum
+        discrete = discrete.take_along_dim(elite[..., None], 1)
+        unit = unit.take_along_dim(elite[..., None, None], 1)
+        elite_weight = (value / self.temperature).softmax(1)
+        discrete_weight = elite_weight[..., None, None] * F.one_hot(discrete, self.specs.num_discrete)
+        parameter_weight = discrete_weight @ self.specs.parameter_mask.to(discrete_weight)
+        total = parameter_weight.sum(1)
+        parameter_weight = parameter_weight / total.clamp(min=1e-8).unsqueeze(1)
+        mean = (parameter_weight * unit).sum(1)
+        variance = (parameter_weight * (unit - mean.unsqueeze(1)).square()).sum(1)
+        deviation = variance.sqrt().clamp(min=self.min_deviation)
+        step = 1.0 - self.momentum
         return Plan(
-            plan.probability.lerp(pressed.sum(1), share),
-            plan.mean.lerp(torch.where(total > 1e-8, mean, plan.mean), share),
-            plan.deviation.lerp(torch.where(total > 1e-8, deviation, plan.deviation), share),
+            plan.probability.lerp(discrete_weight.sum(1), step),
+            plan.mean.lerp(torch.where(total > 1e-8, mean, plan.mean), step),
+            plan.deviation.lerp(torch.where(total > 1e-8, deviation, plan.deviation), step),
         )
 
 
 class DLPAPolicy(TensorDictModuleBase):
-    """The first press of the plan: its likeliest key and mean parameters, or a draw where it explores.
+    """The plan's first action: the likeliest discrete action with mean parameters or, when exploring, a sample.
 
-    Random until the model was trained. Episodes that are over get a press that is none.
+    Acts uniformly at random until the model has been trained. Nothing is planned for finished episodes: their action is
+    random, too, and is ignored.
     """
+
+    is_trained: Tensor
 
     def __init__(self, planner: Planner, specs: PAMDPSpecs, epsilon: float) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION, keys.DONE]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
-        self.model = planner.model  # whoever copies the policy's weights needs the model's
-        self.planner, self.specs, self.epsilon = planner, specs, epsilon
+        self.model = planner.model  # makes the model's weights part of the policy's state
+        self.planner = planner
+        self.specs = specs
+        self.epsilon = epsilon
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write key `[*B]` and parameters `[*B, num_parameters]`."""
+        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).flatten(0, -2)
         discrete = torch.randint(self.specs.num_discrete, state.shape[:1], device=state.device)
         unit = 2.0 * torch.rand(state.shape[0], self.specs.num_parameters, device=state.device) - 1.0
         is_planned = self.is_trained.expand(state.shape[0])
-        over = td.get(keys.DONE, None)
-        if over is not None:
-            is_planned = is_planned & ~over.flatten()
+        done = td.get(keys.DONE, None)
+        if done is not None:
+            is_planned = is_planned & ~done.flatten()
         exploring = not is_greedy()
         if exploring:
             is_planned = is_planned & (torch.rand(state.shape[0], device=state.device) >= self.epsilon)
         if is_planned.any():
-            discrete[is_planned], unit[is_planned] = self.press(state[is_planned], exploring)
+            discrete[is_planned], unit[is_planned] = self.first_action(state[is_planned], exploring)
         shape = td.batch_size
-        duration = self.specs.from_unit(unit).reshape(*shape, self.specs.num_parameters)
-        return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": duration}})
+        parameters = self.specs.from_unit(unit).reshape(*shape, self.specs.num_parameters)
+        return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": parameters}})
 
-    def press(self, state: Tensor, exploring: bool) -> tuple[Tensor, Tensor]:
-        """Return the key `[N]` and the parameters `[N, num_parameters]` in [-1, 1] of the plan's first press."""
+    def first_action(self, state: Tensor, exploring: bool) -> tuple[Tensor, Tensor]:
+        """Return the discrete action `[N]` and the parameters `[N, num_parameters]` in [-1, 1] of the first step."""
         probability, mean, deviation = (part[:, 0] for part in self.planner.plan(state))
         if not exploring:
             return probability.argmax(-1), mean
@@ -190,8 +219,16 @@ class DLPAPolicy(TensorDictModuleBase):
         return probability.multinomial(1).squeeze(-1), unit.clamp(-1.0, 1.0)
 
 
-class DLPA(Learner):
-    """A PAMDPModel trained on windows of its own replay, and a Planner that acts in it."""
+class DLPA(ReplayLearner):
+    """A PAMDPModel trained on windows from a replay buffer, and a Planner that acts in it.
+
+    A stored step carries the number of its trajectory, which is an unbroken sequence of this learner's steps within one
+    environment, episode and option, and the place of the step that follows it there.
+    """
+
+    modes: ClassVar[tuple[str, ...]] = ("train",)
+
+    policy: DLPAPolicy
 
     def __init__(
         self,
@@ -210,118 +247,147 @@ class DLPA(Learner):
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
         warmup_frames: PositiveInt,
-        epsilon: Share,
+        epsilon: FractionBelowOne,
         gamma: PositiveFraction,
         horizon: PositiveInt,
         num_samples: PositiveInt,
         num_elites: PositiveInt,
         num_iterations: PositiveInt,
         temperature: PositiveFloat,
-        momentum: Share,
+        momentum: FractionBelowOne,
         min_deviation: NonNegativeFloat,
         pessimism: NonNegativeFloat,
         planning_precision: Literal["float32", "bfloat16"],
     ) -> None:
-        super().__init__(specs)
-        self.weights = {"state": state_weight, "reward": reward_weight, "termination": termination_weight}
-        self.rho, self.horizon, self.batch_size = rho, horizon, batch_size
-        self.updates_per_frame, self.warmup_frames = updates_per_frame, warmup_frames
+        super().__init__(
+            specs,
+            device,
+            gamma=gamma,
+            warmup_frames=warmup_frames,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=updates_per_frame,
+        )
+        self.loss_weights = {"state": state_weight, "reward": reward_weight, "termination": termination_weight}
+        self.rho = rho
+        self.horizon = horizon
         self.model = PAMDPModel(specs, form, hidden_dims, num_members)
-        search = dict(num_samples=num_samples, num_elites=num_elites, num_iterations=num_iterations, gamma=gamma)
-        search |= dict(temperature=temperature, momentum=momentum, min_deviation=min_deviation, pessimism=pessimism)
-        search |= dict(precision=planning_precision)
-        self.policy = DLPAPolicy(Planner(self.model, specs, horizon=horizon, **search), specs, epsilon)
-        self.register_buffer("frames", torch.zeros((), dtype=torch.long))
-        self.register_buffer("updates", torch.zeros((), dtype=torch.long))
+        planner = Planner(
+            self.model,
+            specs,
+            horizon=horizon,
+            num_samples=num_samples,
+            num_elites=num_elites,
+            num_iterations=num_iterations,
+            temperature=temperature,
+            momentum=momentum,
+            min_deviation=min_deviation,
+            gamma=gamma,
+            pessimism=pessimism,
+            precision=planning_precision,
+        )
+        self.policy = DLPAPolicy(planner, specs, epsilon)
         self.to(device)
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+        self.optimizers = {"model": torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)}
 
-    def stateful(self) -> dict[str, Any]:
-        """Return the optimiser and the replay buffer."""
-        return {"model": self.optimizer, "buffer": self.buffer}
-
-    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Store the batch's transitions and, once the warm-up is over, train the model on windows of them."""
-        if not mask.any():
-            return {}
-        self.store(batch, mask)
-        before, self.frames = self.frames.clone(), self.frames + mask.sum()
-        if self.frames < self.warmup_frames:
-            return {}
-        if before < self.warmup_frames:
-            seen = self.buffer[:]
-            self.model.fit_scales(seen["state"], seen["next_state"])
-            before = torch.zeros_like(before)
-        losses: dict[str, list[Tensor]] = {}
-        for _ in range(int(self.frames * self.updates_per_frame) - int(before * self.updates_per_frame)):
-            self._update(losses)
-        self.policy.is_trained.fill_(True)
-        return {name: torch.stack(values).mean().item() for name, values in losses.items()} | {
-            "updates": self.updates.item()
-        }
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return the model's inputs and targets in a batch `[*B, T]`."""
+        rows = super().transitions(batch).exclude("discount")
+        return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
-        """Add the masked transitions of a batch `[*B, T]`, each with the place of the one that follows it.
+        """Add the transitions in `mask`, with their trajectories and the links within them.
 
-        `successor` is -1 where an episode ends, and while what follows an unfinished one is not known yet: it is the
-        first step of a later batch that starts in the same environment with the state in which this one ended.
+        `trajectory` is unique in the buffer. `successor` is the place of the trajectory's next step, -1 if there is
+        none so far. `is_open` marks the steps whose successor may come with the next batch.
         """
         num_steps = mask.shape[-1]
-        rows = batch[mask]
-        environment, step = mask.reshape(-1, num_steps).nonzero().unbind(-1)
-        over = rows["next", keys.DONE].squeeze(-1)
-        waiting = self._waiting(mask[..., 0].numel())
-        new = TensorDict(
-            {
-                "state": rows[keys.OBSERVATION],
-                "discrete": rows[keys.DISCRETE],
-                "unit": self.specs.to_unit(rows[keys.PARAMETERS]),
-                "reward": rows["next", keys.REWARD].squeeze(-1),
-                "next_state": rows["next", keys.OBSERVATION],
-                "terminated": rows["next", keys.TERMINATED].squeeze(-1),
-                "over": over,
-                "environment": environment,
-                "successor": torch.full_like(environment, -1),
-            },
-            batch_size=rows.shape,
-        )
-        place = self.buffer.extend(new).to(over.device)
-        stored = self.buffer[:]
-        # In one environment an option's steps lie side by side until its episode ends.
-        goes_on = (~over & (step < num_steps - 1)).nonzero().squeeze(-1)
-        stored["successor"][place[goes_on]] = place[goes_on + 1]
-        first = (step == 0).nonzero().squeeze(-1)
-        last = waiting[environment[first]]
-        is_next = (last >= 0) & (stored["next_state"][last] == new["state"][first]).all(-1)
-        stored["successor"][last[is_next]] = place[first[is_next]]
+        rows = self.transitions(batch).reshape(-1, num_steps)
+        mask = mask.reshape(-1, num_steps)
+        ends = option_ends(batch).reshape(-1, num_steps)
+        last_place, last_trajectory = self._open_steps(rows["state"][:, 0])
+        follows = torch.zeros_like(mask)
+        follows[:, 0] = mask[:, 0] & (last_place >= 0)
+        follows[:, 1:] = mask[:, 1:] & mask[:, :-1] & ~ends[:, :-1]
 
-    def _waiting(self, num_environments: int) -> Tensor:
-        """Return where in the replay each environment's unfinished episode ends `[num_environments]`, -1: none."""
-        waiting = torch.full((num_environments,), -1, device=self.frames.device)
+        num_stored = len(self.buffer)
+        first_number = int(self.buffer[:]["trajectory"].max()) + 1 if num_stored else 0
+        is_first = mask & ~follows
+        number = first_number + is_first.flatten().cumsum(0).reshape(mask.shape) - 1
+        has_begun = is_first.cumsum(-1) > 0
+        rows["trajectory"] = torch.where(has_begun, number, last_trajectory.unsqueeze(-1))
+        rows["environment"] = torch.arange(len(mask), device=mask.device).unsqueeze(-1).expand_as(mask)
+        rows["successor"] = torch.full_like(number, -1)
+        rows["is_open"] = torch.zeros_like(mask)
+        rows["is_open"][:, -1] = ~ends[:, -1]
+
+        if num_stored:
+            self.buffer[:]["is_open"].fill_(False)
+        place = torch.full_like(number, -1)
+        place[mask] = self.buffer.extend(rows[mask]).to(place.device)
+        previous = torch.cat([last_place.unsqueeze(-1), place[:, :-1]], -1)
+        self.buffer[:]["successor"][previous[follows]] = place[follows]
+
+    def _open_steps(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the place and the trajectory of the stored step that each environment's state `[N, obs]` follows.
+
+        Each `[N]`; -1 where there is none, as in an environment that was started anew.
+        """
+        place = torch.full((len(state),), -1, device=state.device)
+        trajectory = place.clone()
         if len(self.buffer):
             stored = self.buffer[:]
-            place = (~stored["over"] & (stored["successor"] < 0)).nonzero().squeeze(-1)
-            waiting[stored["environment"][place]] = place
-        return waiting
+            open_place = stored["is_open"].nonzero().squeeze(-1)
+            last = stored[open_place]
+            is_followed = (last["next_state"] == state[last["environment"]]).all(-1)
+            environment = last["environment"][is_followed]
+            place[environment] = open_place[is_followed]
+            trajectory[environment] = last["trajectory"][is_followed]
+        return place, trajectory
 
-    def windows(self) -> TensorDictBase:
-        """Sample windows `[batch_size, horizon]` of steps that follow each other; `valid` up to an episode's end."""
-        stored, rows = self.buffer[:], [self.buffer.sample(self.batch_size)]
-        valid = [torch.ones_like(rows[0]["over"])]
+    def start(self) -> None:
+        """Fit the model's scales."""
+        stored = self.buffer[:]
+        self.model.fit_scales(stored["state"], stored["next_state"])
+
+    def explore(self, frames: int) -> None:
+        """Let the policy plan."""
+        self.policy.is_trained.fill_(True)
+
+    def updates_due(self, before: int, frames: int) -> int:
+        """Return how many updates to make; the first ones make up for the warm-up."""
+        return super().updates_due(before if before >= self.warmup_frames else 0, frames)
+
+    def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
+        """Yield `num_batches` samples of windows that start at any stored step."""
+        starts = torch.randint(len(self.buffer), (num_batches, self.batch_size), device=self.frames.device)
+        for start in starts:
+            yield self.windows(start)
+
+    def windows(self, start: Tensor) -> TensorDictBase:
+        """Return the windows `[N, horizon]` of consecutive steps that start at places `[N]`.
+
+        `valid` is true until the trajectory's end; the steps after it are arbitrary.
+        """
+        stored = self.buffer[:]
+        trajectory = stored["trajectory"][start]
+        places = [start]
+        valid = [torch.ones_like(start, dtype=torch.bool)]
         for _ in range(self.horizon - 1):
-            successor = rows[-1]["successor"]
-            valid.append(valid[-1] & (successor >= 0))
-            rows.append(stored[successor.clamp(min=0)])
-        return torch.stack([row.select(*stored.keys()) for row in rows], 1).set("valid", torch.stack(valid, 1))
+            successor = stored["successor"][places[-1]]
+            place = successor.clamp(min=0)
+            valid.append(valid[-1] & (successor >= 0) & (stored["trajectory"][place] == trajectory))
+            places.append(place)
+        return stored[torch.stack(places, 1)].set("valid", torch.stack(valid, 1))
 
     def losses(self, windows: TensorDictBase) -> dict[str, Tensor]:
         """Return the parts of the H-step loss, each summed over a window with weight rho^h, averaged over windows."""
-        parts: dict[str, Tensor] = dict.fromkeys(self.weights, torch.zeros((), device=self.frames.device))
+        parts = {name: torch.zeros((), device=self.frames.device) for name in self.loss_weights}
         state = windows["state"][:, 0]
         for h, step in enumerate(windows.unbind(1)):
             predicted = self.model(state, step["discrete"], step["unit"])
-            state, terminated = predicted.next_state, step["terminated"]
+            state = predicted.next_state
+            terminated = step["terminated"]
             change = ((state - step["next_state"]) / self.model.change_scale).square().mean(-1) * ~terminated
             reward = torch.where(terminated, predicted.terminating, predicted.continuing)
             label = terminated.float().expand_as(reward)
@@ -334,11 +400,11 @@ class DLPA(Learner):
                 parts[name] = parts[name] + self.rho**h * (error * step["valid"]).mean()
         return parts
 
-    def _update(self, losses: dict[str, list[Tensor]]) -> None:
-        parts = self.losses(self.windows())
-        self.optimizer.zero_grad(set_to_none=True)
-        sum(self.weights[name] * part for name, part in parts.items()).backward()
-        self.optimizer.step()
-        self.updates += 1
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update the model from windows `[batch_size, horizon]`."""
+        parts = self.losses(sample)
+        loss = torch.zeros((), device=self.frames.device)
         for name, part in parts.items():
-            losses.setdefault(name, []).append(part.detach())
+            loss = loss + self.loss_weights[name] * part
+        self.optimizer_step("model", loss)
+        return parts

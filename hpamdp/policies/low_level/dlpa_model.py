@@ -1,6 +1,6 @@
-"""DLPA's learned model of a problem with parameterised actions: transition, rewards and termination.
+"""The learned model of DLPA: transition, reward and termination under parameterised actions.
 
-Source: Zhang, Fu, Miao and Konidaris, 2024, arXiv 2404.03037, section 4; see `dlpa.py`, also for what differs.
+Source: Zhang, Fu, Miao and Konidaris, 2024, arXiv 2404.03037, section 4. See `dlpa.py` for what differs.
 """
 
 from __future__ import annotations
@@ -16,49 +16,62 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class Predictor(nn.Module):
-    """`num_members` independent networks of (s, k, x_k), output `[E, B, out_dim]`.
+    """`num_members` independent networks of a state and an action, output `[E, B, out_dim]`.
 
-    `parallel` sees state, one-hot key and the key's own parameters at once, `masking` all parameters with the other
-    keys' set to 0, `sequential` state and key first and what comes of them with the own parameters.
-    Shapes: states `[B, observation_dim]`, keys `[B]`, parameters `[B, num_parameters]` in [-1, 1].
+    `form` says how the networks take the action:
+
+    - `parallel`: the state, the one-hot discrete action and its own parameters, all at once;
+    - `masking`: as `parallel`, but with the parameters of all actions, those of the others set to 0;
+    - `sequential`: the state and the discrete action first, then their embedding and the action's own parameters.
+
+    Shapes: states `[B, observation_dim]`, discrete actions `[B]`, parameters `[B, num_parameters]` in [-1, 1].
     """
+
+    mask: Tensor
+    slots: Tensor
 
     def __init__(self, specs: PAMDPSpecs, form: str, num_members: int, hidden_dims: list[int], out_dim: int) -> None:
         super().__init__()
         self.form = form
-        width = max(specs.parameter_dims)
+        self.num_discrete = specs.num_discrete
+        max_parameters = max(specs.parameter_dims)
         first_dim = specs.observation_dim + specs.num_discrete
-        slot_dim = specs.num_parameters if form == "masking" else width
+        parameters_dim = specs.num_parameters if form == "masking" else max_parameters
         self.first = nn.Linear(first_dim, hidden_dims[0]) if form == "sequential" else None
         in_dim = hidden_dims[0] if form == "sequential" else first_dim
-        self.net = EnsembleMLP(num_members, in_dim + slot_dim, hidden_dims, out_dim)
+        self.net = EnsembleMLP(num_members, in_dim + parameters_dim, hidden_dims, out_dim)
         mask = specs.parameter_mask
-        # Where each key's own parameters lie, moved to the front; 0 parameters of other keys fill the rest.
         self.register_buffer("mask", mask.float())
-        self.register_buffer("slots", (~mask).to(torch.int8).argsort(dim=-1, stable=True)[:, :width])
+        # The columns of each discrete action's own parameters; where it has fewer than the maximum, columns of other
+        # actions follow, which the mask sets to 0.
+        self.register_buffer("slots", (~mask).to(torch.int8).argsort(dim=-1, stable=True)[:, :max_parameters])
 
     def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Apply all members."""
         own = unit * self.mask[discrete]
         if self.form != "masking":
             own = own.gather(-1, self.slots[discrete])
-        x = torch.cat([state, F.one_hot(discrete, self.mask.shape[0]).to(state.dtype)], -1)
+        x = torch.cat([state, F.one_hot(discrete, self.num_discrete).to(state.dtype)], -1)
         if self.first is not None:
             x = self.first(x).relu()
         return self.net(torch.cat([x, own], -1))
 
 
 class Prediction(NamedTuple):
-    """What the model says of a press."""
+    """What the model predicts for one step."""
 
-    next_state: Tensor  # [B, observation_dim], if the press does not terminate
-    continuing: Tensor  # [E, B] reward if it does not
+    next_state: Tensor  # [B, observation_dim], if the step does not terminate
+    continuing: Tensor  # [E, B] reward if the step does not terminate
     terminating: Tensor  # [E, B] reward if it does
     logit: Tensor  # [E, B] of termination
 
 
 class PAMDPModel(nn.Module):
-    """Transition, reward and termination predictors; `[E]` members for all but the transition."""
+    """One transition predictor, and an ensemble of `num_members` predictors of reward and termination."""
+
+    state_mean: Tensor
+    state_scale: Tensor
+    change_scale: Tensor
 
     def __init__(self, specs: PAMDPSpecs, form: str, hidden_dims: list[int], num_members: int) -> None:
         super().__init__()
@@ -69,14 +82,15 @@ class PAMDPModel(nn.Module):
         self.register_buffer("change_scale", torch.ones(specs.observation_dim))
 
     def fit_scales(self, state: Tensor, next_state: Tensor) -> None:
-        """Take the scales of inputs and targets from transitions `[B, observation_dim]`."""
-        # Entries that never change keep a scale that makes them weigh nothing.
+        """Set the scales of inputs and targets from transitions `[B, observation_dim]`."""
+        # The lower bound keeps entries that never change from dividing by 0.
         self.state_mean.copy_(state.mean(0))
         self.state_scale.copy_(state.std(0).clamp(min=1e-2))
         self.change_scale.copy_((next_state - state).std(0).clamp(min=1e-2))
 
     def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Prediction:
-        """Predict one press from states `[B, observation_dim]`, keys `[B]`, parameters `[B, num_parameters]`."""
+        """Predict one step from states `[B, observation_dim]`, discrete actions `[B]`, parameters in [-1, 1]."""
         scaled = (state - self.state_mean) / self.state_scale
         change = self.transition(scaled, discrete, unit)[0] * self.change_scale
-        return Prediction(state + change, *self.outcome(scaled, discrete, unit).unbind(-1))
+        continuing, terminating, logit = self.outcome(scaled, discrete, unit).unbind(-1)
+        return Prediction(state + change, continuing, terminating, logit)

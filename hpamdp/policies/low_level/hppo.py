@@ -1,19 +1,20 @@
-"""H-PPO: proximal policy optimisation with a discrete actor for the key and a continuous actor for its parameters.
+"""H-PPO: proximal policy optimisation with a discrete actor and a continuous actor for the parameters.
 
-Both actors stand on one encoder, one critic V(s) serves both, and each has a clipped surrogate with its own ratio. Only
-the parameters of the key that was pressed have a likelihood.
+Both actors share an encoder, and one critic V(s) serves both. Each actor has its own probability ratio and its own
+clipped surrogate; the ratio of the parameters covers the chosen action's own parameters alone.
 
 Source: Fan, Su, Zhang and Yu, *Hybrid Actor-Critic Reinforcement Learning in Parameterized Action Space*, 2019, arXiv
 1903.01344, section 4; PPO: Schulman, Wolski, Dhariwal, Radford and Klimov 2017, arXiv 1707.06347, equation 7; GAE:
 Schulman, Moritz, Levine, Jordan and Abbeel 2016, arXiv 1506.02438, equation 16.
 
 Differs from the source:
-- the heads' surrogates are computed here and not by TorchRL's ClipPPOLoss, which multiplies the ratios of all heads and
-  clips the product; the advantages are TorchRL's;
-- a Gaussian in the units [-1, 1] of the bounds gives the parameters; the raw sample is kept for the ratio and clipped
-  only where it is pressed, which spares the likelihood of a squashed one its poles at the bounds;
-- the Gaussian's deviation has a floor, for ratios explode where it shrinks faster than the steps of its mean; floor,
-  learning rate and entropy bonus fall over `anneal_frames` presses of the whole run.
+- the parameters are Gaussian in units where their bounds are [-1, 1]; the ratio is that of the raw sample, which is
+  clipped only for execution, because the density of a squashed sample diverges at the bounds;
+- the Gaussian's standard deviation has a lower limit, because the ratios explode where it shrinks faster than the mean
+  moves; this limit, the learning rate and the entropy bonus are annealed over `anneal_frames` steps of the whole run.
+
+The advantages are TorchRL's. Its ClipPPOLoss is not used because it multiplies the ratios of all heads and clips the
+product.
 """
 
 from __future__ import annotations
@@ -31,38 +32,49 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
 from hpamdp.policies.shared.fractions import Fraction
-from hpamdp.policies.shared.hybrid_actor import HybridActor, encoder
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
-# What the ratio needs of a press: the parameters as they were drawn, in units of their bounds, and the log-likelihoods.
-RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB = "raw_parameters", "discrete_log_prob", "parameter_log_prob"
+# The policy also writes what the ratios need: the raw sample of the parameters and the log-likelihoods.
+RAW = "raw_parameters"
+DISCRETE_LOG_PROB = "discrete_log_prob"
+PARAMETER_LOG_PROB = "parameter_log_prob"
 
 
 class HPPOPolicy(TensorDictModuleBase):
-    """Draws the press from the actor, or takes its likeliest one when greedy."""
+    """Samples the action from the actor, or takes the most probable one when greedy; records its likelihood."""
 
     def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB]
-        self.actor, self.specs = actor, specs
+        self.actor = actor
+        self.specs = specs
 
+    @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write key `[*B]`, parameters `[*B, num_parameters]` and what the ratio needs of them."""
-        with torch.no_grad():
-            distribution = self.actor(td.get(keys.OBSERVATION))
-            discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
-            discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, raw)
-            duration = self.specs.from_unit(raw.clamp(-1.0, 1.0))
-        written = {RAW: raw, DISCRETE_LOG_PROB: discrete_log_prob, PARAMETER_LOG_PROB: parameter_log_prob}
-        return td.update({**written, keys.ACTION: {"discrete": discrete, "parameters": duration}})
+        """Write the discrete action `[*B]`, the parameters `[*B, num_parameters]` and what their ratios need."""
+        distribution: HybridDistribution = self.actor(td.get(keys.OBSERVATION))
+        discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
+        discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, raw)
+        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
+        return td.update(
+            {
+                RAW: raw,
+                DISCRETE_LOG_PROB: discrete_log_prob,
+                PARAMETER_LOG_PROB: parameter_log_prob,
+                keys.ACTION: {"discrete": discrete, "parameters": parameters},
+            }
+        )
 
 
 class HPPO(OnPolicy, Learner):
-    """Clipped policy-gradient updates of both actors from the presses just collected."""
+    """Clipped policy-gradient updates of both actors from the steps just collected."""
 
     has_value: ClassVar[bool] = True
+
+    frames: Tensor
 
     def __init__(
         self,
@@ -92,14 +104,18 @@ class HPPO(OnPolicy, Learner):
         if not min_scale < initial_scale < max_scale:
             raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
         super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
-        self.gamma, self.gae_lambda, self.critic_weight = gamma, gae_lambda, critic_weight
-        self.discrete_entropy, self.parameter_entropy, self.entropy_final = (
-            discrete_entropy,
-            parameter_entropy,
-            entropy_final,
-        )
-        self.min_scale, self.min_scale_final = min_scale, min_scale_final
-        self.lr, self.lr_final, self.anneal_frames = lr, lr_final, anneal_frames
+        self.gamma = gamma
+        self.gae_lambda = gae_lambda
+        self.critic_weight = critic_weight
+        self.discrete_entropy = discrete_entropy
+        self.parameter_entropy = parameter_entropy
+        self.entropy_final = entropy_final
+        self.min_scale = min_scale
+        self.min_scale_final = min_scale_final
+        self.lr = lr
+        self.lr_final = lr_final
+        self.anneal_frames = anneal_frames
+
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), initial_scale)
         self.critic = nn.Sequential(
             encoder(specs.observation_dim, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
@@ -114,9 +130,10 @@ class HPPO(OnPolicy, Learner):
         return self.critic(observation).squeeze(-1)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Estimate the own rows' advantages; from a minibatch of rows on, make `epochs` passes over them.
+        """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.
 
-        Fewer rows, as of an option that is seldom chosen, wait for more; the policy that drew them stays until then.
+        Fewer rows, as of an option that is seldom chosen, wait for more; the policy that sampled them does not change
+        until then.
         """
         progress = min(1.0, self.frames.item() / self.anneal_frames)
         self.frames += batch.numel()
@@ -133,13 +150,15 @@ class HPPO(OnPolicy, Learner):
         return scalars
 
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the generalised advantages and the targets of V, each `[*B, T]`; they count in the rows of `mask`.
+        """Return the generalised advantages and the targets of V, each `[*B, T]`; only the rows in `mask` are valid.
 
-        Bootstrapping stops where an episode terminated, the trace where it is done or its option ends, for there
-        another option's rows can begin; those rows are zeros here.
+        Bootstrapping stops where the episode terminates. The trace also stops at truncations and where an option ends,
+        since the next row may be another learner's; the rows of other learners are treated as zeros.
         """
         with torch.no_grad():
-            value, next_value, reward = torch.zeros(3, *mask.shape, 1, device=mask.device)
+            value = torch.zeros(*mask.shape, 1, device=mask.device)
+            next_value = torch.zeros_like(value)
+            reward = torch.zeros_like(value)
             value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
             next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
             reward[mask] = batch.get(("next", keys.REWARD))[mask]
@@ -150,34 +169,53 @@ class HPPO(OnPolicy, Learner):
         return advantage.squeeze(-1), target.squeeze(-1)
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
-        advantage, target = (each[mask] for each in self.advantages(batch, mask))
-        own = {name: batch.get(name)[mask] for name in (keys.OBSERVATION, RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB)}
-        own |= {"discrete": batch.get(keys.DISCRETE)[mask], "advantage": advantage, "target": target}
-        return TensorDict(own, batch_size=advantage.shape)
+        """Return what an update needs of the rows in `mask`, `[N]`."""
+        advantage, target = self.advantages(batch, mask)
+        return TensorDict(
+            {
+                keys.OBSERVATION: batch.get(keys.OBSERVATION)[mask],
+                "discrete": batch.get(keys.DISCRETE)[mask],
+                RAW: batch.get(RAW)[mask],
+                DISCRETE_LOG_PROB: batch.get(DISCRETE_LOG_PROB)[mask],
+                PARAMETER_LOG_PROB: batch.get(PARAMETER_LOG_PROB)[mask],
+                "advantage": advantage[mask],
+                "target": target[mask],
+            },
+            batch_size=[int(mask.sum())],
+        )
 
     def _update(self, rows: TensorDictBase, entropy_weight: float) -> dict[str, Tensor]:
-        distribution = self.actor(rows[keys.OBSERVATION])
+        """Make one optimisation step of actors and critic from a minibatch `[B]`; return scalars."""
+        distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION])
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
         discrete_log_ratio = discrete_log_prob - rows[DISCRETE_LOG_PROB]
         parameter_log_ratio = parameter_log_prob - rows[PARAMETER_LOG_PROB]
-        gain = self.surrogate(discrete_log_ratio, rows["advantage"]) + self.surrogate(
-            parameter_log_ratio, rows["advantage"]
-        )
+        discrete_gain = self.surrogate(discrete_log_ratio, rows["advantage"])
+        parameter_gain = self.surrogate(parameter_log_ratio, rows["advantage"])
+        gain = (discrete_gain + parameter_gain).mean()
+
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.discrete_entropy * discrete_entropy + self.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(rows[keys.OBSERVATION]).squeeze(-1), rows["target"])
-        self.optimizer_step(self.critic_weight * critic_loss - gain.mean() - entropy_weight * bonus)
+        self.optimizer_step(self.critic_weight * critic_loss - gain - entropy_weight * bonus)
         with torch.no_grad():
-            # exp(x) - 1 - x, an estimate of the divergence that is never negative.
-            ratios = (discrete_log_ratio, parameter_log_ratio)
-            discrete_kl, parameter_kl = ((ratio.expm1() - ratio).mean() for ratio in ratios)
-            clipped = [ratio.expm1().abs() > self.clip for ratio in ratios]
             return {
                 "critic": critic_loss.detach(),
                 "discrete_entropy": discrete_entropy.detach(),
                 "scale": distribution.log_scale.mean().exp(),
-                "discrete_kl": discrete_kl,
-                "parameter_kl": parameter_kl,
-                "discrete_clipped": clipped[0].float().mean(),
-                "parameter_clipped": clipped[1].float().mean(),
+                "discrete_kl": kl_estimate(discrete_log_ratio),
+                "parameter_kl": kl_estimate(parameter_log_ratio),
+                "discrete_clipped": self._clipped_fraction(discrete_log_ratio),
+                "parameter_clipped": self._clipped_fraction(parameter_log_ratio),
             }
+
+    def _clipped_fraction(self, log_ratio: Tensor) -> Tensor:
+        return (log_ratio.expm1().abs() > self.clip).float().mean()
+
+
+def kl_estimate(log_ratio: Tensor) -> Tensor:
+    """Estimate the divergence of the new policy from the old one as the mean of r - 1 - log(r), never negative.
+
+    Source: Schulman 2020, *Approximating KL Divergence*, http://joschu.net/blog/kl-approx.html.
+    """
+    return (log_ratio.expm1() - log_ratio).mean()

@@ -1,105 +1,103 @@
-"""Hybrid SAC: soft actor-critic whose actor chooses among the keys and draws the parameters of each.
+"""Hybrid SAC: soft actor-critic that chooses a discrete action and samples the parameters of each.
 
-One network gives pi(k | s) and, for every key, a squashed Gaussian pi(x_k | s); twin critics give Q(s, k, x_k) with the
-entropies of both, each weighed by a temperature of its own, as part of the return.
+One network gives pi(k | s) and, for every discrete action k, a squashed Gaussian pi(x_k | s). Twin critics give
+Q(s, k, x_k), in which the entropies of both are part of the return, each weighted by its own temperature.
 
 Source: Delalleau, Peter, Alonso and Logut, *Discrete and Continuous Action Representation for Practical RL in Video
 Games*, 2019, arXiv 1912.11077 (parameterised actions, two temperatures). Tuned temperatures: Haarnoja et al. 2018,
 arXiv 1812.05905, section 5. Exact expectation over discrete actions: Christodoulou 2019, arXiv 1910.07207.
 
 Differs from the source:
-- the critics are multi-pass (Bester, James and Konidaris 2019, arXiv 1905.04388): the value of a key sees its own
-  parameters alone, so that those of the other keys get no false gradient and add no noise to the target;
-- each temperature has a target: a share of the uniform keys' entropy, and nats for each parameter of the executed
-  key, so that keys with more parameters, or none, need no target of their own;
+- the critics are multi-pass (Bester, James and Konidaris 2019, arXiv 1905.04388): the value of a discrete action sees
+  its own parameters alone, so the others neither receive false gradients nor add noise to the target;
+- each temperature has a target entropy: a fraction of the uniform distribution's for the discrete action, and nats for
+  each parameter of the executed action, so actions with more parameters, or none, need no target of their own;
 - the actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477).
 
-TorchRL's SACLoss and DiscreteSACLoss do not fit: each takes a single action leaf and a single temperature, while the
-expectation over keys here weighs the densities of parameters too. TanhNormal took 2.5 times as long as the density
-taken here from the sample before its squashing, which also is exact at the bounds.
+TorchRL's SACLoss does not fit: it sums the log-probabilities of all action leaves under one temperature; nor does its
+DiscreteSACLoss, which has no parameters: the expectation over discrete actions here also weighs their log-densities.
+Sampling parameters with their densities from TorchRL's TanhNormal takes 2 to 4 times as long as the
+`HybridDistribution` used here, and its densities are wrong near the bounds, where it inverts the tanh.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, ClassVar
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import PositiveFraction
-from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, sample_index
+from hpamdp.policies.shared.hybrid_actor import HybridDistribution
+from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 
-class HybridDistribution(NamedTuple):
-    """Log-probabilities of the keys `[B, num_keys]`; before squashing, mean and deviation `[B, num_parameters]`."""
+class HSACActor(nn.Module):
+    """One network for the logits of the discrete actions and the Gaussians of their parameters, before squashing.
 
-    discrete_log_probs: Tensor
-    mean: Tensor
-    scale: Tensor
+    Args:
+        specs: sizes and bounds of the problem.
+        hidden_dims: sizes of the hidden layers.
+        scale_range: smallest and largest standard deviation.
+    """
 
-    def sample_parameters(self) -> tuple[Tensor, Tensor]:
-        """Draw all keys' parameters in [-1, 1], differentiably, and return them with their log-densities."""
-        noise = torch.randn_like(self.mean)
-        raw = self.mean + self.scale * noise
-        gaussian = -0.5 * noise.square() - self.scale.log() - 0.5 * math.log(2.0 * math.pi)
-        # log(1 - tanh(raw)^2) without its loss of digits
-        return raw.tanh(), gaussian - 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
-
-
-class HybridActor(nn.Module):
-    """One network for the keys' probabilities and the parameters' Gaussians, deviations within `scale_range`."""
+    parameter_mask: Tensor
 
     def __init__(self, specs: PAMDPSpecs, hidden_dims: list[int], scale_range: tuple[float, float]) -> None:
         super().__init__()
         self.sizes = [specs.num_discrete, specs.num_parameters, specs.num_parameters]
-        self.low, self.high = (math.log(scale) for scale in scale_range)
+        self.log_min_scale, self.log_max_scale = (math.log(scale) for scale in scale_range)
         self.net = mlp(specs.observation_dim, hidden_dims, sum(self.sizes))
+        self.register_buffer("parameter_mask", specs.parameter_mask.float(), persistent=False)
 
     def forward(self, state: Tensor) -> HybridDistribution:
-        """Return the distribution of the next press for states `[*B, observation_dim]`."""
+        """Return the distribution of the action for states `[*B, observation_dim]`."""
         logits, mean, raw_scale = self.net(state).split(self.sizes, -1)
-        log_scale = self.low + (self.high - self.low) * raw_scale.sigmoid()
-        return HybridDistribution(logits.log_softmax(-1), mean, log_scale.exp())
+        log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
+        return HybridDistribution(logits.log_softmax(-1), mean, log_scale, self.parameter_mask)
 
 
 class HSACPolicy(TensorDictModuleBase):
-    """Draws key and parameters, uniformly during the warm-up; greedy: the likeliest key and the squashed means."""
+    """Samples the action, uniformly during the warm-up; greedy: the most probable one with the squashed means."""
 
-    def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
+    is_random: Tensor
+
+    def __init__(self, actor: HSACActor, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
-        self.actor, self.specs = actor, specs
+        self.actor = actor
+        self.specs = specs
         self.register_buffer("is_random", torch.ones((), dtype=torch.bool))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write key `[*B]` and parameters `[*B, num_parameters]`."""
-        distribution = self.actor(td.get(keys.OBSERVATION))
-        if is_greedy():
-            discrete, unit = distribution.discrete_log_probs.argmax(-1), distribution.mean.tanh()
-        elif self.is_random:
+        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
+        distribution: HybridDistribution = self.actor(td.get(keys.OBSERVATION))
+        if self.is_random and not is_greedy():
             unit = 2.0 * torch.rand_like(distribution.mean) - 1.0
             discrete = torch.randint(self.specs.num_discrete, unit.shape[:-1], device=unit.device)
         else:
-            discrete, unit = sample_index(distribution.discrete_log_probs), distribution.sample_parameters()[0]
+            discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
+            unit = raw.tanh()
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}})
 
 
 class HSAC(ReplayLearner):
-    """Soft policy iteration over keys and their parameters, from a replay buffer of its own."""
+    """Soft policy iteration over discrete actions and their parameters, from a replay buffer of its own."""
 
     has_value: ClassVar[bool] = True
+
+    policy: HSACPolicy
 
     def __init__(
         self,
@@ -127,7 +125,7 @@ class HSAC(ReplayLearner):
         critic_lr: PositiveFloat,
     ) -> None:
         if not min_scale < max_scale:
-            raise ValueError(f"min_scale={min_scale}: must lie below max_scale={max_scale}")
+            raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
         super().__init__(
             specs,
             device,
@@ -139,9 +137,10 @@ class HSAC(ReplayLearner):
         )
         self.discrete_target_entropy = discrete_target_entropy * math.log(specs.num_discrete)
         self.parameter_target_entropy = parameter_target_entropy
-        self.policy_delay, self.tau = policy_delay, tau
+        self.policy_delay = policy_delay
+        self.tau = tau
 
-        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale))
+        self.actor = HSACActor(specs, hidden_dims, (min_scale, max_scale))
         self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_discrete_temperature = nn.Parameter(
@@ -164,37 +163,45 @@ class HSAC(ReplayLearner):
         return self.soft_value(self.critics, observation)[0]
 
     def explore(self, frames: int) -> None:
-        """Leave the presses to the actor."""
+        """Explore with the actor from the end of the warm-up on."""
         self.policy.is_random.fill_(False)
 
     def temperatures(self) -> tuple[Tensor, Tensor]:
-        """Return the weights of the keys' and of the parameters' entropy, which carry no gradient."""
+        """Return the weights of the discrete entropy and of the parameters' entropy, without gradients."""
         return self.log_discrete_temperature.detach().exp(), self.log_parameter_temperature.detach().exp()
 
     def soft_value(self, critics: HybridCritics, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the value of states `[B, observation_dim]` and both entropies less their targets, each `[B]`.
+        """Return the soft value V of states `[B, observation_dim]`, and both entropies minus their targets, each `[B]`.
 
-        V = sum_k pi(k) [min Q(k, x_k) - a log pi(k) - b log pi(x_k)] with drawn x_k: exact over keys, so that only the
-        parameters of the key that is executed weigh in the entropy.
+        V = sum_k pi(k) [min Q(k, x_k) - a log pi(k) - b log pi(x_k)] with sampled x_k and temperatures a and b. The
+        expectation over discrete actions is exact; the parameters' entropy is that of the executed action's own.
         """
         discrete_weight, parameter_weight = self.temperatures()
-        distribution = self.actor(state)
-        unit, log_density = distribution.sample_parameters()
-        discrete_log_probs, own_log_density = distribution.discrete_log_probs, log_density @ critics.mask.T
-        q = critics(state, unit).amin(0) - discrete_weight * discrete_log_probs - parameter_weight * own_log_density
-        pi = discrete_log_probs.exp()
-        discrete_excess = -(pi * discrete_log_probs).sum(-1) - self.discrete_target_entropy
-        own_target = self.parameter_target_entropy * critics.mask.sum(-1)
-        return (pi * q).sum(-1), discrete_excess, -(pi * (own_log_density + own_target)).sum(-1)
+        distribution: HybridDistribution = self.actor(state)
+        unit, log_density = distribution.sample_squashed()
+        mask = distribution.parameter_mask
+        log_probs = distribution.discrete_log_probs
+        # Of each discrete action's own parameters together, `[B, num_discrete]`.
+        own_log_density = log_density @ mask.T
+        own_target = self.parameter_target_entropy * mask.sum(-1)
+        q = critics(state, unit).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
+        probs = log_probs.exp()
+        discrete_excess = -(probs * log_probs).sum(-1) - self.discrete_target_entropy
+        parameter_excess = -(probs * (own_log_density + own_target)).sum(-1)
+        return (probs * q).sum(-1), discrete_excess, parameter_excess
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update the critics, now and then also actor and temperatures."""
+        """Update the critics; every `policy_delay` updates, also the actor and the temperatures. Return scalars."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         critic_loss = (q - self._target(sample)).square().mean(-1).sum()
         self.optimizer_step("critics", critic_loss)
         discrete_temperature, parameter_temperature = self.temperatures()
-        scalars = {"critic": critic_loss, "q": q.mean()}
-        scalars |= {"discrete_temperature": discrete_temperature, "parameter_temperature": parameter_temperature}
+        scalars = {
+            "critic": critic_loss,
+            "q": q.mean(),
+            "discrete_temperature": discrete_temperature,
+            "parameter_temperature": parameter_temperature,
+        }
         if self.updates % self.policy_delay == 0:
             scalars |= self._update_actor(sample["state"])
             self._update_temperatures(scalars["discrete_excess"], scalars["parameter_excess"])
@@ -208,7 +215,7 @@ class HSAC(ReplayLearner):
             return batch["reward"] + batch["discount"] * value
 
     def _update_actor(self, state: Tensor) -> dict[str, Tensor]:
-        """Let the actor ascend the soft value; return the loss and the mean entropies less their targets."""
+        """Update the actor to increase the soft value; return the loss and the mean entropies minus their targets."""
         self.critics.requires_grad_(False)
         value, discrete_excess, parameter_excess = self.soft_value(self.critics, state)
         loss = -value.mean()
@@ -217,8 +224,9 @@ class HSAC(ReplayLearner):
         return {"actor": loss, "discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
 
     def _update_temperatures(self, discrete_excess: Tensor, parameter_excess: Tensor) -> None:
-        """Lower a temperature where its entropy exceeds the target, raise it where it falls short."""
-        loss = self.log_discrete_temperature * discrete_excess.detach()
-        loss = loss + self.log_parameter_temperature * parameter_excess.detach()
-        if loss.requires_grad:
+        """Lower each temperature where its entropy exceeds the target, raise it where the entropy falls short."""
+        discrete_loss = self.log_discrete_temperature * discrete_excess.detach()
+        parameter_loss = self.log_parameter_temperature * parameter_excess.detach()
+        loss = discrete_loss + parameter_loss
+        if loss.requires_grad:  # not if both temperatures are fixed
             self.optimizer_step("temperatures", loss)

@@ -1,14 +1,17 @@
-"""Implicit Q-learning: the value of the better part of the data's own presses, and a policy that imitates these.
+"""Implicit Q-learning: the value of the better actions in the data, and a policy that imitates these.
 
-V(s) is an upper expectile of Q(s, k, x) over the presses in the data, Q follows r + gamma V(s'), and the policy weighs
-the presses' likelihood by exp(temperature * (Q - V)): nothing is ever asked of Q that the data doesn't hold.
+V(s) is an upper expectile of Q(s, k, x) over the actions in the data, Q is fitted to r + gamma V(s'), and the policy
+maximises the log-likelihood of the data's actions, weighted by exp(temperature * (Q - V)). Q is never evaluated at an
+action that is not in the data.
 
 Source: Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q-Learning*, arXiv 2110.06169,
 equations 5 to 7.
 
-Differs from the source: a press is a key and its own parameters, so the policy is H-PPO's (Fan et al. 2019, arXiv
-1903.01344) and Q sees the pressed key's parameters alone, as in MP-DQN (Bester et al. 2019, arXiv 1905.04388).
-TorchRL's IQLLoss takes one action leaf, hence not the losses of this file.
+Differs from the source: an action is a discrete action and its own parameters, so the policy is H-PPO's (Fan et al.
+2019, arXiv 1903.01344) and Q sees the chosen action's own parameters alone, as in MP-DQN (Bester et al. 2019, arXiv
+1905.04388).
+
+TorchRL's IQLLoss does not fit: it reads a single action leaf.
 """
 
 from __future__ import annotations
@@ -23,14 +26,14 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp.policies.shared.fractions import PositiveFraction
-from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridPolicy
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 
 class IQL(ReplayLearner):
-    """Twin critics, an expectile of them, and an advantage-weighted policy, from a data set or a replay buffer."""
+    """Twin critics, a state value and an advantage-weighted policy, from a data set or a replay buffer."""
 
     has_value: ClassVar[bool] = True
 
@@ -65,7 +68,11 @@ class IQL(ReplayLearner):
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
         )
-        self.expectile, self.temperature, self.max_weight, self.tau = expectile, temperature, max_weight, tau
+        self.expectile = expectile
+        self.temperature = temperature
+        self.max_weight = max_weight
+        self.tau = tau
+
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
         self.state_value = mlp(specs.observation_dim, hidden_dims, 1)
         self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
@@ -83,21 +90,27 @@ class IQL(ReplayLearner):
         return self.state_value(observation).squeeze(-1)
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update V, then Q, then the policy from transitions `[batch_size]`."""
-        state, discrete, unit = sample["state"], sample["discrete"], sample["unit"]
+        """Update V, then Q, then the policy from transitions `[batch_size]`; return scalars."""
+        state = sample["state"]
+        discrete = sample["discrete"]
+        unit = sample["unit"]
+
         with torch.no_grad():
             q = self.target_critics.of_discrete(state, discrete, unit).amin(0)
         excess = q - self.value(state)
         value_loss = (torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile) * excess.square()).mean()
         self.optimizer_step("state_value", value_loss)
+
         with torch.no_grad():
             advantage = q - self.value(state)
             target = sample["reward"] + sample["discount"] * self.value(sample["next_state"])
-        critics = self.critics.of_discrete(state, discrete, unit)
-        critic_loss = F.mse_loss(critics, target.expand_as(critics))
+        critics_q = self.critics.of_discrete(state, discrete, unit)
+        critic_loss = F.mse_loss(critics_q, target.expand_as(critics_q))
         self.optimizer_step("critics", critic_loss)
         polyak_update(self.target_critics, self.critics, self.tau)
+
         weight = (self.temperature * advantage).exp().clamp(max=self.max_weight)
-        of_discrete, of_parameters = self.actor(state).log_prob(discrete, unit)
-        self.optimizer_step("actor", -(weight * (of_discrete + of_parameters)).mean())
+        distribution: HybridDistribution = self.actor(state)
+        discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, unit)
+        self.optimizer_step("actor", -(weight * (discrete_log_prob + parameter_log_prob)).mean())
         return {"critic": critic_loss, "value": value_loss, "q": q.mean(), "advantage_weight": weight.mean()}

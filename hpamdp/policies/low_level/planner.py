@@ -1,11 +1,11 @@
-"""The environment's own planner as a learner: the upper line."""
+"""The environment's own planner as a learner: the upper reference for learners."""
 
 from __future__ import annotations
 
 from typing import ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from hpamdp import keys
@@ -14,27 +14,35 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class PlannerPolicy(TensorDictModuleBase):
-    """Press what the best plan for the held option says."""
+    """Takes the planned action of the current option."""
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
-        self.in_keys = [keys.ORACLE_DISCRETE, keys.ORACLE_PARAMETERS]
+        in_keys: list[NestedKey] = [keys.ORACLE_DISCRETE, keys.ORACLE_PARAMETERS]
         if specs.num_options:
-            self.in_keys.append(keys.OPTION)
+            in_keys.append(keys.OPTION)
+        self.in_keys = in_keys
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.specs = specs
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the action leaves; the plan's duration stands for every key, of which only the pressed one's counts."""
-        discrete, duration = td.get(keys.ORACLE_DISCRETE), td.get(keys.ORACLE_PARAMETERS)
-        option = td.get(keys.OPTION) if self.specs.num_options else torch.zeros_like(discrete[..., 0])
-        discrete, duration = (plan.gather(-1, option.unsqueeze(-1)).squeeze(-1) for plan in (discrete, duration))
-        duration = duration.unsqueeze(-1).expand(*duration.shape, self.specs.num_parameters)
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": duration}})
+        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`.
+
+        A plan has one parameter, which is written for every discrete action; only the planned action's own counts.
+        """
+        # One plan for each option, `[*B, num_options]`; a single one where there is no choice.
+        planned_discrete = td.get(keys.ORACLE_DISCRETE)
+        planned_parameter = td.get(keys.ORACLE_PARAMETERS)
+        option = td.get(keys.OPTION) if self.specs.num_options else torch.zeros_like(planned_discrete[..., 0])
+        option = option.unsqueeze(-1)
+        discrete = planned_discrete.gather(-1, option).squeeze(-1)
+        parameter = planned_parameter.gather(-1, option)
+        parameters = parameter.expand(*parameter.shape[:-1], self.specs.num_parameters)
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
 
 class Planner(Learner):
-    """Learn nothing and follow the planner."""
+    """Follows the planner and learns nothing."""
 
     needs: ClassVar[tuple[str, ...]] = ("oracle",)
 

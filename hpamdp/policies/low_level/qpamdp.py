@@ -1,6 +1,7 @@
-"""Q-PAMDP: learn which key to press and, with that frozen, for how long; then the other way round.
+"""Q-PAMDP: learn which discrete action to take, then, with that fixed, its parameters, and so on in turns.
 
-Sarsa(lambda) with linear values of the keys and an episodic natural actor-critic (eNAC) for the parameters take turns.
+The values of the discrete actions are linear and learned by Sarsa(lambda); the parameters are learned by the episodic
+natural actor-critic (eNAC).
 
 Source: Masson, Ranchod and Konidaris, *Reinforcement Learning with Parameterized Actions*, 2016, arXiv 1509.01644:
 algorithm 1 and section 5; eNAC: Peters and Schaal 2008, *Natural Actor-Critic*, table 2; Fourier basis: Konidaris,
@@ -8,13 +9,13 @@ Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learni
 on the step: Dabney and Barto 2012, *Adaptive Step-Size for Online Temporal Difference Learning*.
 
 Differs from the source:
-- all environments update together: Sarsa takes the mean of their updates, one step of theirs after the other, and the
-  bound on its step holds for that mean; eNAC's regression is accumulated as normal equations, ridge added;
-- the next key's value is its expectation under the softmax where the next key is not in the batch: in its last column
-  and where an episode is truncated;
+- all environments learn together: Sarsa makes one update per time step, the mean over the environments, and the bound
+  on its step size holds for that mean; eNAC accumulates its regression as normal equations, with ridge regularisation;
+- the value of the next discrete action is its expectation under the softmax where that action is not in the batch: in
+  the batch's last column and where an episode is truncated;
 - the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to its range in the warm-up;
-- parameters are in units of their bounds, sigma is a standard deviation, returns are not discounted in eNAC, and its
-  step is bounded by the divergence from the old policy.
+- parameters are in units where their bounds are [-1, 1], sigma is a standard deviation, eNAC's returns are not
+  discounted, and its step is bounded by the divergence from the old policy.
 """
 
 from __future__ import annotations
@@ -35,12 +36,29 @@ from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import sample_index
 from hpamdp.specs import PAMDPSpecs
 
-RAW = "raw_parameters"  # the parameters as they were drawn, in units of their bounds: [-1, 1] before clipping
-SARSA, PARAMETERS = 0, 1  # the phases
+# The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
+RAW = "raw_parameters"
+
+# The phases: what is being learned.
+SARSA = 0
+PARAMETERS = 1
 
 
 class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
-    """A softmax over linear values of the keys, and Gaussian parameters with linear means."""
+    """A softmax over linear values of the discrete actions, and Gaussian parameters with linear means.
+
+    Args:
+        specs: sizes and bounds of the problem.
+        phi: features of the values.
+        psi: features of the means.
+        temperature: of the softmax.
+        sigma: standard deviation of the parameters.
+        mean: initial mean of the parameters.
+    """
+
+    w: Tensor
+    theta: Tensor
+    sigma: Tensor
 
     def __init__(
         self, specs: PAMDPSpecs, phi: FourierBasis, psi: FourierBasis, temperature: float, sigma: float, mean: float
@@ -48,89 +66,134 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW]
-        self.specs, self.phi, self.psi, self.temperature = specs, phi, psi, temperature
+        self.specs = specs
+        self.phi = phi
+        self.psi = psi
+        self.temperature = temperature
         self.register_buffer("w", torch.zeros(specs.num_discrete, 1))
         self.register_buffer("theta", torch.full((specs.num_parameters, 1), mean))
         self.register_buffer("sigma", torch.tensor(sigma))
 
     def widen(self) -> None:
-        """Give the weights the bases' sizes; what they say stays the same."""
+        """Append zeros to the weights to match the fitted bases; the policy stays the same."""
         self.w = F.pad(self.w, (0, len(self.phi.coefficients) - self.w.shape[1]))
         self.theta = F.pad(self.theta, (0, len(self.psi.coefficients) - self.theta.shape[1]))
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write key `[*B]`, parameters and their raw sample `[*B, num_parameters]`."""
+        """Write the discrete action `[*B]`, the parameters and their raw sample, each `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
-        q, raw = self.phi(observation) @ self.w.T, self.psi(observation) @ self.theta.T
+        q = self.phi(observation) @ self.w.T
+        raw = self.psi(observation) @ self.theta.T
         if is_greedy():
             discrete = q.argmax(-1)
         else:
             discrete = sample_index(q / self.temperature)
             raw = raw + self.sigma * torch.randn_like(raw)
-        duration = self.specs.from_unit(raw.clamp(-1.0, 1.0))
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": duration}, RAW: raw})
+        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}, RAW: raw})
 
 
 class SarsaLambda(SizedByData):
-    """Linear Sarsa(lambda) over environments side by side; their traces go on from one batch to the next."""
+    """Linear Sarsa(lambda) over parallel environments; the traces carry over from one batch to the next.
+
+    Args:
+        gamma: discount of a step.
+        trace_decay: lambda.
+        step_size: largest step size.
+        temperature: of the softmax policy.
+    """
+
+    traces: Tensor
 
     def __init__(self, gamma: float, trace_decay: float, step_size: float, temperature: float) -> None:
         super().__init__()
-        self.gamma, self.trace_decay, self.step_size, self.temperature = gamma, trace_decay, step_size, temperature
+        self.gamma = gamma
+        self.trace_decay = trace_decay
+        self.step_size = step_size
+        self.temperature = temperature
         self.register_buffer("traces", torch.zeros(0, 1, 1))
 
     def update(self, w: Tensor, rows: TensorDict) -> tuple[Tensor, Tensor]:
-        """Return the new weights `[num_keys, num_features]` and the mean squared error of the temporal differences.
+        """Make one update for each time step of a batch.
 
-        Rows `[N, T]` have `phi`, `next_phi`, `key`, `reward`, `terminated`, `done` and `mask`: those that count.
+        Args:
+            w: weights `[num_discrete, num_features]`.
+            rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
+                `done` and `mask` `[N, T]`; only the rows in `mask` count.
+
+        Returns:
+            The new weights and the mean squared temporal-difference error.
         """
         num_envs, num_steps = rows.shape
         if self.traces.shape != (num_envs, *w.shape):
             self.traces = w.new_zeros(num_envs, *w.shape)
-        every, errors = torch.arange(num_envs, device=w.device), []
+        envs = torch.arange(num_envs, device=w.device)
+        errors: list[Tensor] = []
         for t in range(num_steps):
             row = rows[:, t]
-            phi, next_phi, discrete = row["phi"], row["next_phi"], row["discrete"]
+            phi = row["phi"]
+            next_phi = row["next_phi"]
+            discrete = row["discrete"]
             weight = row["mask"] / row["mask"].sum().clamp(min=1)
             self.traces *= self.gamma * self.trace_decay
-            self.traces[every, discrete] += phi
+            self.traces[envs, discrete] += phi
+
             next_q = next_phi @ w.T
-            following = (next_q / self.temperature).softmax(-1)
+            next_probs = (next_q / self.temperature).softmax(-1)
             if t + 1 < num_steps:
-                pressed = F.one_hot(rows["discrete"][:, t + 1], len(w))
-                following = torch.where(row["done"].unsqueeze(-1), following, pressed)
-            following = self.gamma * following * ~row["terminated"].unsqueeze(-1)
-            error = row["reward"] + (following * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
-            # How far a unit step would move the errors themselves, on average: Dabney and Barto's bound.
-            along = torch.einsum("nkf,nf->nk", self.traces, next_phi)
-            change = (following * along).sum(-1) - (self.traces[every, discrete] * phi).sum(-1)
-            step = (1.0 / (change * weight).sum().abs()).clamp(max=self.step_size)
-            w = w + step * torch.einsum("n,nkf->kf", error * weight, self.traces)
+                taken = F.one_hot(rows["discrete"][:, t + 1], len(w))
+                next_probs = torch.where(row["done"].unsqueeze(-1), next_probs, taken)
+            next_weight = self.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
+            error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
+
+            # Dabney and Barto's bound: the mean change of the errors that a step of size 1 would cause.
+            next_change = torch.einsum("nkf,nf->nk", self.traces, next_phi)
+            change = (next_weight * next_change).sum(-1) - (self.traces[envs, discrete] * phi).sum(-1)
+            step_size = (1.0 / (change * weight).sum().abs()).clamp(max=self.step_size)
+            w = w + step_size * torch.einsum("n,nkf->kf", error * weight, self.traces)
             self.traces[row["done"]] = 0.0
             errors.append((error.square() * weight).sum())
         return w, torch.stack(errors).mean()
 
 
 class NaturalActorCritic(SizedByData):
-    """The regression of eNAC: whole episodes' returns on the sums of their log-likelihoods' gradients and phi(s_0).
+    """The regression of eNAC: episode returns on the summed gradients of the log-likelihood and on phi(s_0).
 
-    An episode may span batches. Only those count that began after the last `restart`, under the present parameters.
+    Episodes may span batches. Only those that began after the last `restart` count, since earlier rows were sampled by
+    an older policy.
+
+    Args:
+        ridge: weight of the ridge penalty, in units of the regressors' mean square.
     """
+
+    is_fresh: Tensor  # where the next row begins an episode
+    is_whole: Tensor  # where the current episode began after the last restart
+    regressors: Tensor  # of the current episodes
+    returns: Tensor  # of the current episodes
+    gram: Tensor
+    moment: Tensor
+    num_episodes: Tensor
 
     def __init__(self, ridge: float) -> None:
         super().__init__()
         self.ridge = ridge
-        self.register_buffer("is_fresh", torch.zeros(0, dtype=torch.bool))  # the next row begins an episode
+        self.register_buffer("is_fresh", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("is_whole", torch.zeros(0, dtype=torch.bool))
-        self.register_buffer("regressors", torch.zeros(0, 0))  # of the episodes under way
+        self.register_buffer("regressors", torch.zeros(0, 0))
         self.register_buffer("returns", torch.zeros(0))
         self.register_buffer("gram", torch.zeros(0, 0, dtype=torch.float64))
         self.register_buffer("moment", torch.zeros(0, dtype=torch.float64))
         self.register_buffer("num_episodes", torch.zeros((), dtype=torch.long))
 
     def restart(self, num_regressors: int, is_fresh: Tensor) -> None:
-        """Begin a new regression; `is_fresh` `[N]`: where the next row begins an episode."""
-        self.is_fresh, self.is_whole = is_fresh.clone(), torch.zeros_like(is_fresh)
+        """Discard the collected episodes.
+
+        Args:
+            num_regressors: number of coefficients of the new regression.
+            is_fresh: where the next row begins an episode, bool `[N]`.
+        """
+        self.is_fresh = is_fresh.clone()
+        self.is_whole = torch.zeros_like(is_fresh)
         self.regressors = self.regressors.new_zeros(len(is_fresh), num_regressors)
         self.returns = self.returns.new_zeros(len(is_fresh))
         self.gram = self.gram.new_zeros(num_regressors, num_regressors)
@@ -138,25 +201,40 @@ class NaturalActorCritic(SizedByData):
         self.num_episodes.zero_()
 
     def collect(self, rows: TensorDict) -> None:
-        """Take rows `[N, T]` with `gradient` `[N, T, P]`, `phi`, `reward`, `done` and `mask`, the rows that count."""
-        finished = []
+        """Add the episodes that end in a batch to the regression.
+
+        Args:
+            rows: `[N, T]` with `gradient` `[N, T, num_weights]`, `phi` `[N, T, num_features]`, and `reward`, `done` and
+                `mask` `[N, T]`; only the episodes whose last row is in `mask` count.
+        """
+        ended_regressors: list[Tensor] = []
+        ended_returns: list[Tensor] = []
         for t in range(rows.shape[1]):
             row = rows[:, t]
-            gradient, start = row["gradient"], F.pad(row["phi"], (row["gradient"].shape[-1], 0))
+            gradient = row["gradient"]
+            num_weights = gradient.shape[-1]
+            start = F.pad(row["phi"], (num_weights, 0))
             self.regressors = torch.where(self.is_fresh.unsqueeze(-1), start, self.regressors)
-            self.regressors[:, : gradient.shape[-1]] += gradient
+            self.regressors[:, :num_weights] += gradient
             self.returns = torch.where(self.is_fresh, 0.0, self.returns) + row["reward"]
             self.is_whole = self.is_whole | self.is_fresh
             self.is_fresh = row["done"].clone()
             ended = row["done"] & row["mask"] & self.is_whole
-            finished.append((self.regressors[ended], self.returns[ended]))
-        x, y = (torch.cat(parts) for parts in zip(*finished, strict=True))
+            ended_regressors.append(self.regressors[ended])
+            ended_returns.append(self.returns[ended])
+        x = torch.cat(ended_regressors)
+        y = torch.cat(ended_returns)
         self.gram += x.T @ x
         self.moment += x.T @ y
         self.num_episodes += len(y)
 
     def natural_gradient(self, num_weights: int) -> tuple[Tensor, Tensor]:
-        """Return the first `num_weights` coefficients and what a unit step along them diverges by (nats an episode)."""
+        """Solve the regression.
+
+        Returns:
+            The first `num_weights` coefficients, which are the natural gradient, and the divergence that a step of
+            size 1 along them causes, in nats an episode, `[]`.
+        """
         penalty = self.ridge * self.gram.diagonal().mean() * torch.eye(len(self.gram)).to(self.gram)
         solution = torch.linalg.lstsq(self.gram + penalty, self.moment.unsqueeze(-1)).solution[:num_weights, 0]
         fisher = self.gram[:num_weights, :num_weights] / self.num_episodes
@@ -164,9 +242,25 @@ class NaturalActorCritic(SizedByData):
 
 
 class QPAMDP(Learner):
-    """Sarsa(lambda) for the keys and eNAC for their parameters, in turns counted in finished episodes."""
+    """Sarsa(lambda) for the discrete actions and eNAC for their parameters, in turns.
+
+    A phase consists of windows of finished episodes: Sarsa updates in every batch, eNAC once at the end of a window.
+    """
 
     has_value: ClassVar[bool] = True
+
+    policy: QPAMDPPolicy
+    mask: Tensor
+    low: Tensor
+    high: Tensor
+    best_return: Tensor  # of the current phase's windows
+    window_return: Tensor  # sum over the current window
+    frames: Tensor
+    phase: Tensor
+    window_episodes: Tensor
+    windows: Tensor  # finished in the current phase
+    windows_since_best: Tensor
+    updates: Tensor  # of the parameters
 
     def __init__(
         self,
@@ -199,31 +293,44 @@ class QPAMDP(Learner):
         super().__init__(specs)
         if features is not None and not all(i < specs.observation_dim for i in features):
             last = specs.observation_dim - 1
-            raise ValueError(f"features={features}: the observation has entries 0 to {last}; null: all")
-        self.features, self.warmup_frames, self.initial_episodes = features, warmup_frames, initial_episodes
-        self.relearning_episodes, self.rollouts = relearning_episodes, rollouts
-        self.parameter_updates, self.patience, self.max_divergence = parameter_updates, patience, max_divergence
-        self.natural_step_size, self.sigma_final, self.sigma_decay = natural_step_size, sigma_final, sigma_decay
+            raise ValueError(f"features={features}: the observation has entries 0 to {last}; use null for all of them")
+        self.features = features
+        self.warmup_frames = warmup_frames
+        self.initial_episodes = initial_episodes
+        self.relearning_episodes = relearning_episodes
+        self.parameter_updates = parameter_updates
+        self.patience = patience
+        self.rollouts = rollouts
+        self.natural_step_size = natural_step_size
+        self.max_divergence = max_divergence
+        self.sigma_final = sigma_final
+        self.sigma_decay = sigma_decay
 
-        phi, psi = FourierBasis(phi_order, phi_max_coupled), FourierBasis(psi_order, psi_max_coupled)
+        phi = FourierBasis(phi_order, phi_max_coupled)
+        psi = FourierBasis(psi_order, psi_max_coupled)
         self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean)
-        self.sarsa, self.enac = SarsaLambda(gamma, trace_decay, step_size, temperature), NaturalActorCritic(ridge)
+        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, temperature)
+        self.enac = NaturalActorCritic(ridge)
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf))
         self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf))
-        self.register_buffer("best_return", torch.tensor(-torch.inf))  # of the phase's windows
+        self.register_buffer("best_return", torch.tensor(-torch.inf))
         self.register_buffer("window_return", torch.zeros(()))
         for name in ("frames", "phase", "window_episodes", "windows", "windows_since_best", "updates"):
             self.register_buffer(name, torch.zeros((), dtype=torch.long))
         self.to(device)
 
     def value(self, observation: Tensor) -> Tensor:
-        """Return the highest value of a key, `[B]`."""
+        """Return the highest value of a discrete action, `[B]`."""
         return (self.policy.phi(observation) @ self.policy.w.T).amax(-1)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Fit the features' ranges once the warm-up is over; then update the phase's half, and change phase if due."""
-        batch, mask = batch.reshape(-1, batch.shape[-1]), mask.reshape(-1, mask.shape[-1])
+        """Collect the ranges of the features during the warm-up; then learn what the phase learns, and end it if due.
+
+        Updates within a phase use the rows in `mask`; windows count their episodes.
+        """
+        batch = batch.reshape(-1, batch.shape[-1])
+        mask = mask.reshape(-1, mask.shape[-1])
         if self.frames < self.warmup_frames:
             self._warm_up(batch[keys.OBSERVATION][mask])
             return {}
@@ -241,9 +348,12 @@ class QPAMDP(Learner):
             is_full = self.enac.num_episodes >= self.rollouts
         if is_full:
             scalars |= self._end_window(rows["done"][:, -1])
-        return {**scalars, "updates": self.updates.item(), "sigma": self.policy.sigma.item()}
+        scalars["updates"] = self.updates.item()
+        scalars["sigma"] = self.policy.sigma.item()
+        return scalars
 
     def _warm_up(self, observation: Tensor) -> None:
+        """Extend the ranges by observations `[N, observation_dim]`; fit the bases once there are enough."""
         self.frames += len(observation)
         self.low = torch.cat([observation, self.low.unsqueeze(0)]).amin(0)
         self.high = torch.cat([observation, self.high.unsqueeze(0)]).amax(0)
@@ -257,9 +367,9 @@ class QPAMDP(Learner):
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what the phase's update needs of a batch `[N, T]`."""
-        policy, observation = self.policy, batch[keys.OBSERVATION]
+        observation = batch[keys.OBSERVATION]
         rows = {
-            "phi": policy.phi(observation),
+            "phi": self.policy.phi(observation),
             "discrete": batch[keys.DISCRETE],
             "reward": batch["next", keys.REWARD].squeeze(-1),
             "terminated": batch["next", keys.TERMINATED].squeeze(-1),
@@ -267,27 +377,32 @@ class QPAMDP(Learner):
             "mask": mask,
         }
         if self.phase == SARSA:
-            rows["next_phi"] = policy.phi(batch["next", keys.OBSERVATION])
+            rows["next_phi"] = self.policy.phi(batch["next", keys.OBSERVATION])
         else:
-            psi = policy.psi(observation)
-            score = (batch[RAW] - psi @ policy.theta.T) / policy.sigma.square() * self.mask[rows["discrete"]]
+            psi = self.policy.psi(observation)
+            mean = psi @ self.policy.theta.T
+            score = (batch[RAW] - mean) / self.policy.sigma.square() * self.mask[rows["discrete"]]
             rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
         return TensorDict(rows, batch_size=mask.shape)
 
     def _end_window(self, is_fresh: Tensor) -> dict[str, float]:
-        """Step theta where it is its turn, and change phase where this one is over."""
-        scalars = {"return": (self.window_return / self.window_episodes.clamp(min=1)).item()}
+        """Update the parameters if that is the phase, and end the phase if it is over; return scalars.
+
+        Args:
+            is_fresh: where the next row begins an episode, bool `[N]`.
+        """
+        window_return = (self.window_return / self.window_episodes.clamp(min=1)).item()
+        scalars = {"return": window_return}
         if self.phase == PARAMETERS:
             scalars |= self._step_parameters()
         self.windows += 1
-        self.windows_since_best = (self.windows_since_best + 1) * (self.best_return >= scalars["return"])
-        self.best_return.clamp_(min=scalars["return"])
-        if self.parameter_updates is None:
-            is_over = self.windows_since_best >= self.patience
+        if window_return > self.best_return:
+            self.best_return.fill_(window_return)
+            self.windows_since_best.zero_()
         else:
-            is_over = self.windows >= (1 if self.phase == SARSA else self.parameter_updates)
-        if is_over:
-            self.phase = 1 - self.phase
+            self.windows_since_best += 1
+        if self._phase_is_over():
+            self.phase.fill_(PARAMETERS if self.phase == SARSA else SARSA)
             self.best_return.fill_(-torch.inf)
             self.windows.zero_()
             self.windows_since_best.zero_()
@@ -298,9 +413,15 @@ class QPAMDP(Learner):
         self.window_episodes.zero_()
         return scalars
 
+    def _phase_is_over(self) -> bool:
+        if self.parameter_updates is None:
+            return bool(self.windows_since_best >= self.patience)
+        return bool(self.windows >= (1 if self.phase == SARSA else self.parameter_updates))
+
     def _step_parameters(self) -> dict[str, float]:
+        """Step the mean parameters along the natural gradient and lower sigma; return scalars."""
         direction, divergence = self.enac.natural_gradient(self.policy.theta.numel())
-        # The divergence grows with the step's square.
+        # The divergence grows with the square of the step.
         step = (self.max_divergence / divergence.clamp(min=1e-12)).sqrt().clamp(max=self.natural_step_size)
         self.policy.theta = self.policy.theta + step * direction.view_as(self.policy.theta)
         self.policy.sigma = (self.policy.sigma * self.sigma_decay).clamp(min=self.sigma_final)

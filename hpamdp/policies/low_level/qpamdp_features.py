@@ -1,7 +1,7 @@
-"""Fourier features of the observation for Q-PAMDP, and modules whose buffers get their sizes from data.
+"""Fourier features of the observation for Q-PAMDP, and modules whose buffers are sized by data.
 
 Source: Konidaris, Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learning using the Fourier
-Basis*; see `qpamdp.py`, also for what differs.
+Basis*; see `qpamdp.py`, also for the differences from the source.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 
 class SizedByData(nn.Module):
-    """A module whose buffers get their sizes from data, and so from a checkpoint when it is loaded."""
+    """A module whose buffers are sized by data; loading a state dict resizes them to what was saved."""
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         for name, buffer in list(self.named_buffers(recurse=False)):
@@ -26,33 +26,56 @@ class SizedByData(nn.Module):
 
 
 def fourier_coefficients(num_inputs: int, order: int, max_coupled: int) -> Tensor:
-    """Return the cosines' coefficients `[num_features, num_inputs]`: 0 to `order`, at most `max_coupled` not 0.
+    """Return the coefficients of the cosines, `[num_features, num_inputs]`.
 
-    The constant comes first.
+    They are all vectors of integers from 0 to `order` of which at most `max_coupled` are not 0. The constant (all 0)
+    comes first.
     """
-    rows = [
-        [dict(zip(coupled, values, strict=True)).get(i, 0) for i in range(num_inputs)]
-        for num_coupled in range(min(max_coupled, num_inputs) + 1)
-        for coupled in itertools.combinations(range(num_inputs), num_coupled)
-        for values in itertools.product(range(1, order + 1), repeat=num_coupled)
-    ]
+    rows: list[list[int]] = []
+    for num_coupled in range(min(max_coupled, num_inputs) + 1):
+        for coupled in itertools.combinations(range(num_inputs), num_coupled):
+            for values in itertools.product(range(1, order + 1), repeat=num_coupled):
+                row = [0] * num_inputs
+                for i, value in zip(coupled, values, strict=True):
+                    row[i] = value
+                rows.append(row)
     return torch.tensor(rows, dtype=torch.float32)
 
 
 class FourierBasis(SizedByData):
-    """Cosine features cos(pi c.u) of the observation's chosen entries, scaled to u in [0, 1]; at first the constant."""
+    """Cosine features cos(pi c.u) of some entries of the observation, scaled to u in [0, 1].
+
+    Until `fit` is called, the only feature is the constant 1.
+
+    Args:
+        order: largest coefficient.
+        max_coupled: largest number of entries that a feature depends on.
+    """
+
+    inputs: Tensor
+    low: Tensor
+    width: Tensor
+    coefficients: Tensor
 
     def __init__(self, order: int, max_coupled: int) -> None:
         super().__init__()
-        self.order, self.max_coupled = order, max_coupled
+        self.order = order
+        self.max_coupled = max_coupled
         self.register_buffer("inputs", torch.zeros(1, dtype=torch.long))
         self.register_buffer("low", torch.zeros(1))
         self.register_buffer("width", torch.ones(1))
         self.register_buffer("coefficients", torch.zeros(1, 1))
 
     def fit(self, inputs: Tensor, low: Tensor, high: Tensor) -> None:
-        """Use the observation's entries `inputs` int64 `[d]`, which lie between `low` and `high` `[d]`."""
-        self.inputs, self.low, self.width = inputs, low, (high - low).clamp(min=1e-6)
+        """Set the entries of the observation to use and their ranges.
+
+        Args:
+            inputs: indices of the entries, int64 `[d]`.
+            low, high: their bounds, `[d]`; values outside are clipped.
+        """
+        self.inputs = inputs
+        self.low = low
+        self.width = (high - low).clamp(min=1e-6)
         self.coefficients = fourier_coefficients(len(inputs), self.order, self.max_coupled).to(low)
 
     def forward(self, observation: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Random presses: the lower line for learners."""
+"""Uniformly random actions: the lower reference for learners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class RandomPolicy(TensorDictModuleBase):
-    """Press a uniformly random key with uniformly random parameters."""
+    """Takes a uniformly random discrete action with uniformly random parameters."""
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
@@ -21,15 +21,15 @@ class RandomPolicy(TensorDictModuleBase):
         self.specs = specs
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the action leaves."""
-        batch, device = td.batch_size, td.get(keys.OBSERVATION).device
-        unit = 2.0 * torch.rand(*batch, self.specs.num_parameters, device=device) - 1.0
-        discrete = torch.randint(self.specs.num_discrete, batch, device=device)
+        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
+        device = td.get(keys.OBSERVATION).device
+        unit = 2.0 * torch.rand(*td.batch_size, self.specs.num_parameters, device=device) - 1.0
+        discrete = torch.randint(self.specs.num_discrete, td.batch_size, device=device)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}})
 
 
 class Random(Learner):
-    """Learn nothing and press at random."""
+    """Acts at random and learns nothing."""
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

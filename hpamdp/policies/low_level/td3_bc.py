@@ -1,12 +1,15 @@
-"""TD3+BC for parameterised actions: P-DQN whose parameters stay near the data's, and whose keys the data holds.
+"""TD3+BC for parameterised actions: P-DQN restricted to the data's discrete actions, with parameters near the data's.
 
 Source: Fujimoto and Gu 2021, *A Minimalist Approach to Offline Reinforcement Learning*, arXiv 2106.06860, equation 5,
-on the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twins, smoothing and delay of TD3 (Fujimoto et
-al. 2018, arXiv 1802.09477). Which keys count as in the data: discrete BCQ (Fujimoto et al. 2019, arXiv 1910.01708,
-equation in section 4).
+on the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twin critics, smoothing and delay of TD3
+(Fujimoto et al. 2018, arXiv 1802.09477). Which discrete actions are allowed: discrete BCQ (Fujimoto et al. 2019, arXiv
+1910.01708, equation in section 4).
 
-Differs from the sources: every key has its parameters, so the actor ascends the keys' values in proportion to how often
-the data presses them, and is held to the data at the pressed key alone.
+Differs from the sources: every discrete action has its own parameters, so the actor increases the values of all
+discrete actions, each weighted by its frequency in the data; the distance from the data is that of the recorded
+action's own parameters.
+
+TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, without a discrete choice.
 """
 
 from __future__ import annotations
@@ -30,7 +33,18 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class TD3BCPolicy(TensorDictModuleBase):
-    """Of the keys that the data presses in such a state, that of the highest Q; explores with noise on parameters."""
+    """Takes the discrete action with the highest Q among the allowed ones; explores with noise on the parameters.
+
+    A discrete action is allowed where the data takes it often enough.
+
+    Args:
+        actor: the parameters of all discrete actions, in [-1, 1].
+        critics: the values of all discrete actions.
+        behaviour: logits of the data's discrete actions.
+        specs: sizes and bounds of the problem.
+        discrete_threshold: least probability of an allowed action, as a fraction of the most frequent action's.
+        parameter_noise: standard deviation of the exploration noise.
+    """
 
     def __init__(
         self,
@@ -42,18 +56,27 @@ class TD3BCPolicy(TensorDictModuleBase):
         parameter_noise: float,
     ) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = [keys.OBSERVATION], [keys.DISCRETE, keys.PARAMETERS]
-        self.actor, self.critics, self.behaviour, self.specs = actor, critics, behaviour, specs
-        self.log_threshold, self.parameter_noise = torch.tensor(discrete_threshold).log().item(), parameter_noise
+        self.in_keys = [keys.OBSERVATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
+        self.actor = actor
+        self.critics = critics
+        self.behaviour = behaviour
+        self.specs = specs
+        self.log_threshold = torch.tensor(discrete_threshold).log().item()  # -inf where the threshold is 0
+        self.parameter_noise = parameter_noise
 
     def is_rare(self, state: Tensor) -> Tensor:
-        """Return which keys the data presses too seldom in states `[B, observation_dim]`, bool `[B, num_keys]`."""
+        """Return which discrete actions are too rare in the data, bool `[B, num_discrete]`.
+
+        Args:
+            state: `[B, observation_dim]`.
+        """
         log_probs = self.behaviour(state).log_softmax(-1)
         return log_probs < log_probs.amax(-1, keepdim=True) + self.log_threshold
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write key `[*B]` and parameters `[*B, num_parameters]`."""
+        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         unit = self.actor(state)
         q = self.critics(state, unit).amin(0)
@@ -65,9 +88,12 @@ class TD3BCPolicy(TensorDictModuleBase):
 
 
 class TD3BC(ReplayLearner):
-    """Q-learning on keys of the data with parameters near the data's, from a data set or a replay buffer."""
+    """Q-learning on the data's discrete actions with parameters near the data's, from a data set or a replay buffer."""
 
     has_value: ClassVar[bool] = True
+
+    policy: TD3BCPolicy
+    parameter_mask: Tensor
 
     def __init__(
         self,
@@ -99,8 +125,12 @@ class TD3BC(ReplayLearner):
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
         )
-        self.behaviour_weight, self.policy_delay, self.tau = behaviour_weight, policy_delay, tau
-        self.target_smoothing, self.target_smoothing_clip = target_smoothing, target_smoothing_clip
+        self.behaviour_weight = behaviour_weight
+        self.target_smoothing = target_smoothing
+        self.target_smoothing_clip = target_smoothing_clip
+        self.policy_delay = policy_delay
+        self.tau = tau
+
         self.actor = nn.Sequential(mlp(specs.observation_dim, hidden_dims, specs.num_parameters), nn.Tanh())
         self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.behaviour = mlp(specs.observation_dim, hidden_dims, specs.num_discrete)
@@ -116,13 +146,15 @@ class TD3BC(ReplayLearner):
         }
 
     def value(self, observation: Tensor) -> Tensor:
-        """Return the highest Q of the data's keys at the actor's parameters, `[B]`."""
+        """Return the highest Q of the allowed discrete actions at the actor's parameters, `[B]`."""
         q = self.critics(observation, self.actor(observation)).amin(0)
         return q.masked_fill(self.policy.is_rare(observation), -torch.inf).amax(-1)
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update critics and keys' frequencies, now and then also the actor and the targets."""
-        state, discrete, unit = sample["state"], sample["discrete"], sample["unit"]
+        """Update critics and behaviour; every `policy_delay` updates, also actor and targets. Return scalars."""
+        state = sample["state"]
+        discrete = sample["discrete"]
+        unit = sample["unit"]
         q = self.critics.of_discrete(state, discrete, unit)
         critic_loss = F.mse_loss(q, self._target(sample).expand_as(q))
         self.optimizer_step("critics", critic_loss)
@@ -136,14 +168,14 @@ class TD3BC(ReplayLearner):
         return scalars
 
     def _update_actor(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
-        """Let the parameters ascend the values of the data's keys and stay near the data; return the loss."""
-        own = self.actor(state)
+        """Update the actor towards higher values and towards the data; return the loss."""
+        own_unit = self.actor(state)
         self.critics.requires_grad_(False)
         with torch.no_grad():
             frequency = self.behaviour(state).softmax(-1)
-        q = (self.critics(state, own).amin(0) * frequency).sum(-1)
-        distance = ((own - unit).square() * self.parameter_mask[discrete]).sum(-1)
-        # The values in units of their own size, so that the weight means the same whatever the reward's scale.
+        q = (self.critics(state, own_unit).amin(0) * frequency).sum(-1)
+        distance = ((own_unit - unit).square() * self.parameter_mask[discrete]).sum(-1)
+        # Values are divided by their mean size, so that the weight does not depend on the scale of the reward.
         loss = (self.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
         self.optimizer_step("actor", loss)
         self.critics.requires_grad_(True)
@@ -151,10 +183,11 @@ class TD3BC(ReplayLearner):
 
     @torch.no_grad()
     def _target(self, sample: TensorDictBase) -> Tensor:
-        """Return r + discount max_k Q'(s', k, x'(s')) over the data's keys, `[B]`."""
+        """Return r + discount max_k Q'(s', k, x'(s')) over the allowed discrete actions k, `[B]`."""
         state = sample["next_state"]
         unit = self.target_actor(state)
         bound = self.target_smoothing_clip
         noise = (self.target_smoothing * torch.randn_like(unit)).clamp(-bound, bound)
         q = self.target_critics(state, (unit + noise).clamp(-1.0, 1.0)).amin(0)
-        return sample["reward"] + sample["discount"] * q.masked_fill(self.policy.is_rare(state), -torch.inf).amax(-1)
+        best = q.masked_fill(self.policy.is_rare(state), -torch.inf).amax(-1)
+        return sample["reward"] + sample["discount"] * best

@@ -1,0 +1,1 @@
+"""Parts that several learners or selectors share."""

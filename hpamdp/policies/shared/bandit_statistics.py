@@ -1,4 +1,7 @@
-"""What context-free bandits have in common: what each option has paid so far, and the choice of the best mean."""
+"""What context-free bandits share: the statistics of each option's rewards, and the greedy choice.
+
+The reward of a bandit is here the return of an option.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +21,39 @@ Discount = Annotated[float, Field(gt=0.0, lt=1.0)]
 
 
 class RewardStatistics(nn.Module):
-    """Counts, sums and sums of squares of the options' payoffs.
+    """Weighted counts, sums and sums of squares of each option's rewards.
 
-    Source of the forgetting forms: Garivier and Moulines 2011, arXiv 0805.3415, section 2.
+    Source of the discounted and the sliding-window form: Garivier and Moulines 2011, arXiv 0805.3415, section 2.
 
     Args:
-        num_options: how many options.
-        memory: `all` counts every payoff the same, `discounted` weighs one by `discount` to the power of its age in
+        num_options: number of options.
+        memory: `all` gives every reward the weight 1, `discounted` the weight `discount` to the power of its age in
             decisions, `sliding_window` forgets all but the last `window` decisions.
-        discount: of the discounted form.
-        window: of the sliding-window form.
+        discount: used with `discounted` only.
+        window: used with `sliding_window` only.
+
+    Attributes:
+        counts, sums, squares: of each option's rewards, float64 `[num_options]`.
+        num_decisions: how many decisions were added, forgotten ones included.
+        recent_options, recent_rewards: of the last decisions, `[window]`, oldest first; the option is -1 where there is
+            no decision yet. Empty unless the memory is `sliding_window`.
     """
+
+    counts: Tensor
+    sums: Tensor
+    squares: Tensor
+    num_decisions: Tensor
+    recent_options: Tensor
+    recent_rewards: Tensor
 
     def __init__(self, num_options: int, memory: Memory, discount: float, window: int) -> None:
         super().__init__()
         self.memory = memory
         self.discount = discount if memory == "discounted" else 1.0
-        # float64: sums over 10^8 decisions.
-        for name in ("counts", "sums", "squares"):
-            self.register_buffer(name, torch.zeros(num_options, dtype=torch.float64))
+        # float64, because there may be 10^8 decisions to sum over.
+        self.register_buffer("counts", torch.zeros(num_options, dtype=torch.float64))
+        self.register_buffer("sums", torch.zeros(num_options, dtype=torch.float64))
+        self.register_buffer("squares", torch.zeros(num_options, dtype=torch.float64))
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
         size = window if memory == "sliding_window" else 0
         self.register_buffer("recent_options", torch.full((size,), -1, dtype=torch.long))
@@ -44,22 +61,22 @@ class RewardStatistics(nn.Module):
 
     @property
     def means(self) -> Tensor:
-        """Mean payoff of each option, `[num_options]`; 0 where nothing is remembered."""
+        """Mean reward of each option, `[num_options]`; 0 for untried options."""
         return self.sums / self.counts.clamp(min=1e-12)
 
     @property
     def deviation(self) -> Tensor:
-        """Standard deviation of all payoffs, a scalar; next to 0 while there are none."""
+        """Standard deviation of all rewards, a scalar; close to 0 without rewards."""
         total = self.counts.sum().clamp(min=1.0)
         return (self.squares.sum() / total - (self.sums.sum() / total).square()).clamp(min=1e-12).sqrt()
 
     @property
     def is_untried(self) -> Tensor:
-        """Whether nothing is remembered of an option, bool `[num_options]`."""
+        """Whether no reward of an option is known, bool `[num_options]`; options become untried again if forgotten."""
         return self.counts < 1e-9
 
     def best(self) -> int:
-        """Return the option with the highest mean payoff."""
+        """Return the option with the highest mean reward."""
         return int(torch.where(self.is_untried, -torch.inf, self.means).argmax())
 
     def weights(self, num: int) -> Tensor:
@@ -67,7 +84,7 @@ class RewardStatistics(nn.Module):
         return self.discount ** torch.arange(num - 1, -1, -1, device=self.counts.device).double()
 
     def add(self, options: Tensor, rewards: Tensor) -> None:
-        """Take in the payoffs `[N]` of options `[N]`, oldest first."""
+        """Add the rewards `[N]` of the options `[N]`, oldest first."""
         self.num_decisions += len(options)
         rewards = rewards.double()
         if self.memory == "sliding_window":
@@ -75,36 +92,40 @@ class RewardStatistics(nn.Module):
             self.recent_options = torch.cat([self.recent_options, options])[-size:]
             self.recent_rewards = torch.cat([self.recent_rewards, rewards])[-size:]
             is_filled = self.recent_options >= 0
-            options, rewards = self.recent_options[is_filled], self.recent_rewards[is_filled]
-            for total in (self.counts, self.sums, self.squares):
-                total.zero_()
+            options = self.recent_options[is_filled]
+            rewards = self.recent_rewards[is_filled]
+            self.counts.zero_()
+            self.sums.zero_()
+            self.squares.zero_()
         weights = self.weights(len(options))
         fade = self.discount ** len(options)
-        for total, value in (
-            (self.counts, weights),
-            (self.sums, weights * rewards),
-            (self.squares, weights * rewards.square()),
-        ):
-            total.mul_(fade).index_add_(0, options, value)
+        self.counts.mul_(fade).index_add_(0, options, weights)
+        self.sums.mul_(fade).index_add_(0, options, weights * rewards)
+        self.squares.mul_(fade).index_add_(0, options, weights * rewards.square())
 
 
 class Bandit(Selector):
-    """A selector that sees no context: it remembers payoffs and draws options. A subclass writes `draw`."""
+    """A selector that sees no context: it chooses by the rewards of the options alone. A subclass writes `sample`.
+
+    Args:
+        specs: of the problem.
+        memory, discount, window: which rewards count, as in `RewardStatistics`.
+    """
 
     def __init__(self, specs: PAMDPSpecs, memory: Memory, discount: float, window: int) -> None:
         super().__init__(specs)
-        self.rewards = RewardStatistics(specs.num_options, memory, discount, window)
+        self.statistics = RewardStatistics(specs.num_options, memory, discount, window)
 
     def sample(self, num: int) -> Tensor:
-        """Return `num` exploring choices, int64 `[num]`, for decisions that are due at once."""
+        """Return `num` exploring choices, int64 `[num]`, for decisions that are due at the same time."""
         raise NotImplementedError
 
     def best(self) -> int:
         """Return the greedy choice."""
-        return self.rewards.best()
+        return self.statistics.best()
 
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return the choices `[*B]`: the best option where the policy is greedy, else `draw`s."""
+        """Return the choices `[*B]`: the best option if the policy is greedy, else samples where a decision is due."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         if is_greedy():
             return torch.full_like(is_decision, self.best(), dtype=torch.long)
@@ -113,6 +134,8 @@ class Bandit(Selector):
         return choices
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
-        """Take in the finished decisions' payoffs, oldest first; return each option's mean."""
-        self.rewards.add(decisions.get(keys.OPTION), decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1))
-        return {f"reward_{name}": self.rewards.means[i].item() for i, name in enumerate(self.specs.option_names)}
+        """Add the rewards of finished decisions, oldest first; return the mean reward of each option."""
+        rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
+        self.statistics.add(decisions.get(keys.OPTION), rewards)
+        means = self.statistics.means.tolist()
+        return {f"reward_{name}": mean for name, mean in zip(self.specs.option_names, means, strict=True)}

@@ -1,4 +1,4 @@
-"""Types of options that are shares of a whole, checked when a yaml is read."""
+"""Option types for fractions of a whole, checked when a config is read."""
 
 from __future__ import annotations
 

@@ -1,15 +1,17 @@
-"""A hybrid stochastic policy's network: a categorical over the keys and a Gaussian for their parameters."""
+"""Stochastic hybrid policies: a categorical over the discrete actions and a Gaussian for their parameters."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
@@ -18,10 +20,20 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class HybridDistribution(NamedTuple):
-    """A categorical over keys and a Gaussian for each of their parameters.
+    """A categorical over the discrete actions and a Gaussian for all their parameters.
 
-    Shapes: log-probabilities of the keys `[*B, num_keys]`, mean and log-deviation `[*B, num_parameters]`, the mask of
-    each key's own parameters `[num_keys, num_parameters]`.
+    Raw parameters are samples of the Gaussian in units where the bounds are [-1, 1]. They can be brought within the
+    bounds in two ways:
+
+    - clipped: the learner keeps the raw sample, whose likelihood is `log_prob`, and clips it only for execution;
+    - squashed by tanh: `sample_squashed` returns parameters within the bounds and their log-densities, and gradients
+      flow through both.
+
+    Attributes:
+        discrete_log_probs: log-probabilities of the discrete actions, `[*B, num_discrete]`.
+        mean: of the raw parameters, `[*B, num_parameters]`.
+        log_scale: logarithm of their standard deviation, `[*B, num_parameters]`.
+        parameter_mask: 1 where a parameter belongs to a discrete action, else 0, `[num_discrete, num_parameters]`.
     """
 
     discrete_log_probs: Tensor
@@ -30,30 +42,62 @@ class HybridDistribution(NamedTuple):
     parameter_mask: Tensor
 
     def sample(self) -> tuple[Tensor, Tensor]:
-        """Draw keys `[*B]` and unbounded parameters `[*B, num_parameters]`, those of the other keys too."""
-        return sample_index(self.discrete_log_probs), self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
+        """Sample discrete actions `[*B]` and the raw parameters of all of them, `[*B, num_parameters]`."""
+        discrete = sample_index(self.discrete_log_probs)
+        return discrete, self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
 
     def mode(self) -> tuple[Tensor, Tensor]:
-        """Return the likeliest key `[*B]` and the mean parameters `[*B, num_parameters]`."""
+        """Return the most probable discrete action `[*B]` and the mean raw parameters `[*B, num_parameters]`."""
         return self.discrete_log_probs.argmax(-1), self.mean
 
+    def sample_squashed(self) -> tuple[Tensor, Tensor]:
+        """Sample squashed parameters in [-1, 1]; return them and their log-densities, each `[*B, num_parameters]`.
+
+        The density is computed from the sample before squashing, which keeps it exact at the bounds.
+        """
+        scale = self.log_scale.exp()
+        noise = torch.randn_like(self.mean)
+        raw = self.mean + scale * noise
+        squashed = raw.tanh()
+        # log(1 - tanh(raw)^2), without loss of precision for large |raw|.
+        log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
+        # scale.log(), not log_scale: the density of the scale as it was rounded for the sample.
+        return squashed, gaussian_log_density(noise, scale.log()) - log_slope
+
     def log_prob(self, discrete: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the log-likelihoods `[*B]` of the key and of its own parameters, 0 where it has none."""
-        normal = (
-            -0.5 * ((raw - self.mean) / self.log_scale.exp()).square() - self.log_scale - 0.5 * math.log(2 * math.pi)
-        )
-        of_discrete = self.discrete_log_probs.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
-        return of_discrete, (normal * self.parameter_mask[discrete]).sum(-1)
+        """Return the log-likelihoods of the discrete actions and of their own raw parameters.
+
+        Args:
+            discrete: `[*B]`.
+            raw: `[*B, num_parameters]`; the parameters of the other discrete actions are ignored.
+
+        Returns:
+            Two tensors `[*B]`; the second is 0 for a discrete action without parameters.
+        """
+        discrete_log_prob = self.discrete_log_probs.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
+        log_density = gaussian_log_density((raw - self.mean) / self.log_scale.exp(), self.log_scale)
+        return discrete_log_prob, (log_density * self.parameter_mask[discrete]).sum(-1)
 
     def entropy(self) -> tuple[Tensor, Tensor]:
-        """Return the entropies `[*B]` of the key and, in the mean over keys, of a key's own parameters."""
-        probability = self.discrete_log_probs.exp()
-        normal = self.log_scale + 0.5 * math.log(2 * math.pi * math.e)
-        return -(probability * self.discrete_log_probs).sum(-1), ((probability @ self.parameter_mask) * normal).sum(-1)
+        """Return the entropy of the discrete action and the expected entropy of its own raw parameters, each `[*B]`."""
+        probs = self.discrete_log_probs.exp()
+        discrete_entropy = -(probs * self.discrete_log_probs).sum(-1)
+        gaussian_entropy = self.log_scale + 0.5 * math.log(2 * math.pi * math.e)
+        return discrete_entropy, ((probs @ self.parameter_mask) * gaussian_entropy).sum(-1)
 
 
 class HybridActor(nn.Module):
-    """The discrete and the continuous actor on one encoder."""
+    """A discrete head and a parameter head on one encoder, nearly uniform and centred at initialisation.
+
+    Args:
+        specs: sizes and bounds of the problem.
+        hidden_dims: sizes of the encoder's layers.
+        scale_range: smallest and largest standard deviation, in units where the bounds are [-1, 1].
+        initial_scale: standard deviation at initialisation, strictly within `scale_range`.
+    """
+
+    log_min_scale: Tensor
+    parameter_mask: Tensor
 
     def __init__(
         self, specs: PAMDPSpecs, hidden_dims: Sequence[int], scale_range: tuple[float, float], initial_scale: float
@@ -62,54 +106,59 @@ class HybridActor(nn.Module):
         self.encoder = encoder(specs.observation_dim, hidden_dims)
         self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete)
         self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters)
-        low, high = (math.log(scale) for scale in scale_range)
-        self.register_buffer("log_min_scale", torch.tensor(low))
-        self.log_max_scale = high
-        share = (math.log(initial_scale) - low) / (high - low)
+        log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
+        self.register_buffer("log_min_scale", torch.tensor(log_min_scale))
+        self.log_max_scale = log_max_scale
+        fraction = (math.log(initial_scale) - log_min_scale) / (log_max_scale - log_min_scale)
         with torch.no_grad():
-            # Near-uniform keys and mid-range means to begin with.
             for head in (self.discrete_head, self.parameter_head):
                 head.weight.mul_(0.01)
                 head.bias.zero_()
-            self.parameter_head.bias[specs.num_parameters :] = math.log(share / (1.0 - share))
+            self.parameter_head.bias[specs.num_parameters :] = math.log(fraction / (1.0 - fraction))
         self.register_buffer("parameter_mask", specs.parameter_mask.float())
 
     def forward(self, observation: Tensor) -> HybridDistribution:
-        """Return the distribution of the next press for observations `[*B, observation_dim]`."""
+        """Return the distribution of the action for observations `[*B, observation_dim]`."""
         hidden = self.encoder(observation)
         mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
         return HybridDistribution(self.discrete_head(hidden).log_softmax(-1), mean, log_scale, self.parameter_mask)
 
     def set_min_scale(self, min_scale: float) -> None:
-        """Move the lower end of the range in which the Gaussian's deviation is learned."""
+        """Set the smallest standard deviation."""
         self.log_min_scale.fill_(math.log(min_scale))
 
 
 class HybridPolicy(TensorDictModuleBase):
-    """Draws the press from the actor, or takes its likeliest one when greedy."""
+    """Samples the action from the actor, or takes the most probable one when greedy."""
 
     def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = [keys.OBSERVATION], [keys.DISCRETE, keys.PARAMETERS]
-        self.actor, self.specs = actor, specs
+        self.in_keys = [keys.OBSERVATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
+        self.actor = actor
+        self.specs = specs
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write key `[*B]` and parameters `[*B, num_parameters]`."""
-        distribution = self.actor(td.get(keys.OBSERVATION))
+        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
+        distribution: HybridDistribution = self.actor(td.get(keys.OBSERVATION))
         discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
-        return td.update(
-            {keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(raw.clamp(-1.0, 1.0))}}
-        )
+        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
 
 def encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
-    """Return the ReLU layers below the heads, orthogonal to begin with."""
+    """Return ReLU layers with orthogonal initial weights, for heads to stand on."""
     layers: list[nn.Module] = []
-    for i, o in zip([in_dim, *hidden_dims], hidden_dims, strict=False):
-        linear = nn.Linear(i, o)
+    for layer_in, layer_out in pairwise([in_dim, *hidden_dims]):
+        linear = nn.Linear(layer_in, layer_out)
         nn.init.orthogonal_(linear.weight, math.sqrt(2.0))
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.ReLU()]
     return nn.Sequential(*layers)
+
+
+def gaussian_log_density(standardised: Tensor, log_scale: Tensor) -> Tensor:
+    """Return the log-density of Gaussian samples, given (x - mean) / scale and log(scale)."""
+    return -0.5 * standardised.square() - log_scale - 0.5 * math.log(2 * math.pi)

@@ -1,4 +1,4 @@
-"""What the on-policy learners of both levels have in common: gather rows, then make clipped updates from them."""
+"""What the on-policy learners of both levels share: gather rows, then update from them with a clipped surrogate."""
 
 from __future__ import annotations
 
@@ -12,16 +12,17 @@ from torch import Tensor, nn
 from hpamdp.specs import PAMDPSpecs
 
 
-class OnPolicy:
-    """Proximal policy optimisation, for a `Selector` or a `Learner` to inherit before it.
+class OnPolicy(nn.Module):
+    """Base class for proximal policy optimisation; list it before `Selector` or `Learner` among the bases.
 
-    A subclass makes the `optimiser` of its parameters and calls the methods below.
+    A subclass creates `optimizer` for its parameters and calls the methods below.
 
     Args:
-        specs: of the problem.
-        epochs, minibatch_size: passes over the rows of an update, and rows a step of them takes.
-        clip: the surrogate stops rewarding ratios further from 1.
-        max_grad_norm: of the steps.
+        specs: sizes and bounds of the problem.
+        epochs: passes over the gathered rows in an update.
+        minibatch_size: rows in an optimisation step, and the least number of rows that an update waits for.
+        clip: the surrogate stops rewarding probability ratios further from 1 than this.
+        max_grad_norm: largest gradient norm of an optimisation step; longer gradients are scaled down.
     """
 
     optimizer: torch.optim.Optimizer
@@ -30,11 +31,14 @@ class OnPolicy:
         self, specs: PAMDPSpecs, *, epochs: int, minibatch_size: int, clip: float, max_grad_norm: float
     ) -> None:
         super().__init__(specs)
-        self.epochs, self.minibatch_size, self.clip, self.max_grad_norm = epochs, minibatch_size, clip, max_grad_norm
+        self.epochs = epochs
+        self.minibatch_size = minibatch_size
+        self.clip = clip
+        self.max_grad_norm = max_grad_norm
         self.waiting: list[TensorDict] = []
 
     def stateful(self) -> dict[str, Any]:
-        """Return the optimiser."""
+        """Return the optimizer, for the checkpoint."""
         return {"optimiser": self.optimizer}
 
     def get_extra_state(self) -> list[dict[str, Tensor]]:
@@ -42,37 +46,50 @@ class OnPolicy:
         return [dict(rows.items()) for rows in self.waiting]
 
     def set_extra_state(self, state: list[dict[str, Tensor]]) -> None:
-        """Take the rows back from a state dict."""
+        """Restore the waiting rows from a state dict."""
         self.waiting = [TensorDict(rows).auto_batch_size_(1) for rows in state]
 
     def gather(self, rows: TensorDict) -> TensorDict | None:
-        """Let rows `[N]` wait; from a minibatch of them on, return all that waited."""
+        """Add rows `[N]` to those waiting; once there are `minibatch_size` or more, hand over all of them.
+
+        Returns:
+            All waiting rows `[M]`, after which none wait, or None if there are too few.
+        """
         self.waiting.append(rows)
-        if sum(len(each) for each in self.waiting) < self.minibatch_size:
+        if sum(len(waiting) for waiting in self.waiting) < self.minibatch_size:
             return None
-        gathered, self.waiting = torch.cat(self.waiting), []
+        gathered = torch.cat(self.waiting)
+        self.waiting = []
         return gathered
 
     def make_passes(self, rows: TensorDict, update: Callable[[TensorDictBase], dict[str, Tensor]]) -> dict[str, float]:
-        """Make `epochs` passes over gathered rows, with their `advantage` normalised; return the updates' mean scalars.
+        """Normalise `advantage` over the gathered rows, then make `epochs` passes over them in random minibatches.
 
-        `update` makes a step from a minibatch and returns scalars.
+        Args:
+            rows: `[M]`, with `advantage` `[M]`.
+            update: makes one optimisation step from a minibatch and returns scalars.
+
+        Returns:
+            The scalars, averaged over the optimisation steps.
         """
         advantage = rows["advantage"]
         rows["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
-        steps: list[dict[str, Tensor]] = []
+        num_minibatches = len(rows) // self.minibatch_size
+        scalars: list[dict[str, Tensor]] = []
         for _ in range(self.epochs):
-            order = torch.randperm(len(rows), device=rows.device).tensor_split(len(rows) // self.minibatch_size)
-            steps += [update(rows[indices]) for indices in order]
-        return {name: torch.stack([step[name] for step in steps]).mean().item() for name in steps[0]}
+            order = torch.randperm(len(rows), device=rows.device)
+            for indices in order.tensor_split(num_minibatches):
+                scalars.append(update(rows[indices]))
+        return {name: torch.stack([step[name] for step in scalars]).mean().item() for name in scalars[0]}
 
     def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
-        """Return the clipped surrogate of one policy, `[B]`."""
+        """Return the clipped surrogate `[B]` of one policy head from its log-ratios and the advantages, each `[B]`."""
         ratio = log_ratio.exp()
-        return torch.minimum(ratio * advantage, ratio.clamp(1.0 - self.clip, 1.0 + self.clip) * advantage)
+        clipped_ratio = ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
+        return torch.minimum(ratio * advantage, clipped_ratio * advantage)
 
     def optimizer_step(self, loss: Tensor) -> None:
-        """Take a step of the optimiser."""
+        """Take one step of the optimizer on a loss, with the gradient scaled down to `max_grad_norm`."""
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)

@@ -1,7 +1,8 @@
-"""What the off-policy and offline learners have in common: store transitions, then update from samples of them."""
+"""The base class of the off-policy and offline learners: store transitions, then update from samples of them."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import torch
@@ -15,14 +16,21 @@ from hpamdp.specs import PAMDPSpecs
 
 
 class ReplayLearner(Learner):
-    """A learner with a replay buffer of its own, from which it makes `updates_per_frame` updates for each press.
+    """A learner with its own replay buffer, which makes `updates_per_frame` updates for each step that it stores.
 
-    A subclass fills `optimisers` and writes `update`; the other methods are there to be extended.
+    A subclass fills `optimizers` and implements `train_step`. It may extend the other methods:
+
+    - `transitions` or `store`: what the buffer holds;
+    - `sample_batches`: what an update sees;
+    - `start` and `explore`: what happens at the end of the warm-up, and with every batch after it;
+    - `updates_due`: when updates are made.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
 
     optimizers: dict[str, torch.optim.Optimizer]
+    frames: Tensor
+    updates: Tensor
 
     def __init__(
         self,
@@ -36,51 +44,66 @@ class ReplayLearner(Learner):
         updates_per_frame: float,
     ) -> None:
         super().__init__(specs)
-        self.gamma, self.warmup_frames = gamma, warmup_frames
-        self.batch_size, self.updates_per_frame = batch_size, updates_per_frame
+        self.gamma = gamma
+        self.warmup_frames = warmup_frames
+        self.batch_size = batch_size
+        self.updates_per_frame = updates_per_frame
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
-        """Return the optimisers and the replay buffer."""
+        """Return the optimizers and the replay buffer."""
         return {**self.optimizers, "buffer": self.buffer}
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Store the batch's transitions; once the warm-up is over, make the updates that are due."""
-        rows = self.transitions(batch)[mask]
-        if not len(rows):
+        """Store the batch's transitions; after the warm-up, make the updates that are due."""
+        num_steps = int(mask.sum())
+        if num_steps == 0:
             return {}
-        self.buffer.extend(rows)
-        before, self.frames = int(self.frames), self.frames + len(rows)
-        frames = int(self.frames)
+        self.store(batch, mask)
+        before = int(self.frames)
+        frames = before + num_steps
+        self.frames = self.frames + num_steps
         if frames < self.warmup_frames:
             return {}
         if before < self.warmup_frames:
             self.start()
         self.explore(frames - self.warmup_frames)
-        return self._updates(int(frames * self.updates_per_frame) - int(before * self.updates_per_frame))
+        return self._make_updates(self.updates_due(before, frames))
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Store the transitions in `mask`."""
-        self.buffer.extend(self.transitions(batch)[mask])
+        self.store(batch, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Make updates from what is stored."""
+        """Make updates from the stored transitions."""
         if int(self.frames) == int(self.updates) == 0:
             self.start()
-        return self._updates(num_updates)
+        return self._make_updates(num_updates)
 
-    def _updates(self, num_updates: int) -> dict[str, float]:
-        losses: dict[str, list[Tensor]] = {}
-        if num_updates:
-            # One draw for all updates: the buffer's own overhead is as long as a forward pass.
-            for sample in self.buffer.sample(num_updates * self.batch_size).split(self.batch_size):
+    def _make_updates(self, num_updates: int) -> dict[str, float]:
+        history: dict[str, list[Tensor]] = {}
+        if num_updates > 0:
+            for sample in self.sample_batches(num_updates):
                 self.updates += 1
                 for name, value in self.train_step(sample).items():
-                    losses.setdefault(name, []).append(value.detach())
-        scalars = {name: torch.stack(values).mean().item() for name, values in losses.items()}
+                    history.setdefault(name, []).append(value.detach())
+        scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
         return {**scalars, "updates": self.updates.item()}
+
+    def updates_due(self, before: int, frames: int) -> int:
+        """Return how many updates to make when the number of stored steps has risen from `before` to `frames`."""
+        return int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
+
+    def store(self, batch: TensorDictBase, mask: Tensor) -> None:
+        """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""
+        self.buffer.extend(self.transitions(batch)[mask])
+
+    def sample_batches(self, num_batches: int) -> Iterable[TensorDictBase]:
+        """Return samples for `num_batches` updates, each with transitions `[batch_size]`."""
+        # One call for all updates: the buffer's overhead is as long as a forward pass.
+        return self.buffer.sample(num_batches * self.batch_size).split(self.batch_size)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the step terminated, else gamma."""
@@ -97,17 +120,17 @@ class ReplayLearner(Learner):
         )
 
     def start(self) -> None:
-        """Prepare the first update, from what the warm-up stored."""
+        """Prepare for the first update, from the transitions that the warm-up stored."""
 
     def explore(self, frames: int) -> None:
-        """Set the policy's exploration, `frames` presses after the warm-up."""
+        """Set the policy's exploration for `frames` steps after the warm-up."""
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Make one update from transitions `[batch_size]`; return scalars to log."""
+        """Make one update from a sample of `sample_batches`; return scalars to log."""
         raise NotImplementedError
 
     def optimizer_step(self, name: str, loss: Tensor, max_grad_norm: float | None = None) -> None:
-        """Take a step of an optimiser, with gradients scaled down to a norm where one is given."""
+        """Take one step of the named optimizer, with the gradient's norm clipped to `max_grad_norm` if it is given."""
         optimizer = self.optimizers[name]
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
@@ -118,5 +141,5 @@ class ReplayLearner(Learner):
 
 
 def linear_schedule(time: int, over: int, final: float) -> float:
-    """Return a share that falls in a line from 1 to `final` within a time `over`, in frames or decisions."""
+    """Return a fraction that falls linearly from 1 to `final` within a time `over`, in steps or decisions."""
     return 1.0 + (final - 1.0) * min(1.0, time / max(1, over))

@@ -1,0 +1,1 @@
+"""Where batches come from: this process, worker processes or Ray actors."""

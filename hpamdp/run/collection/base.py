@@ -11,12 +11,13 @@ from torch import Tensor
 class Collection:
     """Gives batches of the agent acting in the run's environments, until it is closed.
 
-    A subclass's `__init__` takes any of `cfg`, `settings`, `parts` and `frames` (presses so far) and its options as
-    keyword arguments, which are the schema of its yaml. Whatever collects, a batch has the same keys and shape, the
-    environments in the same order, and comes from the policy as it is now.
+    A subclass's `__init__` takes any of `config`, `parts` and `frames` (steps so far) and its options as keyword
+    arguments, which are the schema of its yaml. Every collection gives batches of the same keys and shape, with the
+    environments in the same order, from the current policy.
     """
 
-    package: ClassVar[str | None] = None  # that it needs beyond the project's own; also the name of the extra
+    package: ClassVar[str | None] = None  # an optional package that it needs; also the name of the extra
+    has_workers: ClassVar[bool] = False  # whether other processes step the environments
     cpu_s: float = 0.0  # spent collecting in other processes
 
     def next(self) -> TensorDictBase:
@@ -28,4 +29,4 @@ class Collection:
         raise NotImplementedError
 
     def close(self) -> None:
-        """End all other processes, whatever state they are in."""
+        """End all other processes."""

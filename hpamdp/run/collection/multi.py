@@ -6,11 +6,10 @@ import signal
 from collections.abc import Sequence
 from multiprocessing import resource_tracker
 
-from omegaconf import DictConfig
 from pydantic import PositiveInt
 from torchrl.collectors import MultiSyncCollector
 
-from hpamdp.config import RunConfig
+from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.worker import EnvShard
 from hpamdp.run.collection.workers import WorkerCollection, children_without
@@ -19,12 +18,10 @@ from hpamdp.run.collection.workers import WorkerCollection, children_without
 class MultiCollection(WorkerCollection):
     """Steps the environments in processes of TorchRL's MultiSyncCollector, which write into shared memory."""
 
-    def __init__(
-        self, cfg: DictConfig, settings: RunConfig, parts: Parts, frames: int, *, num_workers: PositiveInt
-    ) -> None:
-        super().__init__(cfg, settings, parts, frames, num_workers)
+    def __init__(self, config: Config, parts: Parts, frames: int, *, num_workers: PositiveInt) -> None:
+        super().__init__(config, parts, frames, num_workers)
 
-    def _start(self, shares: Sequence[EnvShard], settings: RunConfig) -> MultiSyncCollector:
+    def _start(self, shares: Sequence[EnvShard], config: Config) -> MultiSyncCollector:
         # multiprocessing unblocks the signals when it starts this helper of its own.
         resource_tracker.ensure_running()
         # A terminal sends its Ctrl-C, and a cluster its stop, to every process of a run.
@@ -32,10 +29,10 @@ class MultiCollection(WorkerCollection):
             return MultiSyncCollector(
                 [share.make_env for share in shares],
                 policy_factory=[share.make_policy for share in shares],
-                frames_per_batch=settings.num_envs * settings.steps_per_batch,
+                frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
                 total_frames=-1,
                 device="cpu",
-                num_threads=settings.threads,
+                num_threads=config.run.threads,
                 cat_results=0,
                 use_buffers=True,
                 auto_register_policy_transforms=False,

@@ -9,12 +9,11 @@ import warnings
 from collections.abc import Sequence
 from typing import ClassVar
 
-from omegaconf import DictConfig
 from pydantic import PositiveInt
 from tensordict import TensorDictBase
 from torchrl.collectors.distributed import RayCollector
 
-from hpamdp.config import RunConfig
+from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.worker import EnvShard
 from hpamdp.run.collection.workers import WorkerCollection, children_without
@@ -27,8 +26,7 @@ class RayCollection(WorkerCollection):
 
     def __init__(
         self,
-        cfg: DictConfig,
-        settings: RunConfig,
+        config: Config,
         parts: Parts,
         frames: int,
         *,
@@ -36,9 +34,9 @@ class RayCollection(WorkerCollection):
         address: str | None = None,
     ) -> None:
         self.address = address
-        super().__init__(cfg, settings, parts, frames, num_workers)
+        super().__init__(config, parts, frames, num_workers)
 
-    def _start(self, shares: Sequence[EnvShard], settings: RunConfig) -> RayCollector:
+    def _start(self, shares: Sequence[EnvShard], config: Config) -> RayCollector:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
         own = {"address": "local", "num_cpus": len(shares), "include_dashboard": False}
@@ -50,7 +48,7 @@ class RayCollection(WorkerCollection):
             return RayCollector(
                 [share.make_env for share in shares],
                 policy_factory=[share.make_policy for share in shares],
-                frames_per_batch=settings.num_envs * settings.steps_per_batch,
+                frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
                 total_frames=sys.maxsize,  # it has no sign for endless
                 device="cpu",
                 ray_init_config={**init, "log_to_driver": False, "logging_level": "warning"},

@@ -6,20 +6,20 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.collectors import Collector
 
-from hpamdp.config import RunConfig
+from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection
 
 
 class SingleCollection(Collection):
-    """Steps the run's environments here, between two calls of the learner."""
+    """Steps the environments in the learner's own process, between two updates."""
 
-    def __init__(self, settings: RunConfig, parts: Parts) -> None:
+    def __init__(self, config: Config, parts: Parts) -> None:
         self.env = parts.env
         self._collector = Collector(
             parts.env,
             parts.policy,
-            frames_per_batch=settings.num_envs * settings.steps_per_batch,
+            frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
             total_frames=-1,
             auto_register_policy_transforms=False,
         )
@@ -34,5 +34,5 @@ class SingleCollection(Collection):
         return self.env.env_state()
 
     def close(self) -> None:
-        """Let go of the environment, which stays open."""
+        """Stop collecting; the environment stays open."""
         self._collector.shutdown(close_env=False)

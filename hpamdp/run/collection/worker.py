@@ -1,20 +1,18 @@
-"""What a worker process builds: its share of the run's environments, and a copy of the policy."""
+"""What a worker process builds: its shard of the run's environments, and a copy of the policy."""
 
 from __future__ import annotations
 
 import io
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from omegaconf import OmegaConf
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs import TransformedEnv
 
-from hpamdp.config import run_config
+from hpamdp.config import Config
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import acting, make_agent, make_env
 from hpamdp.specs import PAMDPSpecs
@@ -23,14 +21,14 @@ _CPU = torch.device("cpu")
 
 
 def packed(module: nn.Module) -> bytes:
-    """Return a module's state as bytes: unlike tensors, they share no memory with it in another process."""
+    """Return a module's state as bytes, which unlike tensors share no memory between processes."""
     file = io.BytesIO()
     torch.save(module.state_dict(), file)
     return file.getvalue()
 
 
 def unpack(module: nn.Module, state: bytes) -> None:
-    """Put a module on the CPU into the state that another one was in, wherever that is."""
+    """Load a `packed` state into a module on the CPU, whatever device it was packed on."""
     module.load_state_dict(torch.load(io.BytesIO(state), map_location=_CPU))
 
 
@@ -39,7 +37,8 @@ class PolicyCopy(TensorDictModuleBase):
 
     def __init__(self, policy: TensorDictModuleBase) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
+        self.in_keys = list(policy.in_keys)
+        self.out_keys = list(policy.out_keys)
         self.policy = policy
         self._cpu_before = time.process_time()
 
@@ -48,25 +47,25 @@ class PolicyCopy(TensorDictModuleBase):
         return self.policy(td)
 
     def receive(self, state: bytes) -> float:
-        """Take over the `packed` state of the learner's policy; return this process's CPU seconds so far."""
+        """Load the `packed` state of the learner's policy; return this process's CPU seconds so far."""
         unpack(self.policy, state)
         return time.process_time() - self._cpu_before
 
 
 @dataclass(frozen=True)
 class EnvShard:
-    """A worker's environments and all it takes to build them elsewhere.
+    """The environments of one worker, with everything needed to build them in its process.
 
     Attributes:
-        cfg: the resolved config.
+        config: of the run.
         specs: of the problem.
         first_env, num_envs: which of the run's environments.
         exploration_seed: of the worker's global generator.
         columns: where the environments stand; empty: at the beginning.
-        low: the `packed` presser of a run with `low.freeze`, whose environments play whole episodes with it.
+        low: the `packed` low level of a run with `low.freeze`, whose environments play whole episodes with it.
     """
 
-    cfg: dict[str, Any]
+    config: Config
     specs: PAMDPSpecs
     first_env: int
     num_envs: int
@@ -77,14 +76,13 @@ class EnvShard:
     def make_env(self) -> TransformedEnv:
         """Build the environments, with their decisions tracked."""
         torch.set_num_threads(1)
-        cfg = OmegaConf.create(self.cfg)
-        settings, agent = run_config(cfg), self._make_agent()
+        agent = self._make_agent()
         if self.low is not None:
             unpack(agent.router, self.low)
-        env = make_env(cfg, self.num_envs, _CPU, settings.seed, self.first_env)
+        env = make_env(self.config, self.num_envs, _CPU, self.config.run.seed, self.first_env)
         if self.columns:
             env.set_env_state(self.columns)
-        return acting(env, agent, settings)[0]
+        return acting(env, agent, self.config)[0]
 
     def make_policy(self) -> PolicyCopy:
         """Build the policy; its weights are yet to come."""
@@ -93,5 +91,4 @@ class EnvShard:
         return PolicyCopy(agent.policy if self.low is None else agent.selector)
 
     def _make_agent(self) -> HierarchicalAgent:
-        cfg = OmegaConf.create(self.cfg)
-        return make_agent(cfg, run_config(cfg), self.specs, _CPU)
+        return make_agent(self.config, self.specs, _CPU)

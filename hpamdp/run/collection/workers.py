@@ -1,61 +1,63 @@
-"""What collection in several processes has in common, whoever starts them."""
+"""What collections in several processes share."""
 
 from __future__ import annotations
 
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from omegaconf import DictConfig, OmegaConf
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.config import RunConfig
+from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection
 from hpamdp.run.collection.worker import EnvShard, packed
 
 
 class WorkerCollection(Collection):
-    """Has each of `num_workers` processes step an equal share of the environments, on the CPU with one thread.
+    """Steps an equal shard of the environments in each of `num_workers` processes, on the CPU with one thread.
 
-    Environment `i` has the layouts that it has in a single process: only the exploration draws from other random
-    numbers, a stream for each worker. Before each batch all workers get the policy's weights and buffers; they wait for
-    one another and for the learner. A subclass starts TorchRL's collector in `_start`.
+    Environment `i` has the same episodes as in a single process; only exploration uses other random numbers, one
+    stream for each worker. Before each batch, all workers get the policy's weights and buffers; they wait for one
+    another and for the learner. A subclass starts TorchRL's collector in `_start`.
     """
 
-    def __init__(self, cfg: DictConfig, settings: RunConfig, parts: Parts, frames: int, num_workers: int) -> None:
-        self._policy, self._device = parts.policy, parts.device
+    has_workers: ClassVar[bool] = True
+
+    def __init__(self, config: Config, parts: Parts, frames: int, num_workers: int) -> None:
+        self._policy = parts.policy
+        self._device = parts.device
         self._columns = parts.env.env_state()
         self._collector: Any = None
         self._is_idle = False
-        size = settings.num_envs // num_workers
+        size = config.run.num_envs // num_workers
         shares = [
             EnvShard(
-                OmegaConf.to_container(cfg, resolve=True),
+                config,
                 parts.agent.specs,
                 first,
                 size,
                 # Other numbers than before where a run goes on.
-                int(np.random.SeedSequence((settings.seed, first, frames)).generate_state(1)[0]),
+                int(np.random.SeedSequence((config.run.seed, first, frames)).generate_state(1)[0]),
                 {name: column[first : first + size].cpu() for name, column in self._columns.items()},
-                packed(parts.agent.router) if settings.low.freeze else None,
+                packed(parts.agent.router) if config.run.low.freeze else None,
             )
-            for first in range(0, settings.num_envs, size)
+            for first in range(0, config.run.num_envs, size)
         ]
         try:
             with uninterrupted():
-                self._collector = self._start(shares, settings)
+                self._collector = self._start(shares, config)
         except BaseException:
             self.close()
             raise
         self._batches = iter(self._collector)
         self._is_idle = True
 
-    def _start(self, shares: Sequence[EnvShard], settings: RunConfig) -> Any:
+    def _start(self, shares: Sequence[EnvShard], config: Config) -> Any:
         """Start a worker for each share, and return TorchRL's collector of them."""
         raise NotImplementedError
 
@@ -77,7 +79,7 @@ class WorkerCollection(Collection):
         return self._collector.map_fn(method, [arguments] * self._collector.num_workers)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the environments' columns, as they were last known if a worker failed."""
+        """Return the environments' state; if a worker failed, the last one that is known."""
         if self._is_idle:
             with uninterrupted():
                 columns = self._call("env.env_state")
@@ -93,7 +95,7 @@ class WorkerCollection(Collection):
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let a Ctrl-C wait for the block's end, as half a message would confuse the workers; a second one doesn't."""
+    """Delay a Ctrl-C to the end of the block: half a message would confuse the workers. A second one interrupts."""
     is_asked = False
 
     def note(*_: Any) -> None:
@@ -117,7 +119,7 @@ def uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def children_without(*numbers: signal.Signals) -> Iterator[None]:
-    """Have processes that are started within the block never see these signals."""
+    """Block these signals in all processes that are started within the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield

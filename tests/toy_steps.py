@@ -1,4 +1,4 @@
-"""A problem of one press with a known optimum, and what learners get of it."""
+"""A problem of one step with a known optimum, and its data as learners see it."""
 
 import torch
 from tensordict import TensorDict
@@ -15,7 +15,11 @@ def states(num: int) -> TensorDict:
 
 
 def one_step_rows(learner: Learner, num: int) -> TensorDict:
-    """Play `num` episodes, `[num, 1]`: key 1 pays the more the nearer its parameters are to (s0, -s1), key 2 a bit."""
+    """Play `num` episodes of one step, `[num, 1]`.
+
+    Discrete action 1 earns the more, the nearer its parameters are to (s0, -s1), at most 1; action 2 always earns 0.2,
+    action 0 loses 0.5.
+    """
     td = learner.policy(states(num))
     unit, state = learner.specs.to_unit(td[keys.PARAMETERS]), td[keys.OBSERVATION]
     error = (unit[:, 1] - state[:, 0]).square() + (unit[:, 2] + state[:, 1]).square()
@@ -27,7 +31,7 @@ def one_step_rows(learner: Learner, num: int) -> TensorDict:
 
 
 def sample(num: int = 32) -> TensorDict:
-    """Return random transitions as they come out of the replay buffer."""
+    """Return random transitions, as sampled from the replay buffer."""
     return TensorDict(
         {
             "state": torch.randn(num, 4),

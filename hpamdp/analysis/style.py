@@ -1,0 +1,70 @@
+"""How all figures look: colours, style, labels at the ends of lines."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from matplotlib.axes import Axes
+
+# Colours of Okabe and Ito and of Tol that the colour-blind tell apart, each with one meaning in all figures.
+AGENT, INK, FAINT = "#0072B2", "#2b2b2b", "#8c8c8c"
+
+# Label, colour and line style of each reference.
+REFERENCES = {
+    "random": ("random", "#8c8c8c", ":"),
+    "human": ("people", "#D98200", "--"),
+    "best_person": ("best person", "#D98200", "-."),
+    "ceiling": ("ceiling", "#2b2b2b", "-"),
+}
+
+STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#666666",
+    "axes.labelcolor": INK,
+    "xtick.color": "#666666",
+    "ytick.color": "#666666",
+    "text.color": INK,
+    "savefig.dpi": 160,
+}
+
+
+def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1.0) -> None:
+    """Write labels (height, text, colour) right of the axes, a line's height apart at least.
+
+    A thin leader joins a label to its line's end, `ends` of the way across the axes.
+    """
+    low, high = axes.get_ylim()
+    labels = sorted(labels)
+    heights = [(height - low) / (high - low) for height, _, _ in labels]
+    for height, place, (_, text, colour) in zip(heights, _apart(heights, 0.064), labels, strict=True):
+        axes.plot(
+            [ends, 1.03],
+            [height, place],
+            color=colour,
+            linewidth=0.7,
+            alpha=0.7,
+            clip_on=False,
+            transform=axes.transAxes,
+        )
+        axes.annotate(text, (1.04, place), xycoords="axes fraction", color=colour, va="center", fontsize=8.5)
+
+
+def _apart(heights: list[float], gap: float) -> list[float]:
+    """Move sorted heights to be at least `gap` apart, every cluster about its own mean, none above 1."""
+    clusters: list[list[float]] = []
+    for height in heights:
+        clusters.append([height])
+        while len(clusters) > 1 and _foot(clusters[-1], gap) < _foot(clusters[-2], gap) + gap * len(clusters[-2]):
+            last = clusters.pop()
+            clusters[-1].extend(last)
+    return [_foot(cluster, gap) + gap * i for cluster in clusters for i in range(len(cluster))]
+
+
+def _foot(cluster: list[float], gap: float) -> float:
+    reach = gap * (len(cluster) - 1)
+    return min(sum(cluster) / len(cluster) - reach / 2.0, 1.02 - reach)

@@ -1,0 +1,170 @@
+"""Transitions to and from Minari, the offline data sets of the Gymnasium ecosystem (extra `minari`).
+
+TorchRL's `MinariExperienceReplay` reads Minari data sets too, but keeps Minari's names of the actions and infos, and
+has no `is_decision`, which selectors learn from.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from hpamdp import keys
+from hpamdp.data.demonstrations import TRAJECTORY
+from hpamdp.data.errors import DataError
+
+if TYPE_CHECKING:
+    import minari
+
+
+@dataclass(frozen=True)
+class MinariLayout:
+    """Under which names the columns of a problem's transitions stand in its Minari data sets.
+
+    Attributes:
+        discrete, parameters, option: the parts of the environment's Dict action; transitions without an option have
+            no such part.
+        infos: columns, at the root and under `next`, that are kept as infos.
+    """
+
+    discrete: str = "discrete"
+    parameters: str = "parameters"
+    option: str = "option"
+    infos: tuple[str, ...] = ()
+
+
+def _import_minari() -> Any:
+    try:
+        import minari
+    except ImportError as error:
+        raise DataError("Minari is not installed; pip install 'hpamdp[minari]'") from error
+    return minari
+
+
+def export(
+    batch: TensorDict,
+    dataset_id: str,
+    layout: MinariLayout,
+    *,
+    env_id: str,
+    env_kwargs: Mapping[str, Any] | None = None,
+    algorithm_name: str | None = None,
+    description: str | None = None,
+) -> minari.MinariDataset:
+    """Write transitions as a Minari data set and return it.
+
+    Args:
+        batch: `[N]`, one episode after another, each up to its `done`; keys as in `hpamdp.data.demonstrations`.
+            Options last a whole episode.
+        dataset_id: such as `namespace/name-v0`; it must not exist yet.
+        layout: names of the actions' parts and of the infos.
+        env_id: Gymnasium's id of the environment, whose action space is a Dict of the layout's parts.
+        env_kwargs: arguments of the environment.
+        algorithm_name: what acted.
+        description: what a user should know of the data.
+
+    Raises:
+        DataError: Minari is missing or refuses the data, the data set exists, there is no such environment, or an
+            option ends inside an episode.
+    """
+    library = _import_minari()
+    from minari.data_collector import EpisodeBuffer
+    from minari.storage import get_dataset_path
+
+    if not re.fullmatch(r"([\w-]+/)*[\w-]+-v\d+", dataset_id):
+        raise DataError(f"{dataset_id}: not a name of a Minari data set; it must be like namespace/name-v0")
+    if get_dataset_path(dataset_id).exists():
+        raise DataError(f"{dataset_id}: Minari has this data set already; delete it first: minari delete {dataset_id}")
+    if not batch["next", keys.IS_DECISION].equal(batch["next", keys.DONE]):
+        raise DataError(f"{dataset_id}: Minari has no place for options that end inside an episode")
+    try:
+        env = gymnasium.make(env_id, **(env_kwargs or {}))
+    except gymnasium.error.Error as error:
+        raise DataError(f"{dataset_id}: {error}") from error
+    ends = batch["next", keys.DONE].squeeze(-1).nonzero().squeeze(-1) + 1
+    lengths = ends.diff(prepend=ends.new_zeros(1)).tolist()
+    try:
+        buffers = [EpisodeBuffer(id=i, **_episode(rows, layout)) for i, rows in enumerate(batch.split(lengths))]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # asks for an author and a link
+            return library.create_dataset_from_buffers(
+                dataset_id, buffers, env=env, algorithm_name=algorithm_name, description=description
+            )
+    except (ValueError, OSError) as error:
+        shutil.rmtree(get_dataset_path(dataset_id), ignore_errors=True)
+        raise DataError(f"{dataset_id}: Minari refuses the data ({error})") from error
+
+
+def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
+    """Return one episode's arrays; observations and infos have one row more than the rest."""
+
+    def with_last(name: str) -> np.ndarray:
+        return torch.cat([rows[name], rows["next", name][-1:]]).numpy()
+
+    actions = {layout.discrete: rows[keys.DISCRETE].numpy(), layout.parameters: rows[keys.PARAMETERS].numpy()}
+    if keys.OPTION in rows.keys():
+        actions[layout.option] = rows[keys.OPTION].numpy()
+    return {
+        "observations": with_last(keys.OBSERVATION),
+        "actions": actions,
+        "rewards": rows["next", keys.REWARD].squeeze(-1).numpy(),
+        "terminations": rows["next", keys.TERMINATED].squeeze(-1).numpy(),
+        "truncations": rows["next", keys.TRUNCATED].squeeze(-1).numpy(),
+        "infos": {name: with_last(name) for name in layout.infos},
+    }
+
+
+def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
+    """Return a Minari data set that `export` wrote as the transitions `[N]` that it was made of.
+
+    Episodes are numbered anew, from 0.
+
+    Raises:
+        DataError: Minari is missing, there is no such data set, or it has another layout.
+    """
+    library = _import_minari()
+    try:
+        episodes = list(library.load_dataset(dataset_id).iterate_episodes())
+        return torch.cat([_transitions(episode, number, layout) for number, episode in enumerate(episodes)])
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise DataError(f"{dataset_id}: cannot be read as transitions ({error})") from error
+
+
+def _transitions(episode: minari.EpisodeData, number: int, layout: MinariLayout) -> TensorDict:
+    """Return the transitions of one episode, the inverse of `_episode`."""
+    actions = episode.actions
+    if not isinstance(actions, dict):
+        raise TypeError("its actions have no named parts")
+    num = len(episode.rewards)
+    rows = TensorDict(batch_size=[num])
+    following = TensorDict(batch_size=[num])
+    columns = {keys.OBSERVATION: episode.observations, **{name: episode.infos[name] for name in layout.infos}}
+    for name, values in columns.items():
+        column = torch.as_tensor(values)
+        rows[name] = column[:-1]
+        following[name] = column[1:]
+    terminated = torch.as_tensor(episode.terminations).unsqueeze(-1)
+    truncated = torch.as_tensor(episode.truncations).unsqueeze(-1)
+    ends = {keys.TERMINATED: terminated, keys.TRUNCATED: truncated, keys.DONE: terminated | truncated}
+    for name, end in ends.items():
+        rows[name] = torch.zeros_like(end)
+        following[name] = end
+    rows[keys.IS_DECISION] = (torch.arange(num) == 0).unsqueeze(-1)
+    following[keys.IS_DECISION] = ends[keys.DONE].clone()
+    following[keys.REWARD] = torch.as_tensor(episode.rewards, dtype=torch.float32).unsqueeze(-1)
+    rows[keys.DISCRETE] = torch.as_tensor(actions[layout.discrete])
+    rows[keys.PARAMETERS] = torch.as_tensor(actions[layout.parameters])
+    if layout.option in actions:
+        rows[keys.OPTION] = torch.as_tensor(actions[layout.option])
+    rows[TRAJECTORY] = torch.full((num,), number)
+    rows["next"] = following
+    return rows

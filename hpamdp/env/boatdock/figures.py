@@ -1,0 +1,189 @@
+"""Figures of an evaluation on boats: the courses they took, and the choice of the boat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from matplotlib.ticker import PercentFormatter
+from scipy.stats import binomtest
+
+from hpamdp.analysis.style import AGENT, FAINT, INK, REFERENCES, label_ends
+from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, NOT_CHOSEN
+from hpamdp.env.boatdock.physics import DOCK_RADIUS, HARBOUR_RADIUS, OUTCOMES, SUCCESS
+from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+
+_OUTCOME_COLOURS = {
+    "success": "#009E73",
+    "too_fast": "#D55E00",
+    "out_of_bounds": "#AA4499",
+    "out_of_fuel": "#332288",
+    "time_limit": "#7FC8F2",
+    "sailing": "#8c8c8c",
+}
+_WATER, _RIM, _DOCK, _DOCK_EDGE = "#eef4f6", "#9fb9c2", "#f4dfb0", "#c8963e"
+
+_SHEET = (4, 6)  # rows and columns of the sheet of trajectories
+
+
+def draw(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
+    """Return `trajectories.png` and, where the agent chose its boat, `choices.png`.
+
+    Args:
+        evaluation: the arrays that `BoatDockEnv.describe` and an evaluation give; figures that lack one are left out.
+        summary: of the run; `references` has the figures of people.
+    """
+    evaluation = dict(evaluation)
+    if "option" in evaluation:
+        evaluation.setdefault("controller", evaluation["option"])
+    figures = {"trajectories.png": _trajectories(evaluation), "choices.png": _choices(evaluation, summary)}
+    return {name: figure for name, figure in figures.items() if figure is not None}
+
+
+def _trajectories(evaluation: Mapping[str, np.ndarray]) -> Figure | None:
+    if not {"path", "goal", "outcome", "score"} <= evaluation.keys() or not len(evaluation["score"]):
+        return None
+    scores, outcomes = evaluation["score"], evaluation["outcome"].astype(int)
+    # Best first; failures, which all score the same, by their outcome. Evenly spaced ranks show the typical ones too.
+    ranking = np.lexsort((outcomes, -scores))
+    num = min(len(ranking), _SHEET[0] * _SHEET[1])
+    chosen = ranking[np.linspace(0, len(ranking) - 1, num).round().astype(int)]
+    columns = min(_SHEET[1], num)
+    num_rows = -(-num // columns)
+    figure = Figure(figsize=(max(1.75 * columns, 5.5), 1.92 * num_rows + 0.75), layout="constrained")
+    all_axes = figure.subplots(num_rows, columns, squeeze=False).ravel()
+    for axes in all_axes:
+        axes.set_axis_off()
+    for axes, episode in zip(all_axes, chosen, strict=False):
+        _draw_episode(axes, evaluation, int(episode))
+    present = [(name, (outcomes == code).mean()) for code, name in enumerate(OUTCOMES) if (outcomes == code).any()]
+    handles = [
+        Line2D([], [], color=_OUTCOME_COLOURS[name], marker=_end_marker(name), label=f"{_words(name)} {share:.1%}")
+        for name, share in present
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
+    figure.supxlabel(
+        f"{num} of {len(scores)} episodes, evenly spaced by score. Open circle: start; a dot where each press ends.\n"
+        "Above: score / best possible score, boat (C congruent, I incongruent).",
+        fontsize=8.5,
+        color=FAINT,
+    )
+    return figure
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _end_marker(outcome: str) -> str:
+    return "o" if outcome == OUTCOMES[SUCCESS] else "X"
+
+
+def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int) -> None:
+    outcome = OUTCOMES[int(evaluation["outcome"][episode])]
+    colour = _OUTCOME_COLOURS[outcome]
+    path = evaluation["path"][episode]
+    path = path[np.isfinite(path).all(axis=-1)]
+    axes.add_patch(Circle((0, 0), HARBOUR_RADIUS, facecolor=_WATER, edgecolor=_RIM, linewidth=0.8))
+    axes.add_patch(
+        Circle(evaluation["goal"][episode], DOCK_RADIUS, facecolor=_DOCK, edgecolor=_DOCK_EDGE, linewidth=0.8)
+    )
+    if len(path):
+        axes.plot(*path.T, color=colour, linewidth=1.5, marker="o", markersize=2.6, zorder=3)
+        axes.plot(*path[0], "o", markersize=5, markerfacecolor="white", markeredgecolor=INK, zorder=4)
+        axes.plot(*path[-1], _end_marker(outcome), color=colour, markersize=6, markeredgecolor="white", zorder=5)
+    axes.set_xlim(-HARBOUR_RADIUS - 3, HARBOUR_RADIUS + 3)
+    axes.set_ylim(HARBOUR_RADIUS + 3, -HARBOUR_RADIUS - 3)  # y points down
+    axes.set_aspect("equal")
+    axes.set_title(_episode_title(evaluation, episode), fontsize=8.5, fontweight="normal", loc="center", pad=2)
+
+
+def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int) -> str:
+    title = f"{evaluation['score'][episode]:.2f}"
+    boat = int(evaluation["controller"][episode]) if "controller" in evaluation else NOT_CHOSEN
+    if "optimum" in evaluation:
+        best = evaluation["optimum"][episode]
+        is_chosen = "option" in evaluation and evaluation["option"][episode] != NOT_CHOSEN
+        # The best of both boats is the ceiling of those who choose only.
+        best = best if is_chosen or boat == NOT_CHOSEN else best[boat : boat + 1]
+        if np.isfinite(best).any():
+            title += f" / {np.nanmax(best):.2f}"
+    letter = {CONGRUENT: "C", INCONGRUENT: "I"}.get(boat)
+    return f"{title}  {letter}" if letter else title
+
+
+def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> Figure | None:
+    if not {"option", "bearing_offset", "outcome"} <= evaluation.keys():
+        return None
+    chose = (evaluation["option"] != NOT_CHOSEN) & np.isfinite(evaluation["bearing_offset"])
+    if not chose.any():
+        return None
+    people = summary.get("references", {}).get("human", {})
+    figure = Figure(figsize=(9.6, 3.7), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
+    _draw_choices(left, {name: array[chose] for name, array in evaluation.items()}, has_people=bool(people))
+    _draw_outcomes(right, evaluation["outcome"].astype(int), people)
+    return figure
+
+
+def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: bool) -> None:
+    edges = np.array(OFFSET_EDGES, dtype=float)
+    centres = (edges[:-1] + edges[1:]) / 2.0
+    bins = np.clip(np.digitize(evaluation["bearing_offset"], edges) - 1, 0, len(centres) - 1)
+    num = np.bincount(bins, minlength=len(centres))
+    filled = num > 0
+
+    def shares(is_congruent: np.ndarray) -> np.ndarray:
+        return np.bincount(bins, weights=is_congruent, minlength=len(centres))[filled] / num[filled]
+
+    labels = []
+    optimum = evaluation.get("optimum", np.full((len(bins), 2), np.nan))
+    congruent = evaluation["option"] == CONGRUENT
+    title = "Congruent boat chosen"
+    if np.isfinite(optimum).all():
+        better = optimum[:, CONGRUENT] > optimum[:, INCONGRUENT]
+        oracle = shares(better)
+        axes.plot(centres[filled], oracle, color=INK, linewidth=1.1, marker="s", markersize=4)
+        labels.append((oracle[-1], "oracle", INK))
+        title += f" (better boat in {(better == congruent).mean():.0%})"
+    if has_people:
+        label, colour, dashes = REFERENCES["human"]
+        axes.plot(centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
+        labels.append((HUMAN_CONGRUENT_BY_OFFSET[-1], label, colour))
+    share = shares(congruent)
+    chosen = np.bincount(bins, weights=congruent, minlength=len(centres))[filled].round().astype(int)
+    intervals = [
+        binomtest(int(k), int(n)).proportion_ci(0.95, method="wilson") for k, n in zip(chosen, num[filled], strict=True)
+    ]
+    errors = np.maximum([share - [i.low for i in intervals], [i.high for i in intervals] - share], 0.0)
+    axes.errorbar(centres[filled], share, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
+    labels.append((share[-1], "this agent", AGENT))
+    axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=edges)
+    axes.set_xlabel("degrees between the goal's bearing and the congruent boat's nearest key")
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.set_title(title)
+    label_ends(axes, labels, ends=centres[filled][-1] / edges[-1])
+
+
+def _draw_outcomes(axes: Axes, outcomes: np.ndarray, people: Mapping[str, float]) -> None:
+    names = [name for code, name in enumerate(OUTCOMES) if (outcomes == code).any() or people.get(name)]
+    colour = REFERENCES["human"][1]
+    for row, name in enumerate(names):
+        share = (outcomes == OUTCOMES.index(name)).mean()
+        axes.barh(row, share, color=_OUTCOME_COLOURS[name], height=0.62)
+        axes.annotate(f"{share:.1%}", (1.16, row), ha="right", va="center", fontsize=8.5, annotation_clip=False)
+        if people.get(name) is not None:
+            for edge, width in (("white", 4.5), (colour, 2.0)):  # the white edge keeps it apart from the bar
+                axes.plot([people[name]] * 2, [row - 0.38, row + 0.38], color=edge, linewidth=width)
+    if people.get("success") is not None:
+        axes.annotate("people", (people["success"], -0.45), color=colour, ha="center", va="bottom", fontsize=8.5)
+    axes.set(xlim=(0, 1), ylim=(len(names) - 0.4, -0.85))
+    axes.set_yticks(range(len(names)), [_words(name) for name in names])
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.tick_params(axis="y", length=0)
+    axes.set_title("How episodes end")

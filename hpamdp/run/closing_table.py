@@ -1,0 +1,67 @@
+"""The table that closes a run: this agent beside the references."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from hpamdp.analysis.style import REFERENCES
+from hpamdp.env.base import Metric
+from hpamdp.messages import duration
+from hpamdp.run.metrics import FRAMES, WALL_SECONDS
+
+
+def _number(value: float) -> str:
+    return f"{round(value, 3) + 0.0:.3f}"  # adding 0 turns -0.0 into 0.0
+
+
+_WRITE: dict[str, Callable[[float], str]] = {"number": _number, "share": "{:.1%}".format, "count": "{:.2f}".format}
+
+
+def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
+    """Return a plain aligned table of this agent beside the references.
+
+    Args:
+        summary: the agent's figures by their names, `references`, `frames` and `wall_s`. Rows that the agent has no
+            figure for are left out, and so are columns without any.
+        metrics: the rows.
+    """
+    titles = {name: title for name, (title, _, _) in REFERENCES.items()}
+    beside = summary.get("references", {})
+    columns = {titles.get(name, name): beside[name] for name in sorted(beside, key=_order)}
+    columns = {"this agent": summary, **columns}
+    rows = [metric for metric in metrics if _is_known(summary.get(metric.name))]
+    columns = {
+        title: figures
+        for title, figures in columns.items()
+        if any(_is_known(figures.get(metric.name)) for metric in rows)
+    }
+    cells = [["", *columns]] if rows else []
+    for metric in rows:
+        values = [figures.get(metric.name) for figures in columns.values()]
+        cells.append([metric.title, *(_WRITE[metric.kind](value) if _is_known(value) else "" for value in values)])
+    widths = [max(len(cell) for cell in column) for column in zip(*cells, strict=True)]
+    lines = []
+    for first, *others in cells:
+        aligned = [first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]
+        lines.append("   ".join(aligned).rstrip())
+    return "\n".join([*lines, *_effort(summary)])
+
+
+def _order(reference: str) -> int:
+    known = list(REFERENCES)
+    return known.index(reference) if reference in known else len(known)
+
+
+def _is_known(value: Any) -> bool:
+    return value is not None and not math.isnan(value)
+
+
+def _effort(summary: Mapping[str, Any]) -> list[str]:
+    parts = []
+    if _is_known(summary.get(FRAMES)):
+        parts.append(f"{summary[FRAMES]:,.0f} frames")
+    if _is_known(summary.get(WALL_SECONDS)):
+        parts.append(duration(summary[WALL_SECONDS]))
+    return [" in ".join(parts)] if parts else []

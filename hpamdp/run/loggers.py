@@ -1,0 +1,213 @@
+"""Where a run's numbers go beside its own files."""
+
+from __future__ import annotations
+
+import netrc
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal, Protocol
+from urllib.parse import urlsplit
+
+from hpamdp.messages import first_line, warn
+
+# Seconds that an online wandb run may keep the training waiting, at its start and at its end.
+_WANDB_START, _WANDB_FINISH = 20.0, 60.0
+
+WandbMode = Literal["offline", "online", "disabled"]
+# What WANDB_MODE may say; two names are wandb's older ones.
+_WANDB_MODES: dict[str, WandbMode] = {
+    "online": "online",
+    "offline": "offline",
+    "disabled": "disabled",
+    "run": "online",
+    "dryrun": "offline",
+}
+
+
+class Logger(Protocol):
+    """Takes a run's numbers and figures somewhere besides `metrics.csv`."""
+
+    def log(self, row: dict[str, float], step: int) -> None:
+        """Take one row of metrics after `step` frames; steps never go down."""
+
+    def images(self, paths: Iterable[Path]) -> None:
+        """Take figures, under their file names."""
+
+    def summary(self, figures: dict[str, Any]) -> None:
+        """Take what closes the run; entries may be mappings."""
+
+    def close(self) -> None:
+        """Finish; nothing is logged afterwards."""
+
+
+class CSVLogger:
+    """Log nothing beyond the files that every run writes.
+
+    Args:
+        output_dir: the run's folder, where they are.
+    """
+
+    def __init__(self, output_dir: Path) -> None:
+        self.output_dir = output_dir
+
+    def log(self, row: dict[str, float], step: int) -> None:
+        """Do nothing: the row is in `metrics.csv`."""
+
+    def images(self, paths: Iterable[Path]) -> None:
+        """Do nothing: the figures are in the folder."""
+
+    def summary(self, figures: dict[str, Any]) -> None:
+        """Do nothing: the summary is in `summary.json`."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+class TensorboardLogger:
+    """Log to TensorBoard event files.
+
+    Args:
+        output_dir: the run's folder; the events go to `tensorboard` in it.
+    """
+
+    def __init__(self, output_dir: Path) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer = SummaryWriter(str(output_dir / "tensorboard"))
+        self._step = 0
+
+    def log(self, row: dict[str, float], step: int) -> None:
+        """Write each metric as a scalar after `step` frames."""
+        self._step = step
+        for name, value in row.items():
+            self._writer.add_scalar(name, value, step)
+
+    def images(self, paths: Iterable[Path]) -> None:
+        """Write figures under their file names."""
+        import numpy as np
+        from PIL import Image
+
+        for path in paths:
+            with Image.open(path) as image:
+                self._writer.add_image(path.stem, np.asarray(image.convert("RGB")), self._step, dataformats="HWC")
+
+    def summary(self, figures: dict[str, Any]) -> None:
+        """Write the summary as a table in text."""
+        lines = [f"| {name} | {value} |" for name, value in figures.items()]
+        self._writer.add_text("summary", "\n".join(["| | |", "|---|---|", *lines]), self._step)
+
+    def close(self) -> None:
+        """Write what is left and close the file."""
+        self._writer.close()
+
+
+class WandbLogger:
+    """Log to Weights & Biases without ever asking for anything or keeping a run from starting.
+
+    Args:
+        project, entity, group, name: as in `wandb.init`; None leaves the choice to wandb.
+        mode: "auto" is what `WANDB_MODE` says, and without it online where an API key is configured (`WANDB_API_KEY`
+            or netrc), offline elsewhere. "online" goes offline with a warning where there is no key or no answer.
+        output_dir: the run's folder; offline runs lie in `wandb` in it, ready for `wandb sync`.
+        config: the run's settings, to be shown beside its numbers.
+    """
+
+    def __init__(
+        self,
+        project: str,
+        entity: str | None,
+        group: str | None,
+        name: str | None,
+        mode: Literal["auto", "offline", "online", "disabled"],
+        *,
+        output_dir: Path,
+        config: dict[str, Any] | None = None,
+    ) -> None:
+        import wandb
+
+        output_dir.mkdir(parents=True, exist_ok=True)  # wandb goes to a temporary folder where this one is missing
+        wandb_settings = wandb.Settings(
+            silent=True,
+            console="off",
+            init_timeout=_WANDB_START,
+            login_timeout=_WANDB_START,
+            finish_timeout=_WANDB_FINISH,
+        )
+
+        def start(chosen: WandbMode) -> wandb.Run:
+            # `setup` needs the mode, too: it silences the login, and keeps an offline run from reporting its use.
+            wandb_settings.mode = chosen
+            wandb.setup(wandb_settings)
+            return wandb.init(
+                project=project,
+                entity=entity,
+                group=group,
+                name=name,
+                dir=str(output_dir),
+                config=config,
+                settings=wandb_settings,
+            )
+
+        chosen = _wandb_mode(mode, wandb.setup(wandb_settings).settings.base_url)
+        try:
+            self._run = start(chosen)
+        except wandb.errors.Error as error:
+            if chosen != "online":
+                raise
+            warn(f"wandb could not start online, the run is logged offline: {first_line(error)}")
+            self._run = start("offline")
+        self._image = wandb.Image
+        self._step = 0
+
+    @property
+    def is_offline(self) -> bool:
+        """Whether the run stays on this machine."""
+        return self._run.offline
+
+    def log(self, row: dict[str, float], step: int) -> None:
+        """Send one row of metrics after `step` frames."""
+        self._step = step
+        self._run.log(row, step=step)
+
+    def images(self, paths: Iterable[Path]) -> None:
+        """Send figures under their file names."""
+        self._run.log({path.stem: self._image(str(path)) for path in paths}, step=self._step)
+
+    def summary(self, figures: dict[str, Any]) -> None:
+        """Send what closes the run."""
+        self._run.summary.update(figures)
+
+    def close(self) -> None:
+        """Wait, for a minute at most, until everything is sent."""
+        self._run.finish()
+
+
+def _wandb_mode(mode: str, server: str) -> WandbMode:
+    given = mode
+    if mode == "auto":
+        given = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
+    if given not in _WANDB_MODES:
+        raise ValueError(f"WANDB_MODE={given}: must be one of {', '.join(_WANDB_MODES)}")
+    chosen = _WANDB_MODES[given]
+    if chosen == "online" and not _has_wandb_key(server):
+        warn("wandb has no API key (WANDB_API_KEY or netrc), the run is logged offline")
+        return "offline"
+    return chosen
+
+
+def _has_wandb_key(server: str) -> bool:
+    if os.environ.get("WANDB_API_KEY"):
+        return True
+    host = urlsplit(server).netloc
+    # Keys of wandb's own cloud may still be kept under its older name, where wandb finds them as well.
+    hosts = [host, "api.wandb.ai"] if host == "api.forge.coreweave.com" else [host]
+    files = [os.environ["NETRC"]] if "NETRC" in os.environ else [Path.home() / ".netrc", Path.home() / "_netrc"]
+    for file in files:
+        try:
+            logins = netrc.netrc(str(file))
+        except (OSError, netrc.NetrcParseError):
+            continue
+        if any(logins.authenticators(name) for name in hosts):
+            return True
+    return False

@@ -1,0 +1,50 @@
+"""The config of a run that starts from a checkpoint: that of the saved run, changed by the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from hpamdp.config import GROUPS, Config, ConfigError, chosen_names, compose_saved, read
+from hpamdp.run import checkpoint
+
+# Parts of the config that make the agent what it is.
+_AGENT = ("high", "low", "agent", "experiment", "search")
+
+
+def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | None]:
+    """Return the config to run and the checkpoint to start from, if there is one.
+
+    With `resume` or `mode=eval` the saved run's config is taken, changed by what the command line sets anew.
+
+    Args:
+        cfg: the composed config.
+        overrides: the words of the command line.
+
+    Raises:
+        ConfigError: a wrong value, no such checkpoint, or a word that would change the saved agent.
+    """
+    config = read(cfg)
+    where = "resume" if config.run.resume is not None else "checkpoint"
+    source = config.run.resume or config.run.checkpoint
+    if source is None:
+        return config, None
+    file = checkpoint.find(source, where)
+    saved = checkpoint.progress_of(file)["config"]
+    if config.run.resume is not None and config.run.mode != saved["mode"]:
+        raise ConfigError(
+            f"resume={source}: a run with mode={saved['mode']}; resume it so, or start one with low.checkpoint={source}"
+        )
+    merged, names = compose_saved(saved)
+    for key in ("mode", "resume", "checkpoint"):  # how that run began does not matter to this one
+        merged[key] = cfg[key]
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
+        if key.split(".")[0] in _AGENT:
+            raise ConfigError(f"{override}: {where} takes the agent from {file}; leave this out")
+        OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False)
+        if key in GROUPS:
+            names[key] = chosen_names(cfg)[key]
+    return read(merged, names), file

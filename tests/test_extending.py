@@ -1,0 +1,79 @@
+"""The examples of examples/extending run from outside the package, by the commands that their README gives."""
+
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torchrl.envs.utils import check_env_specs
+
+FOLDER = Path(__file__).resolve().parent.parent / "examples" / "extending"
+COMMANDS = re.findall(r"^python (-m hpamdp\.cli .*)$", (FOLDER / "README.md").read_text(), re.MULTILINE)
+# What makes a run short.
+SHORT = ["num_envs=8", "steps_per_batch=4", "total_frames=256", "eval.every=0", "eval.layouts=10"]
+
+
+def run(words: list[str], folder: Path) -> dict:
+    environment = os.environ | {"PYTHONPATH": str(FOLDER.parent.parent)}
+    command = [sys.executable, *words, f"hydra.run.dir={folder}"]
+    done = subprocess.run(command, cwd=FOLDER, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads((folder / "summary.json").read_text())
+
+
+def test_the_readme_has_a_command_for_each_file():
+    assert len(COMMANDS) == 4
+    for file in FOLDER.glob("*.py"):
+        assert any(file.stem in command for command in COMMANDS), file.name
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command.split("total_frames")[0][:60])
+def test_each_command_of_the_readme_runs_and_can_be_resumed(command, tmp_path):
+    words = shlex.split(command)
+    minibatch = ["low.minibatch_size=16"] if "hppo" in command else []
+    first = run([*words, *SHORT, *minibatch], tmp_path / "a")
+    assert first["finished"] and first["frames"] == 256
+    conf = words[2:4] if "--config-dir" in words else []
+    again = run(["-m", "hpamdp.cli", *conf, f"resume={tmp_path / 'a'}", "total_frames=320"], tmp_path / "b")
+    assert again["frames"] == 320
+    assert (again["env"], again["high"], again["low"]) == (first["env"], first["high"], first["low"])
+
+
+def test_the_page_extend_quotes_the_examples_and_their_commands_to_the_letter():
+    page = (FOLDER.parent.parent / "docs/extend.md").read_text()
+    sources = [file.read_text() for file in FOLDER.glob("*.py")]
+    quotes = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert len(quotes) > 5
+    assert not [quote for quote in quotes if not any(quote.rstrip() in source for source in sources)]
+    assert re.findall(r"^python (-m hpamdp\.cli .*)$", page, re.MULTILINE) == COMMANDS
+
+
+@pytest.fixture
+def putting(monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    import putting
+
+    return putting
+
+
+def test_the_problem_of_ones_own_keeps_the_contract(putting):
+    env = putting.PuttingEnv(5, seed=3)
+    check_env_specs(env)
+    one = env.reset()["observation"]
+    half = putting.PuttingEnv(2, seed=3, first_env=3)
+    assert torch.equal(half.reset()["observation"], putting.PuttingEnv(5, seed=3).reset()["observation"][3:])
+    state = env.env_state()
+    again = putting.PuttingEnv(5, seed=3)
+    again.set_env_state(state)
+    assert torch.equal(again.env_state()["distance"], state["distance"]) and one.shape == (5, 2)
+
+
+@pytest.mark.slow
+def test_the_learner_of_ones_own_learns(tmp_path):
+    command = next(command for command in COMMANDS if "reinforce" in command)
+    assert run(shlex.split(command), tmp_path)["success"] > 0.9

@@ -1,0 +1,89 @@
+"""The project's pages and files agree with one another: versions, links, the length of the README."""
+
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+import hpamdp
+
+try:
+    import tomllib
+except ModuleNotFoundError:  # Python 3.10
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+PAGES += [file for folder in ("docs", "experiments", "examples") for file in sorted((ROOT / folder).rglob("*.md"))]
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def broken_links(page: Path) -> list[str]:
+    """Return a page's relative links and pictures that lead nowhere."""
+    broken = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        path, _, anchor = link.partition("#")
+        if re.match(r"[a-z]+:", link):
+            continue
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            broken.append(link)
+    return broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_no_link_of_a_page_leads_nowhere(page):
+    assert not broken_links(page)
+
+
+def test_a_broken_link_is_found(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(
+        "# One heading\n[a](gone.md) [b](#one-heading) [c](#other) [d](page.md#one-heading) [e](https://x.y)\n"
+    )
+    assert broken_links(page) == ["gone.md", "#other"]
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 155
+
+
+def test_the_changelog_and_the_citation_have_this_version():
+    assert f"## [{hpamdp.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == hpamdp.__version__
+
+
+def test_every_dependency_has_a_lowest_version_that_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    ranges = dict(re.fullmatch(r"([\w-]+)>=([\d.]+),<[\d.]+", line).groups() for line in project["dependencies"])
+    text = (ROOT / "constraints-lowest.txt").read_text().lower()
+    pinned = dict(re.findall(r"^([\w-]+)==([\d.]+)", text, re.MULTILINE))
+    for name, lowest in ranges.items():
+        assert pinned[name].startswith(lowest), name
+
+
+def imported(package: str) -> bool:
+    """Return whether a module of hpamdp imports a package."""
+    pattern = rf"^\s*(import|from) {package}\b"
+    return any(re.search(pattern, file.read_text(), re.MULTILINE) for file in (ROOT / "hpamdp").rglob("*.py"))
+
+
+def test_every_dependency_is_imported_by_something():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    modules = {"hydra-core": "hydra", "pillow": "PIL", "pyyaml": "yaml", "tensorboard": "torch.utils.tensorboard"}
+    for line in project["dependencies"]:
+        name = re.match(r"[\w-]+", line).group()
+        assert imported(modules.get(name, name)), name
+
+
+def test_make_knows_its_targets():
+    for target in ("run", "test", "slow", "lowest", "wheel", "report"):
+        done = subprocess.run(["make", "--dry-run", target], cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
