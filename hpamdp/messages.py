@@ -1,8 +1,11 @@
-"""Words for the user: one line each."""
+"""Words for the user: one line each, on streams that may be gone."""
 
 from __future__ import annotations
 
+import os
 import sys
+from contextlib import suppress
+from typing import TextIO
 
 
 def one_line(text: object) -> str:
@@ -15,9 +18,47 @@ def first_line(text: object) -> str:
     return one_line(str(text).strip().partition("\n")[0])
 
 
+class LenientStream:
+    """A text stream on which writing never fails: a terminal that was closed or a full disk costs the text alone."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write the text if possible."""
+        with suppress(OSError, ValueError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream if possible."""
+        with suppress(OSError, ValueError):
+            self._stream.flush()
+
+    def isatty(self) -> bool:
+        """Return whether the stream is a terminal."""
+        with suppress(OSError, ValueError):
+            return self._stream.isatty()
+        return False
+
+
+def say(text: str) -> None:
+    """Print to stdout, if it is still there."""
+    _print(text, sys.stdout)
+
+
 def warn(message: str) -> None:
-    """Write one line to stderr; the logging module may be switched off."""
-    print(message, file=sys.stderr)
+    """Write one line to stderr, if it is still there; the logging module may be switched off."""
+    _print(message, sys.stderr)
+
+
+def _print(text: str, stream: TextIO) -> None:
+    try:
+        print(text, file=stream, flush=True)
+    except (OSError, ValueError):
+        # Otherwise the interpreter fails once more when it flushes the stream at its end.
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def duration(seconds: float) -> str:

@@ -1,20 +1,55 @@
-"""A run on disk: everything that is needed to go on with it or to score its agent."""
+"""A run on disk: everything that is needed to continue it or to score its agent.
+
+A checkpoint is a zip archive: `manifest.json` with the run's progress and the checksums of the other members, and one
+member for each component, written by `torch.save` and read with `weights_only`, so that opening somebody else's file runs
+none of its code. TorchRL's `Checkpoint` is not used: it reads a replay buffer's prefetch queue with pickle, stores replay
+buffers at full capacity, and moves the old file away before the new one is in place.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import json
+import os
+import pickle
+import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
-from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState, StateDictCheckpointAdapter
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 
 from hpamdp.config import ConfigError
+from hpamdp.messages import first_line, one_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 
 FILE_NAME = "checkpoint.zip"
+POLICY_NAME = "policy.pt"
+
+_FORMAT = 2
+_MANIFEST = "manifest.json"
+# What can be wrong with the bytes of a file.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    pickle.UnpicklingError,
+    json.JSONDecodeError,
+    UnicodeDecodeError,
+    EOFError,
+    OSError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    NotImplementedError,
+    ValueError,
+    RuntimeError,
+)
 
 
 def find(path: str | Path, where: str) -> Path:
@@ -23,81 +58,117 @@ def find(path: str | Path, where: str) -> Path:
     file = path / FILE_NAME if path.is_dir() else path
     if not file.is_file():
         raise ConfigError(f"{where}={path}: no checkpoint there; give a run's output folder or its {FILE_NAME}")
-    if not Checkpoint.is_checkpoint(file):
+    if not zipfile.is_zipfile(file):
         raise ConfigError(f"{where}={file}: not a checkpoint of this program")
     return file
 
 
-class _Columns:
-    """What is saved or loaded, as a component with a state dict."""
+def save(
+    path: Path,
+    agent: HierarchicalAgent,
+    env_state: Mapping[str, Tensor],
+    progress: Mapping[str, Any],
+    *,
+    with_replay: bool = True,
+) -> None:
+    """Write the agent, its optimizers and replay, the environment's state and the random generators.
 
-    def __init__(self, columns: Mapping[str, Tensor]) -> None:
-        self.columns = dict(columns)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        return self.columns
-
-    def load_state_dict(self, columns: Mapping[str, Tensor]) -> None:
-        self.columns = dict(columns)
-
-
-def _components(agent: HierarchicalAgent, columns: _Columns) -> Checkpoint:
-    checkpoint = Checkpoint()
-    for name, part in {"agent": agent, "rng": GlobalRNGState(), "env": columns, **agent.stateful()}.items():
-        # One file a component; replay buffers have a format of their own.
-        adapter = None if isinstance(part, ReplayBuffer) else StateDictCheckpointAdapter("torch")
-        checkpoint.register(name, part, adapter=adapter)
-    return checkpoint
-
-
-def _filled(agent: HierarchicalAgent) -> set[str]:
-    """Return the components that can be saved: TorchRL refuses a replay buffer that never held anything."""
-    parts = agent.stateful().items()
-    empty = {name for name, part in parts if isinstance(part, ReplayBuffer) and len(part) == 0}
-    return {"agent", "rng", "env", *agent.stateful()} - empty
-
-
-def save(path: Path, agent: HierarchicalAgent, env_state: Mapping[str, Tensor], progress: Mapping[str, Any]) -> None:
-    """Write the agent, its optimisers and replay, the environment's state and the random generators.
+    The file is complete or not there: it is written beside the old one, flushed to the disk, and put in its place in one
+    step.
 
     Args:
-        path: the file; an older one stays in place until the new one is complete.
+        path: the file.
         agent: the agent.
         env_state: the environment's columns.
-        progress: JSON values to read back with `progress_of`: the resolved config, the frames so far.
+        progress: JSON values to read back with `progress_of`: the config, the frames so far.
+        with_replay: whether replay buffers are stored; without them a resumed run begins with empty ones.
+
+    Raises:
+        OSError: the disk is full, or the folder is gone or cannot be written to; the old file stays as it is.
     """
-    _components(agent, _Columns(env_state)).save(path, components=_filled(agent), format="archive", metadata=progress)
+    members = {"agent": agent.state_dict(), "rng": GlobalRNGState().state_dict(), "env": dict(env_state)}
+    for name, part in agent.stateful().items():
+        if isinstance(part, ReplayBuffer):
+            if with_replay:
+                members[name] = _replay_state(part)
+        else:
+            members[name] = part.state_dict()
+    for leftover in path.parent.glob(f".{path.name}.*.partial"):
+        leftover.unlink(missing_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        checksums = {}
+        with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive:
+            for name, state in members.items():
+                data = _packed(state)
+                checksums[name] = hashlib.sha256(data).hexdigest()
+                archive.writestr(f"{name}.pt", data)
+            manifest = {"format": _FORMAT, "members": checksums, "progress": dict(progress)}
+            archive.writestr(_MANIFEST, json.dumps(manifest))
+        put_in_place(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def put_in_place(partial: Path, path: Path) -> None:
+    """Flush a complete file to the disk and give it its name, in place of an older one."""
+    with partial.open("rb+") as file:
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def save_policy(path: Path, agent: HierarchicalAgent, progress: Mapping[str, Any]) -> None:
+    """Write the networks alone, without what only training needs; `mode=eval` can load it.
+
+    Raises:
+        OSError: as `save`.
+    """
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        torch.save({"format": _FORMAT, "progress": json.dumps(dict(progress)), "agent": agent.state_dict()}, partial)
+        put_in_place(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
 def progress_of(file: Path) -> dict[str, Any]:
-    """Return what `save` was given as `progress`."""
-    return Checkpoint.manifest(file)["metadata"]
+    """Return what `save` was given as `progress`.
+
+    Raises:
+        ConfigError: the file is damaged or not a checkpoint of this program.
+    """
+    return _read(file, set())[0]
 
 
 def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:
-    """Fill the agent's learners, but neither their optimisers nor their replay, from another run's checkpoint.
+    """Fill the agent's learners, but neither their optimizers nor their replay, from another run's checkpoint.
 
     Raises:
         ConfigError: the checkpoint is damaged or of other learners.
     """
-    saved = _Columns({})
-    checkpoint = Checkpoint()
-    checkpoint.register("agent", saved, adapter=StateDictCheckpointAdapter("torch"))
+    _, members = _read(file, {"agent"}, device)
+    prefix = "learners."
+    own = {name.removeprefix(prefix): value for name, value in members["agent"].items() if name.startswith(prefix)}
+    saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
+    if own and saved_num != num:
+        raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} learners, but this agent has {num}")
     try:
-        checkpoint.load(file, components={"agent"}, map_location=device)
-        prefix = "learners."
-        own = {name.removeprefix(prefix): value for name, value in saved.columns.items() if name.startswith(prefix)}
-        saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
-        if own and saved_num != num:
-            raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} learners, but this agent has {num}")
         agent.learners.load_state_dict(own)
-    except (CheckpointError, RuntimeError, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"low.checkpoint={file}: of another class or size than low: {reason:.160}") from error
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(
+            f"low.checkpoint={file}: of another class or size than low: {one_line(error):.160}"
+        ) from error
 
 
 def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_training: bool) -> dict[str, Tensor]:
-    """Fill the agent from a checkpoint, with training also its optimisers and replay and the random generators.
+    """Fill the agent from a checkpoint, with training also its optimizers, replay and the random generators.
+
+    Nothing is changed before the whole file was read and checked.
 
     Returns:
         The environment's columns.
@@ -105,13 +176,99 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_traini
     Raises:
         ConfigError: the checkpoint is damaged or of another agent.
     """
-    columns = _Columns({})
-    checkpoint = _components(agent, columns)
-    # What was empty when it was saved stays empty; anything else that is missing is an error.
-    saved = set(Checkpoint.manifest(file)["components"])
-    wanted = (saved | _filled(agent)) if with_training else {"agent", "env"}
+    stateful = agent.stateful()
+    _, members = _read(file, {"agent", "env", "rng", *stateful} if with_training else {"agent", "env"}, device)
+    replays = {name for name, part in stateful.items() if isinstance(part, ReplayBuffer)}
+    missing = {"agent", "env", "rng", *stateful} - replays - set(members) if with_training else set()
+    if missing:
+        raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
     try:
-        checkpoint.load(file, components=wanted, map_location=device)
-    except (CheckpointError, RuntimeError, OSError) as error:
-        raise ConfigError(f"{file}: does not fit this agent: {str(error).splitlines()[0]}") from error
-    return columns.columns
+        agent.load_state_dict(members["agent"])
+        if with_training:
+            for name, part in stateful.items():
+                if name in replays:
+                    _fill_replay(part, members.get(name))
+                else:
+                    part.load_state_dict(members[name])
+            _set_generators(members["rng"])
+    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise ConfigError(f"{file}: does not fit this agent: {first_line(error)}") from error
+    return members.get("env", {})
+
+
+def _packed(state: object) -> bytes:
+    stream = io.BytesIO()
+    torch.save(state, stream)
+    return stream.getvalue()
+
+
+def _read(
+    file: Path, wanted: set[str], device: torch.device | None = None
+) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Return the progress and the wanted members that are there; check every byte that is used."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if _MANIFEST not in archive.namelist():
+                return _read_policy(file, device)
+            manifest = json.loads(archive.read(_MANIFEST))
+            if manifest["format"] != _FORMAT:
+                raise ValueError(f"format {manifest['format']}, but this version reads {_FORMAT}")
+            members = {}
+            for name in sorted(wanted & set(manifest["members"])):
+                data = archive.read(f"{name}.pt")
+                if hashlib.sha256(data).hexdigest() != manifest["members"][name]:
+                    raise ValueError(f"the checksum of {name} is wrong")
+                members[name] = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
+            progress = dict(manifest["progress"])
+            _check_progress(progress)
+    except _DAMAGE as error:
+        raise ConfigError(
+            f"{file}: damaged, or not a checkpoint of this program ({type(error).__name__}: {first_line(error):.120})"
+        ) from error
+    _check_weights(file, members.get("agent", {}))
+    return progress, members
+
+
+def _read_policy(file: Path, device: torch.device | None) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Read what `save_policy` wrote."""
+    saved = torch.load(file, map_location=device, weights_only=True)
+    progress = json.loads(saved["progress"])
+    _check_progress(progress)
+    _check_weights(file, saved["agent"])
+    return progress, {"agent": saved["agent"], "env": {}}
+
+
+def _check_progress(progress: Mapping[str, Any]) -> None:
+    if not isinstance(progress["config"], Mapping):
+        raise TypeError("the config is no mapping")
+
+
+def _check_weights(file: Path, state: Mapping[str, Any]) -> None:
+    for name, value in state.items():
+        if isinstance(value, Tensor) and value.is_floating_point() and value.isnan().any():
+            raise ConfigError(f"{file}: {name} holds NaN; take an earlier checkpoint")
+
+
+def _replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
+    """Return the filled rows of a buffer and the place of the next one."""
+    rows = buffer[:].clone().to_dict() if len(buffer) else {}
+    return {"rows": rows, "num_rows": len(buffer), "writer": dict(buffer._writer.state_dict())}
+
+
+def _fill_replay(buffer: ReplayBuffer, state: Mapping[str, Any] | None) -> None:
+    if state is None:
+        warn("the checkpoint holds no replay (checkpoint.replay=false); the learner begins with an empty one")
+        return
+    if state["num_rows"]:
+        buffer.extend(TensorDict(state["rows"], batch_size=[state["num_rows"]]))
+    buffer._writer.load_state_dict(state["writer"])
+
+
+def _set_generators(state: Mapping[str, Any]) -> None:
+    """Restore the random generators; those of devices that this machine lacks are left out, with a warning."""
+    here = dict(state)
+    if "torch_cuda" in here and not torch.cuda.is_available():
+        del here["torch_cuda"]
+        warn("the checkpoint was made with CUDA, which is not here: its random generators are left out")
+    here["torch_cpu"] = here["torch_cpu"].cpu()
+    GlobalRNGState().load_state_dict(here)

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
-import signal
+import math
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import cast
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tensordict import TensorDictBase
 from tqdm import tqdm
 
+from hpamdp import keys
 from hpamdp.config import Config, ConfigError
+from hpamdp.messages import LenientStream, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.collection.base import Collection
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import resolve
+from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
+_INTERRUPTED, _DIVERGED = 130, 3
+DIVERGED_NAME = "checkpoint.diverged.zip"
+
+
+class DivergedError(Exception):
+    """A number of the training that is not finite."""
 
 
 def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stopped_at: Path | None = None) -> int:
     """Train or score an agent, write everything under `output_dir`, return the exit code.
+
+    0: the run reached its end. 130: it was stopped by a signal, and saved. 3: a reward, a loss or a weight was not
+    finite; the last good checkpoint is kept.
 
     Args:
         cfg: the composed config.
@@ -43,13 +58,19 @@ def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stoppe
         trainer.restore(source)
     output_dir.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(OmegaConf.create(config.to_dict()), output_dir / "config.yaml")
-    is_interrupted = config.run.mode != "eval" and trainer.train()
-    print(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, not is_interrupted))
-    print(f"Everything is in {output_dir}")
+    is_interrupted = False
+    if config.run.mode != "eval":
+        try:
+            is_interrupted = trainer.train()
+        except DivergedError as error:
+            warn(f"{error} at frame {trainer.frames:,}: training stopped; {trainer.keep_for_inspection()}")
+            return _DIVERGED
+    say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, not is_interrupted))
+    say(f"Everything is in {output_dir}")
     if is_interrupted:
         mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
-        print(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: python run.py {mode}resume={output_dir}")
-    return 130 if is_interrupted else 0
+        say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: python run.py {mode}resume={output_dir}")
+    return _INTERRUPTED if is_interrupted else 0
 
 
 class Trainer:
@@ -97,52 +118,83 @@ class Trainer:
         self.recorder.resume_from(source.parent, self.frames)
 
     def train(self) -> bool:
-        """Train until `num_frames` or `eval.stop_score` and save the agent; return whether the user interrupted it."""
-        collection = self.config.collector.build(config=self.config, parts=self.parts, frames=self.frames)
-        total = self.config.run.num_frames
-        bar = tqdm(total=total, initial=self.frames, unit=self.unit, unit_scale=True, mininterval=1.0)
-        previous = signal.signal(signal.SIGTERM, signal.default_int_handler)  # a cluster's stop is a Ctrl-C
-        try:
-            self._loop(collection, bar)
-            return False
-        except KeyboardInterrupt:
-            return True
-        finally:
-            # Saving must not be interrupted.
-            handlers = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
-            bar.close()
-            self.save(collection)
-            collection.close()
-            signal.signal(signal.SIGINT, handlers[signal.SIGINT])
-            signal.signal(signal.SIGTERM, previous)
+        """Train until `num_frames` or `eval.stop_score` and save the agent; return whether a signal stopped it before.
 
-    def _loop(self, collection: Collection, bar: tqdm) -> None:
-        wall_before, cpu_before = self.wall_s - time.perf_counter(), self.cpu_s - time.process_time()
-        if self.last_score is None and self.frames == 0:
-            self._evaluate(bar)
-            if self.parts.data is not None:
-                self.parts.agent.add_demonstrations(self.parts.data)
-        while not self._is_over():
-            num = self._learn(collection)
-            last, self.frames = self.frames, self.frames + num
-            self.wall_s = wall_before + time.perf_counter()
-            self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
-            bar.update(num)
-            if self.frames >= self.config.run.num_frames or _is_due(last, self.frames, self.config.run.eval_every):
+        A signal takes effect between two batches, so that what is saved is what an uninterrupted run has there.
+
+        Raises:
+            DivergedError: a reward, a loss or a weight is not finite; nothing was saved since.
+        """
+        with stop_on_signals() as request:
+            collection: Collection = self.config.collector.build(
+                config=self.config, parts=self.parts, frames=self.frames
+            )
+            try:
+                self._loop(collection, request)
+            except KeyboardInterrupt:  # the second signal
+                pass
+            except DivergedError:
+                collection.close()
+                raise
+            # Saving comes first, is not interrupted, and depends on no stream.
+            with signals_ignored():
+                try:
+                    self.save(collection)
+                finally:
+                    collection.close()
+            return not self._is_over()
+
+    def _loop(self, collection: Collection, request: StopRequest) -> None:
+        run = self.config.run
+        wall_before = self.wall_s - time.perf_counter()
+        cpu_before = self.cpu_s - time.process_time()
+        saved_at = time.monotonic()
+        bar = tqdm(
+            total=run.num_frames,
+            initial=self.frames,
+            unit=self.unit,
+            unit_scale=True,
+            mininterval=1.0,
+            file=LenientStream(sys.stderr),
+        )
+        with bar:
+            if self.last_score is None and self.frames == 0:
                 self._evaluate(bar)
-            elif _is_due(last, self.frames, self.config.run.log_every):
-                self.recorder.log(self.frames, self.wall_s, is_evaluated=False)
-            if not self._is_over() and _is_due(last, self.frames, self.config.run.checkpoint_every):
-                self.save(collection)
+                if self.parts.data is not None:
+                    self.parts.agent.add_demonstrations(self.parts.data)
+            while not self._is_over() and request.signal is None:
+                num = self._learn(collection)
+                last = self.frames
+                self.frames += num
+                self.wall_s = wall_before + time.perf_counter()
+                self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
+                bar.update(num)
+                if self.frames >= run.num_frames or _is_due(last, self.frames, run.eval_every):
+                    self._evaluate(bar)
+                elif _is_due(last, self.frames, run.log_every):
+                    self.recorder.log(self.frames, self.wall_s, is_evaluated=False)
+                is_time = run.checkpoint_minutes > 0.0 and time.monotonic() - saved_at > 60.0 * run.checkpoint_minutes
+                if not self._is_over() and (is_time or _is_due(last, self.frames, run.checkpoint_every)):
+                    self.save(collection)
+                    saved_at = time.monotonic()
 
     def _learn(self, collection: Collection) -> int:
-        """Let the agent learn from a batch of steps or from the data set; return the number of frames."""
+        """Let the agent learn from a batch of steps or from the data set; return the number of frames.
+
+        Raises:
+            DivergedError: a reward or a loss is not finite.
+        """
         if self.config.run.mode == "offline":
             num = min(_UPDATES_A_TURN, self.config.run.num_frames - self.frames)
-            self.recorder.take(None, self.parts.agent.update(num))
+            scalars = self.parts.agent.update(num)
+            check_scalars(scalars)
+            self.recorder.take(None, scalars)
             return num
         batch = collection.next()
-        self.recorder.take(batch, self.parts.agent.learn(batch))
+        check_rewards(batch)
+        scalars = self.parts.agent.learn(batch)
+        check_scalars(scalars)
+        self.recorder.take(batch, scalars)
         return batch.numel()
 
     def _is_over(self) -> bool:
@@ -157,15 +209,60 @@ class Trainer:
         bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
 
     def save(self, collection: Collection) -> None:
-        """Write the checkpoint."""
-        progress = {
+        """Write the checkpoint and the networks alone.
+
+        Raises:
+            DivergedError: a weight is not a number.
+        """
+        for name, value in self.parts.agent.state_dict().items():
+            if isinstance(value, torch.Tensor) and value.is_floating_point() and value.isnan().any():
+                raise DivergedError(f"{name} is NaN")
+        progress = self._progress()
+        file = self.output_dir / checkpoint.FILE_NAME
+        with_replay = self.config.run.checkpoint_replay
+        checkpoint.save(file, self.parts.agent, collection.env_state(), progress, with_replay=with_replay)
+        checkpoint.save_policy(self.output_dir / checkpoint.POLICY_NAME, self.parts.agent, progress)
+
+    def keep_for_inspection(self) -> str:
+        """Save the agent as it is beside the last good checkpoint; return in words what there is."""
+        checkpoint.save(self.output_dir / DIVERGED_NAME, self.parts.agent, {}, self._progress(), with_replay=False)
+        good = self.output_dir / checkpoint.FILE_NAME
+        kept = f"the last good checkpoint is {good}" if good.is_file() else "there is no checkpoint from before"
+        return f"{kept}; the agent as it is now is in {self.output_dir / DIVERGED_NAME}"
+
+    def _progress(self) -> dict[str, object]:
+        return {
             "config": self.config.to_dict(),
             "frames": self.frames,
             "wall_s": self.wall_s,
             "cpu_s": self.cpu_s,
             "last_score": self.last_score,
         }
-        checkpoint.save(self.output_dir / checkpoint.FILE_NAME, self.parts.agent, collection.env_state(), progress)
+
+
+def check_rewards(batch: TensorDictBase) -> None:
+    """Check the rewards of a batch `[*B, T]` and their sums.
+
+    Raises:
+        DivergedError: one is not finite.
+    """
+    for key in (keys.REWARD, keys.EPISODE_RETURN):
+        value = cast(torch.Tensor, batch.get(("next", key)))
+        is_finite = value.isfinite()
+        if not is_finite.all():
+            place = (~is_finite).nonzero()[0]
+            raise DivergedError(f"{key} is {value[tuple(place)].item()} in environment {int(place[0])}")
+
+
+def check_scalars(scalars: Mapping[str, float]) -> None:
+    """Check what the agent returned from learning.
+
+    Raises:
+        DivergedError: a value is not finite.
+    """
+    for name, value in scalars.items():
+        if not math.isfinite(value):
+            raise DivergedError(f"{name} is {value}")
 
 
 def _is_due(before: int, now: int, every: int) -> bool:
