@@ -261,6 +261,13 @@ def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
     return node.runtime.choices
 
 
+def job_overrides() -> list[str]:
+    """Return the words of the running job's command line, as they were written."""
+    words = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+    assert isinstance(words, list)
+    return [str(word) for word in words]
+
+
 def _check_mode(run: RunConfig) -> None:
     if run.mode == "eval" and run.checkpoint is None:
         raise ConfigError("checkpoint: missing; mode=eval needs the output folder of a run")
