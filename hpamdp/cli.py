@@ -25,7 +25,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.config import GROUPS, RUN_FILE, ConfigError, conf_dir, no_such, no_such_option
+from hpamdp.config import GROUPS, RUN_FILE, ConfigError, conf_dir, job_overrides, no_such, no_such_option
 from hpamdp.messages import first_line, one_line
 from hpamdp.run import sweep
 
@@ -181,7 +181,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
 
     output_dir = Path(job.runtime.output_dir)
     try:
-        code = train.run(cfg, output_dir, list(job.overrides.task))
+        code = train.run(cfg, output_dir, job_overrides())
     except ConfigError as error:
         # Not raised any further: Hydra would announce it in a line of its own.
         with suppress(OSError):

@@ -244,7 +244,10 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     for group in GROUPS:
         if cfg.get(group) is None or _TARGET not in cfg[group]:
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
-    plain = _plain(OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"]))
+    own = cfg.copy()
+    OmegaConf.set_struct(own, False)
+    own.pop("hydra", None)
+    plain = _plain(own)
     values = {name: value for name, value in plain.items() if name not in GROUPS}
     values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
@@ -256,6 +259,13 @@ def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
     """Return the name that was chosen for each group, from the config's `hydra` part or else from the running job."""
     node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
     return node.runtime.choices
+
+
+def job_overrides() -> list[str]:
+    """Return the words of the running job's command line, as they were written."""
+    words = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+    assert isinstance(words, list)
+    return [str(word) for word in words]
 
 
 def _check_mode(run: RunConfig) -> None:

@@ -108,7 +108,7 @@ def test_learners_and_selectors_do_not_know_the_agent():
 def test_hydra_wandb_and_minari_stay_in_their_rooms():
     assert importers("hydra") <= {"hpamdp.cli", "hpamdp.config", "hpamdp.run.sweep"}
     assert importers("wandb") <= {"hpamdp.run.loggers"}
-    assert importers("minari") <= {"hpamdp.data.minari"}
+    assert importers("minari") <= {"hpamdp.data.minari", "hpamdp.data.human.minari"}
 
 
 def test_the_run_gets_learners_selectors_and_problems_only_through_the_config():

@@ -66,7 +66,7 @@ def test_learning_curves_show_the_logged_values_between_the_references(tmp_path)
     summary = {"references": {"random": {"score": -0.9}, "human": {"success": 0.9}, "ceiling": {"score": 3.6}}}
     figure = _learning_curves(rows, summary, (Metric("score", "Score"), Metric("success", "Success", "share")))
     (axes,) = [axes for axes in figure.axes if axes.axison]
-    assert axes.get_title(loc="left") == "Score"
+    assert axes.get_title() == "Score"
     lines = {tuple(line.get_ydata()) for line in axes.lines}
     assert {(0.0, 0.5, 1.0, 1.5), (-0.9, -0.9), (3.6, 3.6)} <= lines
     written = {text.get_text() for text in axes.texts}

@@ -46,7 +46,8 @@ def make(high: str, low: str, tmp_path):
 def weights(agent: HierarchicalAgent) -> dict[str, torch.Tensor]:
     """Return what the learners have learned, without their counters and schedules."""
     state = agent.learners.state_dict()
-    return {name: value.clone() for name, value in state.items() if value.is_floating_point() and value.ndim > 0}
+    tensors = {name: value for name, value in state.items() if isinstance(value, torch.Tensor)}
+    return {name: value.clone() for name, value in tensors.items() if value.is_floating_point() and value.ndim > 0}
 
 
 def assert_it_updated(given: list[str], folder: Path) -> None:

@@ -53,7 +53,7 @@ def experiments(tmp_path):
     pages = {
         "fine": PAGE,
         "sad": "# Sad\n\n<!-- table -->\n| kept |\n<!-- /table -->\n",
-        "told": "# Told\n",
+        "no_study": "# No study\n",
     }
     scripts = {
         "fine": STUDY,
@@ -75,8 +75,8 @@ def test_a_failing_study_is_named_and_stops_neither_the_others_nor_its_own_page(
     assert failure.startswith("sad: FileNotFoundError") and "nowhere.csv" in failure
     assert "| kept |" in (experiments / "sad/README.md").read_text()
     text = (tmp_path / "report/report.html").read_text()
-    assert all(f'<section id="{name}">' in text for name in ("fine", "pageless", "sad", "told"))
-    assert "<td>0.7</td>" in text and "Told</h1>" in text
+    assert all(f'<section id="{name}">' in text for name in ("fine", "pageless", "sad", "no_study"))
+    assert "<td>0.7</td>" in text and "No study</h1>" in text
 
 
 def test_all_tables_are_renewed_between_the_markers_and_nothing_else_of_the_page(module, experiments, tmp_path):
@@ -130,8 +130,8 @@ def test_the_report_refers_to_no_other_file(module, experiments, tmp_path):
 
 
 def test_a_missing_image_is_named(module, experiments, tmp_path):
-    (experiments / "told/README.md").write_text("# Told\n\n![x](gone.png)\n")
-    assert "told: no image gone.png" in module.report(experiments, tmp_path / "report")
+    (experiments / "no_study/README.md").write_text("# No study\n\n![x](gone.png)\n")
+    assert "no_study: no image gone.png" in module.report(experiments, tmp_path / "report")
 
 
 def test_the_exit_code_says_whether_all_studies_worked(module, experiments, monkeypatch, capsys):

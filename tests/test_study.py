@@ -129,10 +129,10 @@ def test_the_learners_study_names_published_forms_and_rewards_and_when_people_we
     leave_run(tmp_path / "b", low="pdqn", twin_q="false", multipass="false", reward="sparse", scores=(0.0, 1.9))
     leave_run(tmp_path / "c", low="pdqn")
     results, curves = study("learners").gather(finished([tmp_path]))
-    assert [(row["low"], row["reward"], row["presses_to_people"]) for row in results] == [
-        ("pdqn as MP-DQN", "given", 100.0),
+    assert [(row["low"], row["reward"], row["presses_to_human"]) for row in results] == [
+        ("pdqn as MP-DQN", "shaped", 100.0),
         ("pdqn as P-DQN", "sparse", ""),
-        ("pdqn", "given", 200.0),
+        ("pdqn", "shaped", 200.0),
     ]
     assert len(curves) == 8 and math.isclose(curves[1]["eval/success"], 0.1)
 
@@ -144,6 +144,6 @@ def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length
     leave_run(tmp_path / "d", high="ucb")
     leave_run(tmp_path / "e", low="random")
     found = study("table1").gather(finished([tmp_path]))
-    assert [(row["reward"], row["score"]) for row in found["results"]] == [("given", 3.3), ("sparse", 3.1)]
+    assert [(row["reward"], row["score"]) for row in found["results"]] == [("shaped", 3.3), ("sparse", 3.1)]
     assert len(found["curves"]) == 5
     assert [(row["frames"], row["eval/score"]) for row in found["efficiency"]] == [(0.0, 0.0), (100.0, 2.0)]

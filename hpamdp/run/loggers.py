@@ -127,6 +127,7 @@ class WandbLogger:
         import wandb
 
         output_dir.mkdir(parents=True, exist_ok=True)  # wandb goes to a temporary folder where this one is missing
+        _check_wandb_mode()
         wandb_settings = wandb.Settings(
             silent=True,
             console="off",
@@ -183,12 +184,16 @@ class WandbLogger:
         self._run.finish()
 
 
+def _check_wandb_mode() -> None:
+    given = os.environ.get("WANDB_MODE")
+    if given and given not in _WANDB_MODES:
+        raise ValueError(f"WANDB_MODE={given}: must be one of {', '.join(_WANDB_MODES)}")
+
+
 def _wandb_mode(mode: str, server: str) -> WandbMode:
     given = mode
     if mode == "auto":
         given = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
-    if given not in _WANDB_MODES:
-        raise ValueError(f"WANDB_MODE={given}: must be one of {', '.join(_WANDB_MODES)}")
     chosen = _WANDB_MODES[given]
     if chosen == "online" and not _has_wandb_key(server):
         warn("wandb has no API key (WANDB_API_KEY or netrc), the run is logged offline")

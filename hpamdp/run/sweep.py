@@ -23,7 +23,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config import Config, ConfigError
+from hpamdp.config import Config, ConfigError, job_overrides
 from hpamdp.messages import one_line
 
 _MISTAKE, _INTERRUPTED = 2, 130
@@ -98,7 +98,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         SystemExit: the user stopped it.
     """
     hydra = HydraConfig.get()
-    overrides = list(hydra.overrides.task)
+    overrides = job_overrides()
     job = Job(hydra.job.num, " ".join(overrides), hydra.runtime.output_dir)
     records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":

@@ -26,6 +26,7 @@ def layouts(data: HumanData) -> harbour.Layout:
 def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
     """Return the mean figures of the episodes of `mask` `[E]`, by the names of `hpamdp.env.boatdock.reference`.
 
+    What is `steps` there, the mean number of presses, is `presses` here.
     `score_error` is the standard error of the mean score over episodes, `episodes` the number of episodes.
     """
     if mask is None:

@@ -58,7 +58,8 @@ class BoatDockEnv(PAMDPEnv):
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
         compile_physics: compile the pure step, reset and observation functions (takes about half a minute).
-        oracle: also write what the planner knows under `oracle` (`option` `[N]`; `key`, `duration` `[N, num_options]`).
+        oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
+            `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.

@@ -123,6 +123,10 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         outcome = last.get(keys.OUTCOME)
         return {"outcome": outcome, "success": outcome == released.SUCCESS}
 
+    def summary_entries(self) -> dict[str, str]:
+        """Return which `controller` the boats have."""
+        return {"controller": self.controller}
+
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the shares of the outcomes other than success. There is no ceiling: idling refuels without limit."""
         return {
