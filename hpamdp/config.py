@@ -127,6 +127,8 @@ class RunConfig(BaseModel):
     offline: OfflineConfig
     eval: EvalConfig
     checkpoint_every: NonNegativeInt
+    checkpoint_minutes: Annotated[float, Field(ge=0.0)]
+    checkpoint_replay: bool
     checkpoint: str | None
     resume: str | None
 

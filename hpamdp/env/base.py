@@ -137,6 +137,11 @@ class PAMDPEnv(EnvBase):
         """
         return {}
 
+    @property
+    def keeps_episodes(self) -> bool:
+        """Whether `env_state` holds the state of the episodes, so that a resumed run continues them."""
+        return bool(self.env_state())
+
     def env_state(self) -> dict[str, Tensor]:
         """Return what the episodes' future depends on, each `[N, ...]`, for a checkpoint; empty where it is unknown."""
         return {}

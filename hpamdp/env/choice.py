@@ -60,6 +60,11 @@ class OptionChoiceEnv(PAMDPEnv):
         """Return the results of the wrapped environment."""
         return self._inner_env.results(last)
 
+    @property
+    def keeps_episodes(self) -> bool:
+        """Whether the environment's `env_state` holds its episodes."""
+        return self._low[1].keeps_episodes
+
     def env_state(self) -> dict[str, Tensor]:
         """Return the state of the wrapped environment."""
         return self._inner_env.env_state()

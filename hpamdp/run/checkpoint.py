@@ -1,9 +1,9 @@
 """A run on disk: everything that is needed to continue it or to score its agent.
 
 A checkpoint is a zip archive: `manifest.json` with the run's progress and the checksums of the other members, and one
-member for each component, written by `torch.save` and read with `weights_only`, so that opening somebody else's file runs
-none of its code. TorchRL's `Checkpoint` is not used: it reads a replay buffer's prefetch queue with pickle, stores replay
-buffers at full capacity, and moves the old file away before the new one is in place.
+member for each component, written by `torch.save` and read with `weights_only`, so that opening somebody else's file
+runs none of its code. TorchRL's `Checkpoint` is not used: it reads a replay buffer's prefetch queue with pickle, stores
+replay buffers at full capacity, and moves the old file away before the new one is in place.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import pickle
 import zipfile
 import zlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ POLICY_NAME = "policy.pt"
 
 _FORMAT = 2
 _MANIFEST = "manifest.json"
+# Parts of a run that are saved beside the agent.
+STATES = ("collection", "recorder")
 # What can be wrong with the bytes of a file.
 _DAMAGE = (
     zipfile.BadZipFile,
@@ -63,30 +66,43 @@ def find(path: str | Path, where: str) -> Path:
     return file
 
 
+@dataclass(frozen=True)
+class Saved:
+    """What `load` gives back of a checkpoint, beside what it fills the agent with.
+
+    Attributes:
+        states: what `save` was given, by name.
+        generators: the states of the random generators, for `set_generators`.
+    """
+
+    states: dict[str, dict[str, Any]]
+    generators: dict[str, Any]
+
+
 def save(
     path: Path,
     agent: HierarchicalAgent,
-    env_state: Mapping[str, Tensor],
+    states: Mapping[str, Mapping[str, Any]],
     progress: Mapping[str, Any],
     *,
     with_replay: bool = True,
 ) -> None:
-    """Write the agent, its optimizers and replay, the environment's state and the random generators.
+    """Write the agent, its optimizers and replay, the states of other parts and the random generators.
 
-    The file is complete or not there: it is written beside the old one, flushed to the disk, and put in its place in one
-    step.
+    The file is complete or not there: it is written beside the old one, flushed to the disk, and put in its place in
+    one step.
 
     Args:
         path: the file.
         agent: the agent.
-        env_state: the environment's columns.
+        states: of the other parts of the run, by name: nested dictionaries of tensors and numbers.
         progress: JSON values to read back with `progress_of`: the config, the frames so far.
         with_replay: whether replay buffers are stored; without them a resumed run begins with empty ones.
 
     Raises:
         OSError: the disk is full, or the folder is gone or cannot be written to; the old file stays as it is.
     """
-    members = {"agent": agent.state_dict(), "rng": GlobalRNGState().state_dict(), "env": dict(env_state)}
+    members: dict[str, Any] = {"agent": agent.state_dict(), "rng": GlobalRNGState().state_dict(), **states}
     for name, part in agent.stateful().items():
         if isinstance(part, ReplayBuffer):
             if with_replay:
@@ -165,21 +181,18 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
         ) from error
 
 
-def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_training: bool) -> dict[str, Tensor]:
-    """Fill the agent from a checkpoint, with training also its optimizers, replay and the random generators.
+def load(file: Path, agent: HierarchicalAgent, device: torch.device, *, with_training: bool) -> Saved:
+    """Fill the agent from a checkpoint, with training also its optimizers and replay.
 
-    Nothing is changed before the whole file was read and checked.
-
-    Returns:
-        The environment's columns.
+    Nothing is changed before the whole file was read and checked. The random generators are left to `set_generators`.
 
     Raises:
         ConfigError: the checkpoint is damaged or of another agent.
     """
     stateful = agent.stateful()
-    _, members = _read(file, {"agent", "env", "rng", *stateful} if with_training else {"agent", "env"}, device)
+    _, members = _read(file, None if with_training else {"agent", *STATES}, device)
     replays = {name for name, part in stateful.items() if isinstance(part, ReplayBuffer)}
-    missing = {"agent", "env", "rng", *stateful} - replays - set(members) if with_training else set()
+    missing = {"agent", "rng", *STATES, *stateful} - replays - set(members) if with_training else set()
     if missing:
         raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
     try:
@@ -190,10 +203,9 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, with_traini
                     _fill_replay(part, members.get(name))
                 else:
                     part.load_state_dict(members[name])
-            _set_generators(members["rng"])
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ConfigError(f"{file}: does not fit this agent: {first_line(error)}") from error
-    return members.get("env", {})
+    return Saved({name: members.get(name, {}) for name in STATES}, members.get("rng", {}))
 
 
 def _packed(state: object) -> bytes:
@@ -203,9 +215,9 @@ def _packed(state: object) -> bytes:
 
 
 def _read(
-    file: Path, wanted: set[str], device: torch.device | None = None
+    file: Path, wanted: set[str] | None, device: torch.device | None = None
 ) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the progress and the wanted members that are there; check every byte that is used."""
+    """Return the progress and the wanted members that are there, None: all; check every byte that is used."""
     try:
         with zipfile.ZipFile(file) as archive:
             if _MANIFEST not in archive.namelist():
@@ -214,7 +226,8 @@ def _read(
             if manifest["format"] != _FORMAT:
                 raise ValueError(f"format {manifest['format']}, but this version reads {_FORMAT}")
             members = {}
-            for name in sorted(wanted & set(manifest["members"])):
+            names = set(manifest["members"])
+            for name in sorted(names if wanted is None else wanted & names):
                 data = archive.read(f"{name}.pt")
                 if hashlib.sha256(data).hexdigest() != manifest["members"][name]:
                     raise ValueError(f"the checksum of {name} is wrong")
@@ -235,7 +248,7 @@ def _read_policy(file: Path, device: torch.device | None) -> tuple[dict[str, Any
     progress = json.loads(saved["progress"])
     _check_progress(progress)
     _check_weights(file, saved["agent"])
-    return progress, {"agent": saved["agent"], "env": {}}
+    return progress, {"agent": saved["agent"]}
 
 
 def _check_progress(progress: Mapping[str, Any]) -> None:
@@ -264,7 +277,7 @@ def _fill_replay(buffer: ReplayBuffer, state: Mapping[str, Any] | None) -> None:
     buffer._writer.load_state_dict(state["writer"])
 
 
-def _set_generators(state: Mapping[str, Any]) -> None:
+def set_generators(state: Mapping[str, Any]) -> None:
     """Restore the random generators; those of devices that this machine lacks are left out, with a warning."""
     here = dict(state)
     if "torch_cuda" in here and not torch.cuda.is_available():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,20 @@ class Recorder:
         """Begin the metrics with the rows of the run in `folder`, up to `frames`."""
         self.metrics = MetricsFile(self.metrics.path, folder / "metrics.csv", frames)
 
+    def state(self) -> dict[str, Any]:
+        """Return what the next row of metrics depends on, for a checkpoint."""
+        return {
+            "ended": [dict(ended.items()) for ended in self._ended],
+            "scalars": dict(self._scalars),
+            "held": dict(self._held),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state`."""
+        self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in state["ended"]]
+        self._scalars = dict(state["scalars"])
+        self._held = dict(state["held"])
+
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
         """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
         self._scalars |= scalars
@@ -65,7 +80,8 @@ class Recorder:
             row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
         self.metrics.append(row)
         self.parts.logger.log(row, frames)
-        self._ended, self._scalars = [], {}
+        self._ended = []
+        self._scalars = {}
         return row
 
     def finish(self, frames: int, wall_s: float, cpu_s: float, is_finished: bool) -> str:

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from hpamdp import keys
 from hpamdp.config import Config, ConfigError
-from hpamdp.messages import LenientStream, say, warn
+from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.collection.base import Collection
@@ -93,6 +93,7 @@ class Trainer:
         self.wall_s = 0.0
         self.cpu_s = 0.0
         self.last_score: float | None = None  # at the last evaluation
+        self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
         self.unit = " steps"
         if config.run.mode == "offline":
             self.unit = " updates"
@@ -100,22 +101,20 @@ class Trainer:
             self.unit = " decisions"
 
     def restore(self, source: Path) -> None:
-        """Take the agent from a checkpoint and, to continue training, the progress of its run."""
+        """Take the agent from a checkpoint and, to continue training, the state of its run."""
         is_training = self.config.run.mode != "eval"
-        env_state = checkpoint.load(source, self.parts.agent, self.parts.device, is_training)
+        saved = checkpoint.load(source, self.parts.agent, self.parts.device, with_training=is_training)
         progress = checkpoint.progress_of(source)
         self.frames = progress["frames"]
         self.wall_s = progress["wall_s"]
         self.cpu_s = progress["cpu_s"]
         self.last_score = progress["last_score"]
         if not is_training:
-            self.parts.env.set_statistics(env_state)
+            self.parts.env.set_statistics(saved.states["collection"].get("env", {}))
             return
-        try:
-            self.parts.env.set_env_state(env_state)
-        except ValueError as error:
-            raise ConfigError(f"num_envs={self.config.run.num_envs}: {error}; leave it out when you resume") from error
         self.recorder.resume_from(source.parent, self.frames)
+        self.recorder.set_state(saved.states["recorder"])
+        self._saved = saved
 
     def train(self) -> bool:
         """Train until `num_frames` or `eval.stop_score` and save the agent; return whether a signal stopped it before.
@@ -130,10 +129,11 @@ class Trainer:
                 config=self.config, parts=self.parts, frames=self.frames
             )
             try:
+                self._continue(collection)
                 self._loop(collection, request)
             except KeyboardInterrupt:  # the second signal
                 pass
-            except DivergedError:
+            except (DivergedError, ConfigError):
                 collection.close()
                 raise
             # Saving comes first, is not interrupted, and depends on no stream.
@@ -143,6 +143,18 @@ class Trainer:
                 finally:
                     collection.close()
             return not self._is_over()
+
+    def _continue(self, collection: Collection) -> None:
+        """Put the collection and the random generators into the state that was saved, if there is one."""
+        if self._saved is None:
+            return
+        try:
+            collection.set_state(self._saved.states["collection"])
+        except (ValueError, RuntimeError, KeyError) as error:
+            raise ConfigError(
+                f"num_envs={self.config.run.num_envs}: {first_line(error)}; leave it out when you resume"
+            ) from error
+        checkpoint.set_generators(self._saved.generators)
 
     def _loop(self, collection: Collection, request: StopRequest) -> None:
         run = self.config.run
@@ -220,15 +232,17 @@ class Trainer:
         progress = self._progress()
         file = self.output_dir / checkpoint.FILE_NAME
         with_replay = self.config.run.checkpoint_replay
-        checkpoint.save(file, self.parts.agent, collection.env_state(), progress, with_replay=with_replay)
+        states = {"collection": collection.state(), "recorder": self.recorder.state()}
+        checkpoint.save(file, self.parts.agent, states, progress, with_replay=with_replay)
         checkpoint.save_policy(self.output_dir / checkpoint.POLICY_NAME, self.parts.agent, progress)
 
     def keep_for_inspection(self) -> str:
         """Save the agent as it is beside the last good checkpoint; return in words what there is."""
-        checkpoint.save(self.output_dir / DIVERGED_NAME, self.parts.agent, {}, self._progress(), with_replay=False)
+        file = self.output_dir / DIVERGED_NAME
+        checkpoint.save(file, self.parts.agent, {}, self._progress(), with_replay=False)
         good = self.output_dir / checkpoint.FILE_NAME
         kept = f"the last good checkpoint is {good}" if good.is_file() else "there is no checkpoint from before"
-        return f"{kept}; the agent as it is now is in {self.output_dir / DIVERGED_NAME}"
+        return f"{kept}; the agent as it is now is in {file}"
 
     def _progress(self) -> dict[str, object]:
         return {

@@ -125,6 +125,11 @@ class GymnasiumEnv(PAMDPEnv):
         """
         self.observations.share(other.observations)
 
+    @property
+    def keeps_episodes(self) -> bool:
+        """Whether episodes continue in a resumed run: no, the state of somebody else's environment is unknown."""
+        return False
+
     def env_state(self) -> dict[str, Tensor]:
         """Return the running statistics, if there are any; the state of the episodes is unknown."""
         statistics = self.observations.statistics

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from tensordict import TensorDictBase
-from torch import Tensor
 
 
 class Collection:
@@ -24,8 +24,20 @@ class Collection:
         """Collect a batch `[num_envs, steps_per_batch]`."""
         raise NotImplementedError
 
-    def env_state(self) -> dict[str, Tensor]:
-        """Return where the environments stand, as their own `state_columns` do."""
+    def state(self) -> dict[str, Any]:
+        """Return the state of the collection for a checkpoint.
+
+        `env`: the environments' `env_state`, first dimension `num_envs`. Where it holds their episodes, also `root`,
+        the tensordict `[num_envs]` from which the next step is made, as a nested dictionary.
+        """
+        raise NotImplementedError
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state`.
+
+        Raises:
+            ValueError: it is of another number of environments.
+        """
         raise NotImplementedError
 
     def close(self) -> None:

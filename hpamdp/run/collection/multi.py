@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Sequence
 from multiprocessing import resource_tracker
 
@@ -13,6 +12,7 @@ from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.worker import EnvShard
 from hpamdp.run.collection.workers import WorkerCollection, children_without
+from hpamdp.run.stopping import STOP_SIGNALS
 
 
 class MultiCollection(WorkerCollection):
@@ -25,7 +25,7 @@ class MultiCollection(WorkerCollection):
         # multiprocessing unblocks the signals when it starts this helper of its own.
         resource_tracker.ensure_running()
         # A terminal sends its Ctrl-C, and a cluster its stop, to every process of a run.
-        with children_without(signal.SIGINT, signal.SIGTERM):
+        with children_without(*STOP_SIGNALS):
             return MultiSyncCollector(
                 [share.make_env for share in shares],
                 policy_factory=[share.make_policy for share in shares],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.worker import EnvShard
 from hpamdp.run.collection.workers import WorkerCollection, children_without
+from hpamdp.run.stopping import STOP_SIGNALS
 
 
 class RayCollection(WorkerCollection):
@@ -44,7 +44,7 @@ class RayCollection(WorkerCollection):
         # It misses weights to send; `receive` is there for them.
         for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
             warnings.filterwarnings("ignore", message=warning)
-        with children_without(signal.SIGINT):
+        with children_without(*STOP_SIGNALS):
             return RayCollector(
                 [share.make_env for share in shares],
                 policy_factory=[share.make_policy for share in shares],

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.collectors import Collector
 
 from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection
+from hpamdp.run.collection.root import collector_state, set_collector_state
 
 
 class SingleCollection(Collection):
@@ -29,9 +32,13 @@ class SingleCollection(Collection):
         """Collect a batch."""
         return next(self._batches)
 
-    def env_state(self) -> dict[str, Tensor]:
-        """Return the environment's."""
-        return self.env.env_state()
+    def state(self) -> dict[str, Any]:
+        """Return the environments' state and the root of the next step."""
+        return collector_state(self._collector)
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state`."""
+        set_collector_state(self._collector, state)
 
     def close(self) -> None:
         """Stop collecting; the environment stays open."""

@@ -51,6 +51,14 @@ class PolicyCopy(TensorDictModuleBase):
         unpack(self.policy, state)
         return time.process_time() - self._cpu_before
 
+    def generator_state(self) -> Tensor:
+        """Return the state of this process's random generator."""
+        return torch.get_rng_state()
+
+    def set_generator_state(self, state: Tensor) -> None:
+        """Set the state of this process's random generator."""
+        torch.set_rng_state(state)
+
 
 @dataclass(frozen=True)
 class EnvShard:
@@ -61,7 +69,6 @@ class EnvShard:
         specs: of the problem.
         first_env, num_envs: which of the run's environments.
         exploration_seed: of the worker's global generator.
-        columns: where the environments stand; empty: at the beginning.
         low: the `packed` low level of a run with `low.freeze`, whose environments play whole episodes with it.
     """
 
@@ -70,7 +77,6 @@ class EnvShard:
     first_env: int
     num_envs: int
     exploration_seed: int
-    columns: dict[str, Tensor]
     low: bytes | None
 
     def make_env(self) -> TransformedEnv:
@@ -80,8 +86,6 @@ class EnvShard:
         if self.low is not None:
             unpack(agent.router, self.low)
         env = make_env(self.config, self.num_envs, _CPU, self.config.run.seed, self.first_env)
-        if self.columns:
-            env.set_env_state(self.columns)
         return acting(env, agent, self.config)[0]
 
     def make_policy(self) -> PolicyCopy:

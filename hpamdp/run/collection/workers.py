@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
@@ -31,26 +30,26 @@ class WorkerCollection(Collection):
     def __init__(self, config: Config, parts: Parts, frames: int, num_workers: int) -> None:
         self._policy = parts.policy
         self._device = parts.device
-        self._columns = parts.env.env_state()
+        self._keeps_episodes = parts.env.keeps_episodes
+        self._num_envs = config.run.num_envs
+        self._size = config.run.num_envs // num_workers
+        self._state: dict[str, Any] = {"env": parts.env.env_state()}
         self._collector: Any = None
         self._is_idle = False
-        size = config.run.num_envs // num_workers
         shares = [
             EnvShard(
                 config,
                 parts.agent.specs,
                 first,
-                size,
+                self._size,
                 # Other numbers than before where a run goes on.
                 int(np.random.SeedSequence((config.run.seed, first, frames)).generate_state(1)[0]),
-                {name: column[first : first + size].cpu() for name, column in self._columns.items()},
                 packed(parts.agent.router) if config.run.low.freeze else None,
             )
-            for first in range(0, config.run.num_envs, size)
+            for first in range(0, self._num_envs, self._size)
         ]
         try:
-            with uninterrupted():
-                self._collector = self._start(shares, config)
+            self._collector = self._start(shares, config)
         except BaseException:
             self.close()
             raise
@@ -62,12 +61,11 @@ class WorkerCollection(Collection):
         raise NotImplementedError
 
     def next(self) -> TensorDictBase:
-        """Send the policy's state, then collect a batch; a Ctrl-C takes effect when it is there."""
-        with uninterrupted():
-            self._is_idle = False
-            self.cpu_s = sum(self._call("policy.receive", packed(self._policy)))
-            batch = self._joined(next(self._batches))
-            self._is_idle = True
+        """Send the policy's state, then collect a batch."""
+        self._is_idle = False
+        self.cpu_s = sum(self._call("policy.receive", packed(self._policy)))
+        batch = self._joined(next(self._batches))
+        self._is_idle = True
         return batch.to(self._device)
 
     def _joined(self, batch: TensorDictBase) -> TensorDictBase:
@@ -78,43 +76,41 @@ class WorkerCollection(Collection):
         """Return what a method of each worker's collector returns."""
         return self._collector.map_fn(method, [arguments] * self._collector.num_workers)
 
-    def env_state(self) -> dict[str, Tensor]:
-        """Return the environments' state; if a worker failed, the last one that is known."""
+    def state(self) -> dict[str, Any]:
+        """Return the workers' states side by side; if one failed, the last ones that are known.
+
+        `generators` holds the state of each worker's random generator.
+        """
         if self._is_idle:
-            with uninterrupted():
-                columns = self._call("env.env_state")
-                self._columns = {name: torch.cat([share[name] for share in columns]) for name in columns[0]}
-        return self._columns
+            self._state = {"env": _joined(self._call("env.env_state"))}
+            if self._keeps_episodes:
+                self._state["root"] = _joined([_without_ids(root) for root in self._call("_carrier.to_dict")])
+            self._state["generators"] = self._call("policy.generator_state")
+        return self._state
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state` of any collection; exploration is the same only with as many workers."""
+        sizes = {len(column) for column in state["env"].values()}
+        if sizes - {self._num_envs}:
+            raise ValueError(f"the state is of {sizes.pop()} environments, but there are {self._num_envs}")
+        self._state = dict(state)
+        self._send("env.set_env_state", state["env"])
+        if "root" in state and self._keeps_episodes:
+            self._send("_carrier.update", state["root"])
+        generators = state.get("generators", [])
+        if len(generators) == self._collector.num_workers:
+            self._collector.map_fn("policy.set_generator_state", [(generator,) for generator in generators])
+
+    def _send(self, method: str, values: Mapping[str, Any]) -> None:
+        """Call a method of each worker's collector with the worker's rows of nested values."""
+        rows = [_sliced(values, first, self._size) for first in range(0, self._num_envs, self._size)]
+        self._collector.map_fn(method, [(shard,) for shard in rows])
 
     def close(self) -> None:
         """End the workers."""
         if self._collector is not None:
             self._collector.shutdown()
             self._collector = None
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Delay a Ctrl-C to the end of the block: half a message would confuse the workers. A second one interrupts."""
-    is_asked = False
-
-    def note(*_: Any) -> None:
-        nonlocal is_asked
-        if is_asked:
-            raise KeyboardInterrupt
-        is_asked = True
-
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    handlers = {number: handler for number, handler in handlers.items() if handler != signal.SIG_IGN}
-    for number in handlers:
-        signal.signal(number, note)
-    try:
-        yield
-    finally:
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    if is_asked:
-        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -125,3 +121,25 @@ def children_without(*numbers: signal.Signals) -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _joined(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Put nested dictionaries of columns on top of one another."""
+    joined: dict[str, Any] = {}
+    for name, value in states[0].items():
+        parts = [state[name] for state in states]
+        joined[name] = _joined(parts) if isinstance(value, Mapping) else torch.cat(parts)
+    return joined
+
+
+def _sliced(values: Mapping[str, Any], first: int, size: int) -> dict[str, Any]:
+    """Return rows of nested columns, on the CPU."""
+    return {
+        name: _sliced(value, first, size) if isinstance(value, Mapping) else value[first : first + size].cpu()
+        for name, value in values.items()
+    }
+
+
+def _without_ids(root: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out the trajectory numbers that TorchRL's collector keeps."""
+    return {name: value for name, value in root.items() if name != "collector"}
