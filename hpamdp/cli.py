@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import itertools
 import os
 import re
@@ -26,7 +27,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.config import GROUPS, RUN_FILE, ConfigError, conf_dir, job_overrides, no_such, no_such_option
-from hpamdp.messages import first_line, one_line
+from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run import sweep
 
 _MISTAKE, _INTERRUPTED = 2, 130
@@ -177,24 +178,40 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     job = HydraConfig.get()
     if job.mode == RunMode.MULTIRUN:
         return sweep.run_job(cfg, start)
-    from hpamdp.run import train  # takes seconds, which --help need not wait for
+    # These take seconds, which --help need not wait for.
+    from hpamdp.run import train
+    from hpamdp.run.folder import locked
 
     output_dir = Path(job.runtime.output_dir)
+    if output_dir.resolve() == Path.cwd():
+        _exit_with("hydra.run.dir: the working directory; give a folder of the run's own, or leave hydra.run.dir out")
     try:
-        code = train.run(cfg, output_dir, job_overrides())
+        with locked(output_dir):
+            code = train.run(cfg, output_dir, job_overrides())
     except ConfigError as error:
         # Not raised any further: Hydra would announce it in a line of its own.
         with suppress(OSError):
             output_dir.rmdir()  # Hydra made it; it stays if there is something in it
         _exit_with(str(error))
+    except OSError as error:
+        if not _is_about_folder(error, output_dir):
+            raise
+        _exit_with(f"{output_dir}: {error.strerror or error}; the run was stopped", 1)
     if code:
         sys.exit(code)
     return None
 
 
-def _exit_with(mistake: str) -> NoReturn:
-    print(one_line(mistake), file=sys.stderr)
-    sys.exit(_MISTAKE)
+def _is_about_folder(error: OSError, folder: Path) -> bool:
+    """Return whether the run's folder is gone or cannot be written to."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+        return True
+    return error.filename is not None and Path(str(error.filename)).is_relative_to(folder)
+
+
+def _exit_with(mistake: str, code: int = _MISTAKE) -> NoReturn:
+    warn(one_line(mistake))
+    sys.exit(code)
 
 
 def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str:

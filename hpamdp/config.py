@@ -131,6 +131,7 @@ class RunConfig(BaseModel):
     checkpoint_replay: bool
     checkpoint: str | None
     resume: str | None
+    overwrite: bool
 
     @property
     def num_frames(self) -> int:
@@ -271,6 +272,9 @@ def job_overrides() -> list[str]:
 
 
 def _check_mode(run: RunConfig) -> None:
+    for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
+        if value == "":
+            raise ConfigError(f"{name}: empty; give the output folder of a run, or leave {name} out")
     if run.mode == "eval" and run.checkpoint is None:
         raise ConfigError("checkpoint: missing; mode=eval needs the output folder of a run")
     if run.mode != "eval" and run.checkpoint is not None:

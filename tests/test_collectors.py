@@ -19,7 +19,6 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=hppo", "low.minibatch_size=16"]
-BOATS = ["start_x", "start_y", "goal_x", "goal_y", "episode"]
 GYMNASIUM = ["env.id=hpamdp/BoatDock-v0", "env.kwargs={controller:congruent}", "env.max_steps=9"]
 WORKERS = [
     "multi",
@@ -39,10 +38,10 @@ def make(folder, *overrides):
     return parts, config.collector.build(config=config, parts=parts, frames=0)
 
 
-def share(folder, *overrides, first_env=0, num_envs=8, low=None, columns=None):
+def share(folder, *overrides, first_env=0, num_envs=8, low=None):
     config = make_config([*SMALL, *overrides])
     specs = assemble(config, folder).agent.specs
-    return EnvShard(config, specs, first_env, num_envs, exploration_seed=0, columns=columns or {}, low=low)
+    return EnvShard(config, specs, first_env, num_envs, exploration_seed=0, low=low)
 
 
 def leaves(batch):
@@ -82,7 +81,7 @@ def test_the_next_batch_goes_on_where_the_last_one_ended(workers):
     is_on = ~last["next", "done"][:, -1, 0]
     assert is_on.any()
     assert torch.equal(last["next", "observation"][:, -1][is_on], following["observation"][:, 0][is_on])
-    columns = collection.env_state()
+    columns = collection.state()["env"]
     assert all(len(column) == 8 for column in columns.values())
     # Scaled observations end in goal - boat, px over the harbour's radius.
     offset = following["next", "observation"][:, -1, -2:]
@@ -112,7 +111,7 @@ def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
     parts = assemble(config, tmp_path)
     collection = config.collector.build(config=config, parts=parts, frames=0)
     torch.manual_seed(1)
-    copy = EnvShard(config, parts.agent.specs, 0, 8, exploration_seed=1, columns={}, low=None).make_policy()
+    copy = EnvShard(config, parts.agent.specs, 0, 8, exploration_seed=1, low=None).make_policy()
     for _ in range(2):
         parts.agent.learn(collection.next())
     assert copy.receive(packed(parts.policy)) > 0.0
@@ -147,16 +146,20 @@ def test_shares_together_are_the_environments_of_a_single_process(env, tmp_path)
         torch.testing.assert_close(acted["next", name], expected["next", name])
 
 
-def test_a_share_goes_on_where_its_environments_stood(tmp_path):
-    env = share(tmp_path, first_env=4, num_envs=4).make_env()
-    env.reset()
-    columns = env.env_state()
-    again = share(tmp_path, first_env=4, num_envs=4, columns=columns).make_env()
-    again.reset()
-    assert again.env_state()["episode"].tolist() == [1] * 4
-    env.reset()
-    for name in BOATS:
-        assert torch.equal(again.env_state()[name], env.env_state()[name])
+def test_a_collection_goes_on_where_another_one_stood(workers, tmp_path):
+    collection = workers[1]
+    collection.next()
+    state = collection.state()
+    _, single = make(tmp_path, "collector=single")
+    single.set_state(state)
+    expected, batch = collection.next(), single.next()
+    torch.testing.assert_close(batch["observation"][:, 0], expected["observation"][:, 0])
+
+
+def test_the_state_of_another_number_of_environments_is_refused(workers, tmp_path):
+    _, small = make(tmp_path, "num_envs=4")
+    with pytest.raises(ValueError, match=r"of 4 environments, but there are 8"):
+        workers[1].set_state(small.state())
 
 
 def test_a_frozen_presser_goes_with_the_share(tmp_path):

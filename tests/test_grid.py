@@ -106,13 +106,14 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
     collected = parts.env.rollout(20, parts.agent.policy, break_when_any_done=False).contiguous()
     parts.agent.learn(collected)
     file = tmp_path / checkpoint.FILE_NAME
-    checkpoint.save(file, parts.agent, parts.env.env_state(), {"frames": 320})
+    states = {"collection": {"env": parts.env.env_state()}, "recorder": {}}
+    checkpoint.save(file, parts.agent, states, {"frames": 320, "config": {}})
 
     other = make(high, low, tmp_path)
     torch.manual_seed(99)
-    env_state = checkpoint.load(file, other.agent, other.device, with_training=True)
-    other.env.set_env_state(env_state)
-    assert checkpoint.progress_of(file) == {"frames": 320}
+    saved = checkpoint.load(file, other.agent, other.device, with_training=True)
+    other.env.set_env_state(saved.states["collection"]["env"])
+    assert checkpoint.progress_of(file) == {"frames": 320, "config": {}}
     results = []
     for one in (other, parts):
         torch.manual_seed(5)

@@ -37,7 +37,7 @@ def jobs(monkeypatch):
     """Replace training by a function that writes what a run does; return what each run was started with."""
     started = []
 
-    def run(cfg, folder, overrides, stopped_at=None):
+    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False):
         started.append((cfg.seed, stopped_at))
         OmegaConf.save(OmegaConf.create(read(cfg).to_dict()), folder / "config.yaml")
         if cfg.seed == 1:
@@ -228,7 +228,7 @@ def test_a_missing_cluster_is_told_in_one_line(command, monkeypatch):
 def test_a_search_maximises_the_score_skips_finished_trials_and_survives_failed_ones(command, monkeypatch, tmp_path):
     tried = []
 
-    def run(cfg, folder, overrides, stopped_at=None):
+    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False):
         tried.append(cfg.low.clip)
         if len(tried) == 2:
             raise ZeroDivisionError("a bug")

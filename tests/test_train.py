@@ -21,7 +21,7 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=32", "steps_per_batch=4", "eval.layouts=20", "total_frames=1024", "eval.every=512"]
-FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkpoint.zip"}
+FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkpoint.zip", "policy.pt"}
 PICTURES = {"learning_curves.png", "trajectories.png", "choices.png"}
 
 
@@ -74,7 +74,8 @@ def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
     for name in ("often", "seldom"):
         file = checkpoint.find(tmp_path / name, "resume")
         parts = assemble(make_config([*SMALL, "low=random"]), tmp_path)
-        states.append(checkpoint.load(file, parts.agent, torch.device("cpu"), with_training=True))
+        saved = checkpoint.load(file, parts.agent, torch.device("cpu"), with_training=True)
+        states.append(saved.states["collection"]["env"])
     assert all(torch.equal(states[0][column], states[1][column]) for column in states[0])
 
 

@@ -29,9 +29,7 @@ from torchrl.data import ReplayBuffer
 from hpamdp.config import ConfigError
 from hpamdp.messages import first_line, one_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
-
-FILE_NAME = "checkpoint.zip"
-POLICY_NAME = "policy.pt"
+from hpamdp.run.folder import CHECKPOINT_NAME as FILE_NAME
 
 _FORMAT = 2
 _MANIFEST = "manifest.json"

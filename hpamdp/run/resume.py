@@ -38,7 +38,7 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
             f"resume={source}: a run with mode={saved['mode']}; resume it so, or start one with low.checkpoint={source}"
         )
     merged, names = compose_saved(saved)
-    for key in ("mode", "resume", "checkpoint"):  # how that run began does not matter to this one
+    for key in ("mode", "resume", "checkpoint", "overwrite"):  # how that run began does not matter to this one
         merged[key] = cfg[key]
     for override in overrides:
         key = override.partition("=")[0].lstrip("+~")

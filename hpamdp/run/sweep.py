@@ -11,20 +11,20 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml
-from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from hpamdp.config import Config, ConfigError, job_overrides
-from hpamdp.messages import one_line
+from hpamdp.messages import one_line, say
+from hpamdp.run.folder import locked
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
@@ -106,9 +106,9 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
         _stop_with_parent()
     folder = Path(job.folder)
     records.write(job)
-    print(f"Job {job.number}: {job.overrides}", flush=True)
+    say(f"Job {job.number}: {job.overrides}")
     try:
-        with _locked(folder):
+        with locked(folder, _PATIENCE_S):
             job.state, job.score = _go_on(cfg, overrides, folder)
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))
@@ -120,7 +120,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
             (folder / "error.txt").write_text(traceback.format_exc())
     records.write(job)
     if job.state != _FINISHED:
-        print(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}", flush=True)
+        say(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}")
     if job.state == _STOPPED:
         sys.exit(_INTERRUPTED)
     return job.score
@@ -141,8 +141,10 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
     (folder / "error.txt").unlink(missing_ok=True)
     is_resumed = source.exists()
     if is_resumed:
-        print(f"Going on from {source}", flush=True)
-    code = train.run(cfg, folder, overrides, source if is_resumed else None)
+        say(f"Going on from {source}")
+    code = train.run(cfg, folder, overrides, source if is_resumed else None, may_overwrite=True)
+    if code == train.DIVERGED:
+        return _FAILED, None
     if code:
         return _STOPPED, None
     return (_RESUMED if is_resumed else _FINISHED), _final_score(folder)
@@ -191,22 +193,6 @@ def _stop_with_parent() -> None:
                 os.kill(os.getpid(), signal.SIGTERM)  # training saves on the first, and nothing survives the second
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Lock a job's folder; wait for the workers of a killed sweep, which are about to stop."""
-    file = folder / ".lock"
-    lock = FileLock(file, timeout=_PATIENCE_S)
-    try:
-        lock.acquire()
-    except Timeout as error:
-        raise ConfigError("another process is at work in its folder; start the sweep again after it") from error
-    try:
-        yield
-    finally:
-        file.unlink(missing_ok=True)
-        lock.release()
 
 
 def has_begun(start: str) -> bool:

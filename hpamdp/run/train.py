@@ -20,12 +20,13 @@ from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.collection.base import Collection
+from hpamdp.run.folder import POLICY_NAME, check_unused
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import resolve
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
-_INTERRUPTED, _DIVERGED = 130, 3
+INTERRUPTED, DIVERGED = 130, 3  # exit codes
 DIVERGED_NAME = "checkpoint.diverged.zip"
 
 
@@ -33,7 +34,14 @@ class DivergedError(Exception):
     """A number of the training that is not finite."""
 
 
-def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stopped_at: Path | None = None) -> int:
+def run(
+    cfg: DictConfig,
+    output_dir: Path,
+    overrides: Sequence[str] = (),
+    stopped_at: Path | None = None,
+    *,
+    may_overwrite: bool = False,
+) -> int:
     """Train or score an agent, write everything under `output_dir`, return the exit code.
 
     0: the run reached its end. 130: it was stopped by a signal, and saved. 3: a reward, a loss or a weight was not
@@ -44,11 +52,15 @@ def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stoppe
         output_dir: a folder, made if need be.
         overrides: the command line's words, which change a resumed run's config.
         stopped_at: the checkpoint of this very run, to continue from.
+        may_overwrite: whether the results of a run in the folder may be overwritten, as with `overwrite=true`.
 
     Raises:
         ConfigError: a wrong value or path, or values that do not go together.
     """
     config, source = resolve(cfg, overrides)
+    is_own = source is not None and source.resolve().parent == output_dir.resolve()
+    if not (may_overwrite or config.run.overwrite or is_own):
+        check_unused(output_dir)
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
     parts = assemble(config, output_dir)
@@ -64,13 +76,13 @@ def run(cfg: DictConfig, output_dir: Path, overrides: Sequence[str] = (), stoppe
             is_interrupted = trainer.train()
         except DivergedError as error:
             warn(f"{error} at frame {trainer.frames:,}: training stopped; {trainer.keep_for_inspection()}")
-            return _DIVERGED
+            return DIVERGED
     say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, not is_interrupted))
     say(f"Everything is in {output_dir}")
     if is_interrupted:
         mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
         say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: python run.py {mode}resume={output_dir}")
-    return _INTERRUPTED if is_interrupted else 0
+    return INTERRUPTED if is_interrupted else 0
 
 
 class Trainer:
@@ -234,7 +246,7 @@ class Trainer:
         with_replay = self.config.run.checkpoint_replay
         states = {"collection": collection.state(), "recorder": self.recorder.state()}
         checkpoint.save(file, self.parts.agent, states, progress, with_replay=with_replay)
-        checkpoint.save_policy(self.output_dir / checkpoint.POLICY_NAME, self.parts.agent, progress)
+        checkpoint.save_policy(self.output_dir / POLICY_NAME, self.parts.agent, progress)
 
     def keep_for_inspection(self) -> str:
         """Save the agent as it is beside the last good checkpoint; return in words what there is."""
