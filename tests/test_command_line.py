@@ -95,7 +95,7 @@ def test_a_refused_run_leaves_no_folder_behind(command, tmp_path):
 def test_jobs_get_their_config_folder_and_overrides(command, tmp_path, monkeypatch):
     seen = []
 
-    def run(cfg, folder, overrides, stopped_at=None):
+    def run(cfg, folder, overrides, stopped_at=None, **_):
         seen.append((cfg.seed, folder, overrides))
 
     monkeypatch.setattr(train, "run", run)
@@ -121,11 +121,11 @@ def test_a_bug_keeps_its_traceback(command, monkeypatch, bug):
 
 def test_an_interrupted_run_exits_with_130_and_ends_a_sweep(command, monkeypatch):
     seen = []
-    monkeypatch.setattr(train, "run", lambda cfg, folder, overrides, _=None: seen.append(cfg.seed) or 130)
+    monkeypatch.setattr(train, "run", lambda cfg, folder, overrides, stopped_at=None, **_: seen.append(cfg.seed) or 130)
     assert command("-m", "seed=1,2")[0] == 130
     assert seen == [1]
 
-    def interrupted(cfg, folder, overrides):
+    def interrupted(cfg, folder, overrides, **_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(train, "run", interrupted)

@@ -63,7 +63,7 @@ class OptionChoiceEnv(PAMDPEnv):
     @property
     def keeps_episodes(self) -> bool:
         """Whether the environment's `env_state` holds its episodes."""
-        return self._low[1].keeps_episodes
+        return self._inner_env.keeps_episodes
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the state of the wrapped environment."""

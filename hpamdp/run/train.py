@@ -58,6 +58,7 @@ def run(
         ConfigError: a wrong value or path, or values that do not go together.
     """
     config, source = resolve(cfg, overrides)
+    source = stopped_at or source
     is_own = source is not None and source.resolve().parent == output_dir.resolve()
     if not (may_overwrite or config.run.overwrite or is_own):
         check_unused(output_dir)
@@ -65,7 +66,6 @@ def run(
     torch.manual_seed(config.run.seed)
     parts = assemble(config, output_dir)
     trainer = Trainer(config, parts, output_dir)
-    source = stopped_at or source
     if source is not None:
         trainer.restore(source)
     output_dir.mkdir(parents=True, exist_ok=True)
