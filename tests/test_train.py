@@ -25,6 +25,13 @@ FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkp
 PICTURES = {"learning_curves.png", "trajectories.png", "choices.png"}
 
 
+@pytest.fixture(autouse=True)
+def no_figures(request, monkeypatch):
+    """Draw nothing, which takes longer than the runs, but where pictures are the point."""
+    if "pictures" not in request.node.name:
+        monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
+
+
 def start(output_dir, *overrides):
     return run(compose_config([*SMALL, *overrides]), output_dir, list(overrides))
 
