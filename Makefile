@@ -23,7 +23,7 @@ test: $(VENV)/.installed
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy hpamdp
-	$(PYTHON) -m pytest -n auto $(COVERAGE) $(ARGS)
+	$(PYTHON) -m pytest -n auto --dist worksteal $(COVERAGE) $(ARGS)
 
 # What takes longer, one after another: launchers, Ray, the wheel, the oldest dependencies.
 slow:
@@ -51,7 +51,7 @@ wheel: $(SLOW)/.installed
 
 # The quick tests with the lowest versions that pyproject.toml allows.
 lowest: $(LOWEST)/.installed
-	$(LOWEST)/bin/python -m pytest -n auto $(ARGS)
+	$(LOWEST)/bin/python -m pytest -n auto --dist worksteal $(ARGS)
 
 # Figures, tables and pages of all studies, from their csv files: report/report.html
 report: $(VENV)/.installed

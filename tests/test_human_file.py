@@ -76,10 +76,12 @@ def test_tables_hold_what_scipy_reads(tmp_path):
 
 
 @needs_real
-def test_tables_of_the_released_file_hold_what_scipy_reads_and_take_under_five_seconds():
+def test_tables_of_the_released_file_hold_what_scipy_reads_in_at_most_twenty_times_its_time():
     start = time.process_time()
+    scipy.io.loadmat(REAL)
+    scipys = time.process_time() - start
     data = read(REAL)
-    assert time.process_time() - start < 5.0
+    assert time.process_time() - start - scipys < 20.0 * scipys
     assert_same_as_scipy(REAL, data)
 
 

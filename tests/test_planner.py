@@ -253,10 +253,14 @@ def test_an_empty_batch_gets_an_empty_plan(layout: Layout) -> None:
     assert plans.keys.shape == (0, 2, 3) and plans.score.shape == (0, 2)
 
 
-def test_a_thousand_layouts_take_seconds(layout: Layout) -> None:
-    begin = time.perf_counter()
-    best_plans(layout, filled(1, NUM))
-    assert time.perf_counter() - begin < 10.0
+def test_a_thousand_layouts_take_less_than_two_hundred_times_as_long_as_one(layout: Layout) -> None:
+    def seconds(num: int) -> float:
+        begin = time.process_time()
+        best_plans(Layout(*(field[:num] for field in layout)), filled(1, num))
+        return time.process_time() - begin
+
+    one = min(seconds(1) for _ in range(3))
+    assert seconds(NUM) < 200.0 * one
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

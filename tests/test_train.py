@@ -127,7 +127,7 @@ def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, cap
     assert float(after[-1]["frames"]) == resumed["frames"]
 
 
-def test_a_saved_agent_is_scored_again_with_the_same_result(tmp_path):
+def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_path):
     start(tmp_path / "run", "low=random", "high=uniform")
     words = ["mode=eval", f"checkpoint={tmp_path / 'run'}"]
     assert run(compose_config(words), tmp_path / "scored", words) == 0
