@@ -82,10 +82,10 @@ $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray]'
 	@touch $@
 
-# This launcher wants cloudpickle < 3, and boto3, which it needs, python-dateutil < 3.
+# This launcher and what it needs want older versions of much that constraints.txt pins, such as cloudpickle < 3.
 $(RAY)/.installed: pyproject.toml constraints.txt
 	$(venv)
-	@grep -vE '^(cloudpickle|python-dateutil)==' constraints.txt > $(@D)/constraints.txt
+	@grep -E '^(torch|torchrl|tensordict|gymnasium|hydra-core|omegaconf|ray)==' constraints.txt > $(@D)/constraints.txt
 	$(INSTALL) -c $(@D)/constraints.txt -e '.[dev,ray-launcher]'
 	@touch $@
 
