@@ -60,7 +60,15 @@ def assert_it_updated(given: list[str], folder: Path) -> None:
     assert any(before[name].shape != value.shape or not before[name].equal(value) for name, value in after.items())
 
 
-@pytest.mark.parametrize(("high", "low"), list(itertools.product(choices("high"), TRAINED)))
+# Quick: each selector over two learners, each learner under two selectors.
+QUICK = {*itertools.product(choices("high"), ("random", "hppo")), *itertools.product(("none", "uniform"), TRAINED)}
+PAIRS = [
+    pytest.param(*pair, marks=[] if pair in QUICK else [pytest.mark.slow])
+    for pair in itertools.product(choices("high"), TRAINED)
+]
+
+
+@pytest.mark.parametrize(("high", "low"), PAIRS)
 def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
     monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0

@@ -96,7 +96,7 @@ def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
     stop_and_resume(words_of(high, low), tmp_path, monkeypatch, signal.SIGTERM)
 
 
-@pytest.mark.parametrize("low", ["hppo", "pdqn"])
+@pytest.mark.parametrize("low", ["hppo", pytest.param("pdqn", marks=pytest.mark.slow)])
 def test_a_run_with_worker_processes_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
     stop_and_resume([*words_of("ucb", low), "collector=multi"], tmp_path, monkeypatch, signal.SIGTERM)
 
