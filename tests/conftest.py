@@ -1,6 +1,7 @@
 """What the tests share."""
 
 import random
+import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,11 @@ from omegaconf import DictConfig
 
 from hpamdp.cli import main
 from hpamdp.config import Config, read
+
+# Whoever starts the tests in the background or under nohup has signals ignored, and every process of theirs inherits that.
+for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU):
+    if signal.getsignal(number) == signal.SIG_IGN:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 # Two processes on two cores fight over threads otherwise.
 torch.set_num_threads(1)
