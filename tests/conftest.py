@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from hpamdp.cli import main
 from hpamdp.config import Config, read
 
-# Whoever starts the tests in the background or under nohup has signals ignored, and every process of theirs inherits that.
+# Tests that are started in the background or under nohup inherit ignored signals, and so would what they start.
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU):
     if signal.getsignal(number) == signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
