@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -44,7 +45,8 @@ class RayCollection(WorkerCollection):
         # It misses weights to send; `receive` is there for them.
         for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
             warnings.filterwarnings("ignore", message=warning)
-        with children_without(*STOP_SIGNALS):
+        # Ray ends its own processes by SIGTERM.
+        with children_without(*(number for number in STOP_SIGNALS if number != signal.SIGTERM)):
             return RayCollector(
                 [share.make_env for share in shares],
                 policy_factory=[share.make_policy for share in shares],
