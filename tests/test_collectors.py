@@ -220,10 +220,10 @@ def test_when_a_worker_dies_the_run_fails_with_its_agent_saved_and_no_process_le
 @pytest.mark.parametrize("collector", WORKERS)
 def test_a_terminals_ctrl_c_stops_all_processes_and_the_run_goes_on_in_one(collector, tmp_path):
     command = [sys.executable, str(CONF.parent / "run.py"), f"collector={collector}", *SMALL, "total_frames=100000000"]
-    folder = f"hydra.run.dir={tmp_path}"
+    folder = f"hydra.run.dir={tmp_path / 'run'}"
     # A session of its own is what a terminal gives: the signal goes to all of its processes.
     process = subprocess.Popen([*command, "log_every=32", folder], start_new_session=True, cwd=tmp_path)
-    metrics = tmp_path / "metrics.csv"
+    metrics = tmp_path / "run/metrics.csv"
     for _ in range(1200):
         if metrics.is_file() and len(metrics.read_text().splitlines()) > 3:
             break
@@ -236,7 +236,7 @@ def test_a_terminals_ctrl_c_stops_all_processes_and_the_run_goes_on_in_one(colle
         time.sleep(0.1)
     assert not processes_of(process.pid)
     frames = len(metrics.read_text().splitlines())
-    overrides = [f"resume={tmp_path}", "collector=single", "total_frames=32"]
+    overrides = [f"resume={tmp_path / 'run'}", "collector=single", "total_frames=32"]
     assert run(compose_config(overrides), tmp_path / "resumed", overrides) == 0 and frames > 3
 
 

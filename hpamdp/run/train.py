@@ -148,13 +148,19 @@ class Trainer:
             except (DivergedError, ConfigError):
                 collection.close()
                 raise
-            # Saving comes first, is not interrupted, and depends on no stream.
-            with signals_ignored():
-                try:
-                    self.save(collection)
-                finally:
-                    collection.close()
+            except BaseException:  # such as a worker that died: what was learned is saved before the run fails
+                self._save_and_close(collection)
+                raise
+            self._save_and_close(collection)
             return not self._is_over()
+
+    def _save_and_close(self, collection: Collection) -> None:
+        """Save before anything else; that is not interrupted and depends on no stream."""
+        with signals_ignored():
+            try:
+                self.save(collection)
+            finally:
+                collection.close()
 
     def _continue(self, collection: Collection) -> None:
         """Put the collection and the random generators into the state that was saved, if there is one."""
