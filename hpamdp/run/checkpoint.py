@@ -69,10 +69,12 @@ class Saved:
     """What `load` gives back of a checkpoint, beside what it fills the agent with.
 
     Attributes:
+        progress: JSON values that `save` was given.
         states: what `save` was given, by name.
         generators: the states of the random generators, for `set_generators`.
     """
 
+    progress: dict[str, Any]
     states: dict[str, dict[str, Any]]
     generators: dict[str, Any]
 
@@ -188,7 +190,7 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, *, with_tra
         ConfigError: the checkpoint is damaged or of another agent.
     """
     stateful = agent.stateful()
-    _, members = _read(file, None if with_training else {"agent", *STATES}, device)
+    progress, members = _read(file, None if with_training else {"agent", *STATES}, device)
     replays = {name for name, part in stateful.items() if isinstance(part, ReplayBuffer)}
     missing = {"agent", "rng", *STATES, *stateful} - replays - set(members) if with_training else set()
     if missing:
@@ -203,7 +205,7 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, *, with_tra
                     part.load_state_dict(members[name])
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise ConfigError(f"{file}: does not fit this agent: {first_line(error)}") from error
-    return Saved({name: members.get(name, {}) for name in STATES}, members.get("rng", {}))
+    return Saved(progress, {name: members.get(name, {}) for name in STATES}, members.get("rng", {}))
 
 
 def _packed(state: object) -> bytes:

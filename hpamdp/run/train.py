@@ -116,7 +116,7 @@ class Trainer:
         """Take the agent from a checkpoint and, to continue training, the state of its run."""
         is_training = self.config.run.mode != "eval"
         saved = checkpoint.load(source, self.parts.agent, self.parts.device, with_training=is_training)
-        progress = checkpoint.progress_of(source)
+        progress = saved.progress
         self.frames = progress["frames"]
         self.wall_s = progress["wall_s"]
         self.cpu_s = progress["cpu_s"]
