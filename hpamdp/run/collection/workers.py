@@ -82,9 +82,9 @@ class WorkerCollection(Collection):
         `generators` holds the state of each worker's random generator.
         """
         if self._is_idle:
-            self._state = {"env": _joined(self._call("env.env_state"))}
+            self._state = {"env": _side_by_side(self._call("env.env_state"))}
             if self._keeps_episodes:
-                self._state["root"] = _joined([_without_ids(root) for root in self._call("_carrier.to_dict")])
+                self._state["root"] = _side_by_side([_without_ids(root) for root in self._call("_carrier.to_dict")])
             self._state["generators"] = self._call("policy.generator_state")
         return self._state
 
@@ -123,13 +123,13 @@ def children_without(*numbers: signal.Signals) -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _joined(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Put nested dictionaries of columns on top of one another."""
-    joined: dict[str, Any] = {}
+def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Concatenate the rows of nested columns."""
+    columns: dict[str, Any] = {}
     for name, value in states[0].items():
         parts = [state[name] for state in states]
-        joined[name] = _joined(parts) if isinstance(value, Mapping) else torch.cat(parts)
-    return joined
+        columns[name] = _side_by_side(parts) if isinstance(value, Mapping) else torch.cat(parts)
+    return columns
 
 
 def _sliced(values: Mapping[str, Any], first: int, size: int) -> dict[str, Any]:
