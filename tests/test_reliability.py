@@ -65,6 +65,22 @@ def test_rewards_whose_sum_overflows_stop_the_run(tmp_path, monkeypatch, capsys)
     assert "episode_return is inf in environment" in capsys.readouterr().err
 
 
+def test_an_error_in_the_environment_saves_what_was_learned_and_is_raised_as_it_is(tmp_path, monkeypatch):
+    given = [*SMALL, "low=random", "total_frames=8192"]
+    step, steps = BoatDockEnv._step, itertools.count()
+
+    def failing(self, tensordict):
+        if next(steps) > 150:
+            raise RuntimeError("a bug in step")
+        return step(self, tensordict)
+
+    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="a bug in step"):
+        patch.setattr(BoatDockEnv, "_step", failing)
+        run(compose_config(given), tmp_path / "failed", given)
+    assert 0 < checkpoint.progress_of(tmp_path / "failed/checkpoint.zip")["frames"] < 8192
+    assert run(compose_config([f"resume={tmp_path / 'failed'}"]), tmp_path / "resumed", []) == 0
+
+
 def test_a_loss_that_is_nan_stops_the_run_before_it_is_saved(tmp_path, monkeypatch, capsys):
     given = [*SMALL, "low=pdqn", *SHORT["pdqn"], "checkpoint_every=128"]
     train_step, steps = PDQN.train_step, itertools.count()

@@ -2,8 +2,10 @@
 
 import csv
 import itertools
+import multiprocessing
 import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -48,27 +50,49 @@ def assert_same(one: object, other: object, where: str = "") -> None:
         assert one == other, where
 
 
-def stop_and_resume(given: list[str], tmp_path: Path, monkeypatch, number: int) -> None:
-    """Run once as a whole, once with a signal in the middle and a resumption; assert that both come to the same."""
+def stop_and_resume(given: list[str], tmp_path: Path, monkeypatch, *numbers: int) -> None:
+    """Run once as a whole; for each signal once with it in the middle and a resumption; assert that all are the same."""
     assert run(compose_config(given), tmp_path / "whole", given) == 0
+    whole = members_of(tmp_path / "whole")
+    for number in numbers:
+        stopped, resumed = tmp_path / f"stopped-{number}", tmp_path / f"resumed-{number}"
+        with monkeypatch.context() as patch:
+            patch.setattr(Recorder, "take", signalled(number))
+            stop = kill if number == signal.SIGKILL else interrupt
+            stop(given, stopped)
+        words = [f"resume={stopped}"]
+        torch.manual_seed(1234)  # nothing of another process's generators may matter
+        assert run(compose_config(words), resumed, words) == 0
+        assert rows_of(resumed) == rows_of(tmp_path / "whole")
+        members = members_of(resumed)
+        for rng in (whole["rng"], members["rng"]):
+            rng.pop("python", None), rng.pop("numpy", None)  # which no part of a run uses
+        assert_same(members, whole)
+
+
+def signalled(number: int) -> Callable[..., None]:
+    """Return a `Recorder.take` that sends this process a signal after some batches."""
     take, batches = Recorder.take, itertools.count(1)
 
-    def interrupted(self, batch, scalars):
+    def take_and_signal(self, batch, scalars):
         take(self, batch, scalars)
         if next(batches) == STOPPED_AFTER:
             os.kill(os.getpid(), number)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Recorder, "take", interrupted)
-        assert run(compose_config(given), tmp_path / "stopped", given) == 130
-    words = [f"resume={tmp_path / 'stopped'}"]
-    torch.manual_seed(1234)  # nothing of another process's generators may matter
-    assert run(compose_config(words), tmp_path / "resumed", words) == 0
-    assert rows_of(tmp_path / "resumed") == rows_of(tmp_path / "whole")
-    whole, resumed = members_of(tmp_path / "whole"), members_of(tmp_path / "resumed")
-    for members in (whole, resumed):
-        del members["rng"]["python"], members["rng"]["numpy"]  # which no part of a run uses
-    assert_same(resumed, whole)
+    return take_and_signal
+
+
+def interrupt(given: list[str], folder: Path) -> None:
+    assert run(compose_config(given), folder, given) == 130
+
+
+def kill(given: list[str], folder: Path) -> None:
+    """Run in a process of its own that is killed; what it saved last is some batches old."""
+    words = [*given, "checkpoint_every=96"]
+    child = multiprocessing.get_context("fork").Process(target=run, args=(compose_config(words), folder, words))
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
 
 
 def words_of(high: str, low: str) -> list[str]:
@@ -93,12 +117,23 @@ def test_every_signal_that_stops_a_run_saves_it(number, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(("high", "low"), list(itertools.product(SELECTORS, TRAINED)))
 def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
-    stop_and_resume(words_of(high, low), tmp_path, monkeypatch, signal.SIGTERM)
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+    stop_and_resume(words_of(high, low), tmp_path, monkeypatch, *numbers)
 
 
-@pytest.mark.parametrize("low", ["hppo", pytest.param("pdqn", marks=pytest.mark.slow)])
+def test_a_killed_run_resumes_from_its_last_checkpoint_to_the_last_bit(tmp_path, monkeypatch):
+    stop_and_resume(words_of("ucb", "pdqn"), tmp_path, monkeypatch, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("low", ["hppo", *(pytest.param(low, marks=pytest.mark.slow) for low in TRAINED)])
 def test_a_run_with_worker_processes_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
     stop_and_resume([*words_of("ucb", low), "collector=multi"], tmp_path, monkeypatch, signal.SIGTERM)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("high", SELECTORS)
+def test_a_killed_run_with_worker_processes_resumes_to_the_last_bit(high, tmp_path, monkeypatch):
+    stop_and_resume([*words_of(high, "hppo"), "collector=multi"], tmp_path, monkeypatch, signal.SIGKILL)
 
 
 @pytest.mark.parametrize("env", ["platform", "boatdock_released"])

@@ -28,7 +28,8 @@ def set_collector_state(collector: Collector, state: Mapping[str, Any]) -> None:
     Raises:
         ValueError: the state is of another number of environments.
     """
-    collector.env.set_env_state(state["env"])
+    if state["env"]:  # else the episodes that the collector has just begun go on
+        collector.env.set_env_state(state["env"])
     root = state.get("root")
     if root is not None and collector.env.keeps_episodes:
         collector._carrier.update(TensorDict(root, batch_size=collector._carrier.batch_size))

@@ -27,14 +27,24 @@ class SingleCollection(Collection):
             auto_register_policy_transforms=False,
         )
         self._batches = iter(self._collector)
+        self._is_idle = True
 
     def next(self) -> TensorDictBase:
         """Collect a batch."""
-        return next(self._batches)
+        self._is_idle = False
+        batch = next(self._batches)
+        self._is_idle = True
+        return batch
 
     def state(self) -> dict[str, Any]:
-        """Return the environments' state and the root of the next step."""
-        return collector_state(self._collector)
+        """Return the environments' state and the root of the next step.
+
+        After an error in the middle of a batch, when TorchRL has closed its collector, there are no episodes to go on
+        with; what else the environments' state holds, such as the scale of observations, is returned.
+        """
+        if self._is_idle:
+            return collector_state(self._collector)
+        return {"env": {} if self.env.keeps_episodes else self.env.env_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state`."""

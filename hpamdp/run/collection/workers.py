@@ -94,7 +94,8 @@ class WorkerCollection(Collection):
         if sizes - {self._num_envs}:
             raise ValueError(f"the state is of {sizes.pop()} environments, but there are {self._num_envs}")
         self._state = dict(state)
-        self._send("env.set_env_state", state["env"])
+        if state["env"]:  # else the episodes that the workers have just begun go on
+            self._send("env.set_env_state", state["env"])
         if "root" in state and self._keeps_episodes:
             self._send("_carrier.update", state["root"])
         generators = state.get("generators", [])
