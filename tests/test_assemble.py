@@ -174,11 +174,14 @@ def test_a_finished_hppo_begins_a_new_run_with_its_first_learning_rate(tmp_path)
 @pytest.mark.parametrize("low", ["pdqn", "hsac"])
 def test_a_learner_of_another_run_fills_its_replay_before_it_updates(low, tmp_path):
     words = [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
-    train(make_config(words), tmp_path / "first")
-    again = [*words, f"low.checkpoint={tmp_path / 'first'}", "low.warmup_frames=1000"]
+    parts = train(make_config(words), tmp_path / "first")
+    frames = min(int(learner.frames) for learner in parts.agent.learners)
+    again = [*words, f"low.checkpoint={tmp_path / 'first'}", f"low.warmup_frames={frames}"]
     parts = make(make_config(again), tmp_path / "second")
     before = [int(learner.updates) for learner in parts.agent.learners]
-    parts.agent.learn(parts.env.rollout(8, parts.policy, break_when_any_done=False))
+    batch = parts.env.rollout(2, parts.policy, break_when_any_done=False)
+    assert batch.numel() < frames
+    parts.agent.learn(batch)
     assert max(before) > 0
     assert [int(learner.updates) for learner in parts.agent.learners] == before
 
