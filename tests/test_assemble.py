@@ -11,6 +11,7 @@ from toy_options import Crossing
 from hpamdp import keys
 from hpamdp.config import Config, ConfigError
 from hpamdp.env.choice import OptionChoiceEnv
+from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.train import Trainer
 
@@ -145,6 +146,44 @@ def test_learners_of_another_run_go_on_learning_where_they_are_not_frozen(traine
     words = [*SMALL, "high=ucb", "low=hppo", *SHORT["hppo"], f"low.checkpoint={trained}"]
     start = copied(make(make_config(words), tmp_path).agent.learners)
     assert not is_same(copied(train(make_config(words), tmp_path / "on").agent.learners), start)
+
+
+@pytest.mark.parametrize("low", ["hppo", "pdqn", "hsac"])
+def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_afresh(low, tmp_path):
+    words = [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
+    trained = copied(train(make_config(words), tmp_path / "first").agent.learners)
+    fresh = copied(make(make_config(words), tmp_path / "fresh").agent.learners)
+    parts = make(make_config([*words, f"low.checkpoint={tmp_path / 'first'}"]), tmp_path / "second")
+    loaded = copied(parts.agent.learners)
+    assert trained["0.frames"] > 0
+    restarted = {name for name in loaded if name.rpartition(".")[2] in Learner.progress}
+    assert "0.frames" in restarted
+    for name, value in loaded.items():
+        assert torch.equal(value, (fresh if name in restarted else trained)[name]), name
+
+
+def test_a_finished_hppo_begins_a_new_run_with_its_first_learning_rate(tmp_path):
+    words = [*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"], "low.anneal_frames=64", "low.minibatch_size=8"]
+    train(make_config(words), tmp_path / "first")
+    parts = make(make_config([*words, f"low.checkpoint={tmp_path / 'first'}"]), tmp_path / "second")
+    parts.agent.learn(parts.env.rollout(8, parts.policy, break_when_any_done=False))
+    for learner in parts.agent.learners:
+        assert learner.optimizer.param_groups[0]["lr"] == learner.lr
+
+
+@pytest.mark.parametrize("low", ["pdqn", "hsac"])
+def test_a_learner_of_another_run_fills_its_replay_before_it_updates(low, tmp_path):
+    words = [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
+    parts = train(make_config(words), tmp_path / "first")
+    frames = min(int(learner.frames) for learner in parts.agent.learners)
+    again = [*words, f"low.checkpoint={tmp_path / 'first'}", f"low.warmup_frames={frames}"]
+    parts = make(make_config(again), tmp_path / "second")
+    before = [int(learner.updates) for learner in parts.agent.learners]
+    batch = parts.env.rollout(2, parts.policy, break_when_any_done=False)
+    assert batch.numel() < frames
+    parts.agent.learn(batch)
+    assert max(before) > 0
+    assert [int(learner.updates) for learner in parts.agent.learners] == before
 
 
 def test_frozen_learners_that_need_no_training_need_no_checkpoint(tmp_path):

@@ -92,6 +92,15 @@ def test_demonstrations_are_one_batch_with_option_sums():
     assert batch[0][keys.PARAMETERS].equal(rows[keys.PARAMETERS])
 
 
+def test_demonstrations_hold_the_decisions_that_they_are_given_and_name_missing_keys():
+    rows = episodes(2, 2)
+    assert Demonstrations(rows).decisions is None
+    decisions = with_option_sums(rows)[1::2].set(keys.OPTION, torch.tensor([0, 1]))
+    assert Demonstrations(rows, decisions=decisions).decisions.shape == (1, 2)
+    with pytest.raises(DataError, match=r"the decisions lack option, next\.option_return$"):
+        Demonstrations(rows, decisions=decisions.exclude(keys.OPTION, ("next", keys.OPTION_RETURN)))
+
+
 def test_demonstrations_name_missing_keys_and_refuse_episodes_out_of_order():
     rows = episodes(2, 2)
     with pytest.raises(DataError, match=r"the transitions lack action\.discrete, next\.reward$"):

@@ -18,7 +18,7 @@ from hpamdp.data.human import minari
 from hpamdp.data.human.dataset import HumanExperienceReplay, slices, whole_episodes
 from hpamdp.data.human.episodes import keep, scores_by_person, select
 from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
-from hpamdp.data.human.transitions import transitions
+from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.episode import FUEL
@@ -80,6 +80,30 @@ def test_transitions_are_those_of_the_environment_for_the_same_presses(data, rew
         torch.testing.assert_close(ours["next", keys.REWARD], rows["next", keys.REWARD], atol=2e-2, rtol=0)
         for name in (keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED):
             assert torch.equal(ours["next", name], rows["next", name]), name
+
+
+@pytest.mark.parametrize("reward", ["paper", "sparse"])
+def test_the_return_of_a_fully_logged_episode_is_the_sum_of_its_rewards(data, reward):
+    data = keep(data, is_fully_logged(data))
+    rows = transitions(data, reward=reward)
+    total = torch.zeros(len(data.episodes)).index_add(0, rows[TRAJECTORY], rows["next", keys.REWARD].squeeze(-1))
+    decided = decisions(data, reward=reward)
+    torch.testing.assert_close(decided["next", keys.OPTION_RETURN].squeeze(-1), total, atol=1e-4, rtol=0.0)
+    ends = rows["next", keys.DONE].squeeze(-1)
+    for name in (keys.TERMINATED, keys.IS_DECISION):
+        assert torch.equal(decided["next", name], rows["next", name][ends])
+
+
+@needs_real
+def test_the_mean_return_of_peoples_episodes_is_their_score_and_the_progress():
+    data = read(REAL, one_frame=True)
+    decided = decisions(data)["next"]
+    assert len(decided) == 14_400
+    assert decided[keys.OPTION_RETURN].mean().item() == pytest.approx(2.768, abs=0.002)
+    sparse = decisions(data, reward="sparse")["next", keys.OPTION_RETURN].mean().item()
+    assert sparse - (data.episodes["outcome"] != physics.SUCCESS).float().mean().item() == pytest.approx(
+        1.970, abs=1e-3
+    )
 
 
 def test_transitions_have_the_environments_keys_shapes_and_types(data):

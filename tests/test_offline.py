@@ -60,13 +60,44 @@ def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, pat
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])
 def test_a_selector_learns_from_the_decisions_in_the_data(high, path, tmp_path):
     parts = assemble(make_config(overrides(path, "iql", high)), tmp_path)
-    parts.agent.add_demonstrations(parts.data)
-    num_episodes = int((parts.data["next", keys.DONE]).sum())
+    parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
+    num_episodes = len(read(path, checksum=None).episodes)
     selector = parts.agent.selector
     if high in ("ucb", "linucb"):
         assert selector.statistics.num_decisions == num_episodes
     else:
         assert len(selector.buffer) == num_episodes
+
+
+@pytest.mark.parametrize("reward", ["paper", "sparse"])
+def test_selectors_learn_what_every_episode_returned_whatever_becomes_of_its_presses(reward, path):
+    env = BoatDockEnv(reward=reward)
+    episodes = read(path, checksum=None, one_frame=True).episodes
+    decided = [
+        HumanDemonstrations(env, path=path, rest_to_rest=rest_to_rest, **ALL).decisions
+        for rest_to_rest in (True, False)
+    ]
+    assert (decided[0] == decided[1]).all()
+    decisions = decided[0][0]
+    assert torch.equal(decisions[keys.OPTION], episodes["controller"])
+    is_success = episodes["outcome"] == physics.SUCCESS
+    final = torch.where(is_success, 5.0 * episodes["tank"] / 360.0, 0.0)
+    if reward == "paper":
+        failed = torch.isin(episodes["outcome"], torch.tensor([physics.TOO_FAST, physics.OUT_OF_BOUNDS]))
+        failed |= episodes["outcome"] == physics.OUT_OF_FUEL
+        at_dock = is_success | (episodes["outcome"] == physics.TOO_FAST)
+        progress = 1.0 - physics.DOCK_RADIUS / (episodes["goal"] - episodes["start"]).norm(dim=1)
+        expected = (progress + final - failed.float())[at_dock]
+    else:
+        at_dock, expected = torch.ones_like(is_success), final
+    torch.testing.assert_close(decisions["next", keys.OPTION_RETURN].squeeze(-1)[at_dock], expected)
+    fresh = BoatDockEnv(len(episodes)).reset(episodes.select("start", "goal"))[keys.OBSERVATION]
+    torch.testing.assert_close(decisions["next", keys.DECISION_OBSERVATION], fresh)
+
+
+def test_where_the_boat_is_given_there_are_no_decisions(path):
+    env = BoatDockEnv(controller="congruent")
+    assert HumanDemonstrations(env, path=path, rest_to_rest=True, **ALL).decisions is None
 
 
 def test_decision_sums_match_those_of_the_decision_tracker(path):
@@ -166,8 +197,8 @@ def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path, no_
 def test_demonstrations_are_stored_in_the_replay_buffers(path, tmp_path):
     given = ["low=pdqn", "data=human", "data.checksum=null", f"data.path={path}", "eval.layouts=4", "num_envs=4"]
     parts = assemble(make_config(given), tmp_path)
-    parts.agent.add_demonstrations(parts.data)
-    assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.numel()
+    parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
+    assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.batch.numel()
 
 
 # One step, three discrete actions with a parameter each. The best is action 1 with half its range; in the data three in

@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hpamdp.analysis.study import curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
+from hpamdp.analysis.study import (
+    curve,
+    difference,
+    finished,
+    groups,
+    interquartile_mean,
+    middle_half,
+    read_csv,
+    spread,
+    write_tables,
+)
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 CONFIG = (
@@ -117,11 +127,51 @@ def test_seeds_that_do_not_vary_have_an_interval_of_no_width(values):
     assert interquartile_mean(values) == (2.0, 2.0, 2.0)
 
 
+def test_an_interquartile_mean_is_shown_from_five_seeds_on():
+    assert middle_half([1.0, 2.0, 3.0, 4.0]) == ""
+    assert middle_half([1.0, 1.0, 1.0, 1.0, 1.0]) == "1.000 (1.000 to 1.000)"
+
+
+def test_a_difference_is_clear_where_its_interval_excludes_0():
+    clear = difference([3.0, 3.1, 3.2], [1.0, 1.1, 1.2])
+    assert clear.mean == pytest.approx(2.0)
+    assert 1.7 < clear.low < 2.0 < clear.high < 2.3
+    assert clear.is_clear and clear.improvement == 1.0
+    assert difference([1.0, 1.1, 1.2], [3.0, 3.1, 3.2]).is_clear
+    assert str(clear).startswith("+2.000 (+1.") and str(clear).endswith(")")
+    unclear = difference([1.0, 2.0, 3.0], [1.1, 1.9, 2.9])
+    assert unclear.low < 0.0 < unclear.high and not unclear.is_clear and str(unclear).endswith("), unclear")
+    assert unclear.improvement == pytest.approx(5 / 9)
+    assert difference([1.0, 1.0], [1.0, 1.0]).improvement == 0.5
+
+
+def test_a_difference_has_no_interval_with_one_seed_and_leaves_outer_quarters_out_from_five_on():
+    assert str(difference([2.0], [1.0, 1.5])) == "+0.750" and not difference([2.0], [1.0, 1.5]).is_clear
+    assert difference([1.0, 1.0, 1.0, 1.0, 100.0], [0.0] * 5).mean == 1.0
+    assert difference([1.0, 1.0, 1.0, 97.0], [0.0] * 5).mean == 25.0
+
+
+def test_the_interval_of_a_difference_covers_the_truth_about_as_often_as_it_says():
+    generator = np.random.default_rng(0)
+    for num in (3, 12):
+        pairs = [difference(generator.normal(size=num), generator.normal(size=num)) for _ in range(40)]
+        assert 0.85 <= np.mean([not pair.is_clear for pair in pairs]) <= 1.0
+
+
+def test_a_curve_of_one_seed_has_no_deviation():
+    rows = [{"seed": 0, "frames": 10 * i, "score": float(i)} for i in range(3)]
+    assert curve(rows, "frames", "score")[2].tolist() == [0.0, 0.0, 0.0]
+
+
 def test_a_curve_goes_as_far_as_all_seeds_do():
     rows = [{"seed": 0, "frames": 10 * i, "score": float(i)} for i in range(4)]
     rows += [{"seed": 1, "frames": 10 * i, "score": i + 2.0} for i in range(3)]
     x, mean, deviation = curve(rows, "frames", "score")
-    assert x.tolist() == [0, 10, 20] and mean.tolist() == [1, 2, 3] and deviation.tolist() == [1, 1, 1]
+    assert (
+        x.tolist() == [0, 10, 20]
+        and mean.tolist() == [1, 2, 3]
+        and deviation.tolist() == pytest.approx([math.sqrt(2)] * 3)
+    )
 
 
 def test_the_learners_study_names_published_forms_and_rewards_and_when_people_were_reached(tmp_path):

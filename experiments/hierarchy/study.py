@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 
 HERE = Path(__file__).resolve().parent
@@ -94,15 +94,20 @@ def _mean_drift(evaluation: dict[str, float]) -> float:
 def table(results: Rows) -> str:
     """Return a line for each selector and learner: mean and standard deviation over seeds, best score first."""
     lines = [
-        "| selector | learner | presses, uniform | n | score | oracle's | weighted | regret | gain | success | CPU |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        "| selector | learner | presses, uniform | n | score | above the next (95 %) "
+        "| oracle's | weighted | regret | gain | success | CPU |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    cases = groups(results, "low", "total", "uniform_option_frames", "high").items()
-    for (low, total, uniform, high), runs in sorted(cases, key=_order):
+    cases = sorted(groups(results, "low", "total", "uniform_option_frames", "high").items(), key=_order)
+    for place, ((low, total, uniform, high), runs) in enumerate(cases, start=1):
+        above = ""
+        if place < len(cases) and cases[place][0][:3] == (low, total, uniform):
+            above = str(difference([run["score"] for run in runs], [run["score"] for run in cases[place][1]]))
         mean = {column: np.mean([run[column] for run in runs]) for column in COLUMNS}
         score = spread([run["score"] for run in runs])
         lines.append(
-            f"| {high} | {low} | {total:,.0f}, {uniform:,.0f} | {len(runs)} | {score} | {mean['agreement']:.1%} | "
+            f"| {high} | {low} | {total:,.0f}, {uniform:,.0f} | {len(runs)} | {score} | {above} | "
+            f"{mean['agreement']:.1%} | "
             f"{mean['weighted_agreement']:.1%} | {mean['regret']:.3f} | {mean['choice_gain']:.3f} | "
             f"{mean['success']:.1%} | {mean['cpu_s']:.0f} s |"
         )

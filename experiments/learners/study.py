@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
 from hpamdp.env.boatdock.reference import HUMAN
 
 HERE = Path(__file__).resolve().parent
@@ -105,6 +105,19 @@ def table(results: Rows) -> str:
     return "\n".join(lines)
 
 
+def boats_table(results: Rows) -> str:
+    """Return a line for each learner that was trained on both boats: the difference of its scores."""
+    lines = ["| learner | congruent less incongruent (95 %) | probability of improvement |", "|---|---|---|"]
+    for (low,), runs in groups(results, "low").items():
+        scores = [
+            [run["score"] for run in runs if (run["problem"], run["reward"]) == (boat, "shaped")] for boat in BOATS
+        ]
+        if all(scores):
+            found = difference(*scores)
+            lines.append(f"| {low} | {found} | {found.improvement:.2f} |")
+    return "\n".join(lines)
+
+
 def _order(case: tuple[tuple[Any, ...], Rows]) -> tuple[bool, str]:
     """Return the place of a line: the boats before Platform, the shaped before the sparse reward."""
     (_, problem, reward), _ = case
@@ -168,7 +181,7 @@ def main(folders: Sequence[str]) -> None:
     draw(curves, results, "shaped", "frames", HERE / "curves.png")
     draw(curves, results, "sparse", "frames", HERE / "curves_sparse.png")
     draw(curves, results, "shaped", "wall_s", HERE / "curves_seconds.png")
-    print(table(results))
+    print(table(results), boats_table(results), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
 from hpamdp.env.boatdock.reference import HUMAN
 
 HERE = Path(__file__).resolve().parent
@@ -24,6 +24,16 @@ COLOURS = {"bc": "#8c8c8c", "iql": "#0072B2", "td3_bc": "#D55E00"}
 OUTCOMES = ("success", "too_fast", "out_of_bounds", "out_of_fuel")
 OFFLINE, PRETRAINED, SCRATCH = "offline", "pretrained", "scratch"  # how a run starts
 REST_TO_REST, RECORDED = "rest-to-rest", "recorded"  # how it takes the data's presses
+# What the page compares: learner, start, presses and episodes of the one and of the other.
+COMPARISONS = (
+    ("bc: rest-to-rest less recorded", ("bc", OFFLINE, REST_TO_REST, "all"), ("bc", OFFLINE, RECORDED, "all")),
+    ("iql: rest-to-rest less recorded", ("iql", OFFLINE, REST_TO_REST, "all"), ("iql", OFFLINE, RECORDED, "all")),
+    ("bc: successes less all", ("bc", OFFLINE, REST_TO_REST, "successes"), ("bc", OFFLINE, REST_TO_REST, "all")),
+    ("iql less bc", ("iql", OFFLINE, REST_TO_REST, "all"), ("bc", OFFLINE, REST_TO_REST, "all")),
+    ("td3_bc less iql", ("td3_bc", OFFLINE, REST_TO_REST, "all"), ("iql", OFFLINE, REST_TO_REST, "all")),
+    ("iql: pretrained less scratch", ("iql", PRETRAINED, "none", "all"), ("iql", SCRATCH, "none", "all")),
+    ("pretrained: iql less td3_bc", ("iql", PRETRAINED, "none", "all"), ("td3_bc", PRETRAINED, "none", "all")),
+)
 
 
 def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
@@ -94,7 +104,18 @@ def table(results: Rows) -> str:
         frames = [run["frames_to_human"] for run in runs]
         reached = ", ".join("never" if value == "" else f"{value:,.0f}" for value in frames)
         lines.append(f"| {low} | {start} | {reached} | {score} |")
+    lines += ["", "| | difference (95 %) | probability of improvement |", "|---|---|---|"]
+    for title, better, other in COMPARISONS:
+        scores = [_scores(results, *case) for case in (better, other)]
+        if all(scores):
+            found = difference(*scores)
+            lines.append(f"| {title} | {found} | {found.improvement:.2f} |")
     return "\n".join(lines)
+
+
+def _scores(results: Rows, low: str, start: str, data: str, episodes: str) -> list[float]:
+    case = (low, start, data, episodes)
+    return [row["score"] for row in results if (row["low"], row["start"], row["data"], row["episodes"]) == case]
 
 
 def _mean(rows: Rows, column: str) -> float:

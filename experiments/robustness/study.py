@@ -20,7 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
-from hpamdp.analysis.study import Rows, Run, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, difference, finished, groups, read_csv, spread, write_tables
 from hpamdp.config import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.run import checkpoint
@@ -108,6 +108,30 @@ def table(rows: Rows) -> str:
     return "\n".join(lines)
 
 
+def gains_table(rows: Rows) -> str:
+    """Return a line for each noise that H-PPO was trained with alone: what that gains with this noise and without."""
+    lines = ["| H-PPO trained with | gain at that noise (95 %) | without noise (95 %) |", "|---|---|---|"]
+    rows = [row for row in rows if row["agent"] == "hppo"]
+    for (trained_with,), of_training in groups(rows, "trained_with").items():
+        if trained_with == NO_NOISE or PLUS in trained_with:
+            continue
+        noise, level = trained_with.split()
+        gains = [
+            difference(_scores(of_training, noise, at), _scores(_trained_without(rows), noise, at))
+            for at in (float(level), 0.0)
+        ]
+        lines.append(f"| {trained_with} | {gains[0]} | {gains[1]} |")
+    return "\n".join(lines)
+
+
+def _trained_without(rows: Rows) -> Rows:
+    return [row for row in rows if row["trained_with"] == NO_NOISE]
+
+
+def _scores(rows: Rows, noise: str, level: float) -> list[float]:
+    return [row["score"] for row in rows if row["noise"] == noise and row["level"] == level]
+
+
 def draw(rows: Rows, path: Path) -> None:
     """Draw scores on the congruent boat against the level of each noise.
 
@@ -171,7 +195,7 @@ def main(folders: Sequence[str]) -> None:
     rows = read_csv(HERE / "results.csv")
     rows.sort(key=_order)
     draw(rows, HERE / "robustness.png")
-    print(table(rows))
+    print(table(rows), gains_table(rows), sep="\n\n")
 
 
 if __name__ == "__main__":

@@ -18,7 +18,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, finished, groups, interquartile_mean, read_csv, spread, write_tables
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    curve,
+    difference,
+    finished,
+    groups,
+    middle_half,
+    read_csv,
+    spread,
+    write_tables,
+)
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised
 
@@ -122,12 +133,8 @@ def summarise(results: Rows) -> Rows:
             if not runs:
                 continue
             scores = [run["score"] for run in runs]
-            middle, interval_low, interval_high = interquartile_mean(scores)
             figures = {
                 "score": np.mean(scores),
-                "interquartile_mean": middle,
-                "interval_low": interval_low,
-                "interval_high": interval_high,
                 "human_normalised": human_normalised(float(np.mean(scores)), boat),
                 "success": np.mean([run["success"] for run in runs]),
                 "presses": np.mean([run["presses"] for run in runs]),
@@ -139,11 +146,21 @@ def summarise(results: Rows) -> Rows:
                     "boat": boat,
                     "seeds": len(runs),
                     "spread": spread(scores),
+                    "interquartile_mean": middle_half(scores),
+                    "above_next": _above_next(results, low, boat),
                     **{name: round(float(value), 4) for name, value in figures.items()},
                     "paper": paper,
                 }
             )
     return rows
+
+
+def _above_next(results: Rows, low: str, boat: str) -> str:
+    """Return how much a learner is above the next best one on this boat; empty for the last one."""
+    scores = {name: [run["score"] for run in _of(results, name, boat)] for name in LEARNERS}
+    ranking = sorted((name for name in LEARNERS if scores[name]), key=lambda name: -np.mean(scores[name]))
+    place = ranking.index(low) + 1
+    return str(difference(scores[low], scores[ranking[place]])) if place < len(ranking) else ""
 
 
 def ceilings(results: Rows) -> dict[str, float]:
@@ -179,15 +196,18 @@ def brief_table(rows: Rows, results: Rows) -> str:
 
 
 def table(rows: Rows, results: Rows) -> str:
-    """Return the lines of the learners, then those of people, the ceiling and random presses."""
+    """Return the lines of the learners, then those of people, the ceiling and random presses.
+
+    From five seeds on, the interquartile mean and its interval follow the score.
+    """
     lines = [
-        "| | boat | score | interquartile mean (95 %) | random 0, people 1 | success | presses | CPU | the paper's |",
+        "| | boat | score | above the next best (95 %) | random 0, people 1 | success | presses | CPU | the paper's |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        interval = f"{row['interval_low']:.3f} to {row['interval_high']:.3f}"
+        middle = f"; {row['interquartile_mean']}" if row["interquartile_mean"] else ""
         lines.append(
-            f"| {row['learner']} | {row['boat']} | {row['spread']} | {row['interquartile_mean']:.3f} ({interval}) | "
+            f"| {row['learner']} | {row['boat']} | {row['spread']}{middle} | {row['above_next']} | "
             f"{row['human_normalised']:.3f} | {row['success']:.1%} | {row['presses']:,.0f} | {row['cpu_s']:.0f} s | "
             f"{row['paper']} |"
         )
@@ -204,17 +224,19 @@ def table(rows: Rows, results: Rows) -> str:
 
 
 def reward_table(results: Rows) -> str:
-    """Return a line for each learner: its scores after training with either reward."""
-    columns = [f"{boat}, {reward}" for boat in BOATS for reward in REWARDS]
-    lines = [f"| learner | {' | '.join(columns)} |", "|---|---|---|---|---|"]
+    """Return a line for each learner: its scores after training with either reward, and the difference."""
+    columns = [f"{boat}, {what}" for boat in BOATS for what in (*REWARDS, "sparse less shaped (95 %)")]
+    lines = [f"| learner | {' | '.join(columns)} |", "|---|---|---|---|---|---|---|"]
     for low in LEARNERS:
         if not any(row["low"] == low and row["reward"] == "sparse" for row in results):
             continue
         cells = []
         for boat in BOATS:
-            for reward in REWARDS:
-                scores = [row["score"] for row in _of(results, low, boat) if row["reward"] == reward]
-                cells.append(spread(scores) if scores else "")
+            shaped, sparse = (
+                [row["score"] for row in _of(results, low, boat) if row["reward"] == reward] for reward in REWARDS
+            )
+            cells += [spread(scores) if scores else "" for scores in (shaped, sparse)]
+            cells.append(str(difference(sparse, shaped)) if shaped and sparse else "")
         lines.append(f"| {low} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -223,7 +245,7 @@ def efficiency_table(efficiency: Rows, results: Rows) -> str:
     """Return a line for each learner: presses to the human score, and the full-length scores on both boats together."""
     lines = [
         "| learner | presses to 1.97, congruent | incongruent | wall seconds, both "
-        "| random 0, people 1: interquartile mean of the full-length runs on both boats (95 %) |",
+        "| random 0, people 1: full-length runs, both boats |",
         "|---|---|---|---|---|",
     ]
     for low in LEARNERS:
@@ -236,9 +258,9 @@ def efficiency_table(efficiency: Rows, results: Rows) -> str:
             cells.append(_range([_first_at_human_score(rows) for rows in runs], "frames"))
         runs = groups(of_learner, "boat", "seed").values()
         cells.append(_range([_first_at_human_score(rows) for rows in runs], "wall_s"))
-        normalised = [human_normalised(row["score"], row["boat"]) for row in results if row["low"] == low]
-        middle, interval_low, interval_high = interquartile_mean(normalised)
-        lines.append(f"| {low} | {' | '.join(cells)} | {middle:.3f} ({interval_low:.3f} to {interval_high:.3f}) |")
+        by_seed = groups([row for row in results if row["low"] == low], "seed").values()
+        normalised = [np.mean([human_normalised(row["score"], row["boat"]) for row in rows]) for rows in by_seed]
+        lines.append(f"| {low} | {' | '.join(cells)} | {spread(normalised)} |")
     return "\n".join(lines)
 
 

@@ -6,7 +6,7 @@ import csv
 import json
 import sys
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from scipy import stats
 from hpamdp.run.metrics import read_rows
 
 Rows = list[dict[str, Any]]
+
+MIN_SEEDS = 5  # from which on an interquartile mean is shown
 
 
 @dataclass(frozen=True)
@@ -91,13 +93,15 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
 
 
 def spread(values: Sequence[float], digits: int = 3) -> str:
-    """Return mean ± standard deviation over seeds, or the one value."""
+    """Return mean ± standard deviation (of a sample, n - 1) over seeds, or the one value."""
     mean = f"{np.mean(values):.{digits}f}"
     return f"{mean} ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else mean
 
 
 def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean of the middle half, and its 95 % percentile bootstrap interval over seeds.
+    """Return the mean of the middle half, and its 95 % bootstrap interval over seeds.
+
+    Of fewer than `MIN_SEEDS` it is the plain mean or nearly so, and says nothing more; `middle_half` leaves it out.
 
     Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
     """
@@ -105,15 +109,89 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
     middle = float(stats.trim_mean(sample, 0.25))
     if len(sample) < 2 or np.ptp(sample) == 0.0:
         return middle, middle, middle
+    return middle, *_interval((sample,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis))
+
+
+def middle_half(values: Sequence[float]) -> str:
+    """Return the interquartile mean and its interval, empty with fewer than `MIN_SEEDS` seeds."""
+    if len(values) < MIN_SEEDS:
+        return ""
+    middle, low, high = interquartile_mean(values)
+    return f"{middle:.3f} ({low:.3f} to {high:.3f})"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How much one method is above another, with the seeds as the unit.
+
+    Attributes:
+        mean: difference of the means, of the interquartile means from `MIN_SEEDS` seeds of both on.
+        low, high: its 95 % bootstrap interval; NaN with a single seed of either. With three seeds of both it reaches
+            about from the least to the greatest difference of two of them, and contains the truth in 90 % of cases.
+        improvement: the probability that a seed of the one is above a seed of the other, ties counted half.
+    """
+
+    mean: float
+    low: float
+    high: float
+    improvement: float
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the interval excludes 0."""
+        return self.low > 0.0 or self.high < 0.0
+
+    def __str__(self) -> str:
+        """Return the difference and its interval, `unclear` where that does not exclude 0."""
+        if np.isnan(self.low):
+            return f"{self.mean:+.3f}"
+        interval = f"{self.mean:+.3f} ({self.low:+.3f} to {self.high:+.3f})"
+        return interval if self.is_clear else f"{interval}, unclear"
+
+
+def difference(values: Sequence[float], others: Sequence[float]) -> Difference:
+    """Return how much the first scores are above the others, one score a seed.
+
+    Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
+    """
+    sample, other = np.asarray(values, dtype=float), np.asarray(others, dtype=float)
+    proportion = 0.25 if min(len(sample), len(other)) >= MIN_SEEDS else 0.0
+
+    def statistic(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+        return stats.trim_mean(x, proportion, axis=axis) - stats.trim_mean(y, proportion, axis=axis)
+
+    mean = float(statistic(sample, other, 0))
+    pairs = np.sign(sample[:, None] - other[None, :])
+    improvement = float((0.5 * (pairs + 1.0)).mean())
+    if min(len(sample), len(other)) < 2:
+        return Difference(mean, np.nan, np.nan, improvement)
+    return Difference(mean, *_interval((sample, other), statistic), improvement)
+
+
+def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., np.ndarray]) -> tuple[float, float]:
+    """Return the 95 % expanded percentile bootstrap interval of a statistic of independent samples.
+
+    The plain percentile interval of a few seeds is too narrow: of the difference of three and three it contains the
+    truth in 78 % of cases. Expanded, it is as wide as Student's t asks for, as far as the samples go.
+
+    Source: Hesterberg 2015, *What teachers should know about the bootstrap*, arXiv 1411.5279.
+    """
+    num = min(map(len, samples))
+    freedom = sum(len(sample) - 1 for sample in samples)
+    tail = stats.norm.cdf(stats.t.ppf(0.025, freedom) * np.sqrt(num / (num - 1)))
     interval = stats.bootstrap(
-        (sample,), lambda x, axis: stats.trim_mean(x, 0.25, axis=axis), method="percentile", rng=0, n_resamples=2000
+        samples, statistic, confidence_level=1.0 - 2.0 * tail, method="percentile", rng=0, n_resamples=9999
     ).confidence_interval
-    return middle, float(interval.low), float(interval.high)
+    return float(interval.low), float(interval.high)
 
 
 def curve(runs: Rows, x: str, y: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `x` and the mean and standard deviation over seeds of `y`, as far as all the seeds go."""
+    """Return `x` and the mean and standard deviation over seeds of `y`, as far as all the seeds go.
+
+    The deviation is that of a sample, as `spread` has it; 0 with one seed.
+    """
     seeds = [np.array([(row[x], row[y]) for row in rows], dtype=float) for rows in groups(runs, "seed").values()]
     num = min(map(len, seeds))
     heights = np.array([seed[:num, 1] for seed in seeds])
-    return np.mean([seed[:num, 0] for seed in seeds], 0), heights.mean(0), heights.std(0)
+    deviation = heights.std(0, ddof=1) if len(seeds) > 1 else np.zeros(num)
+    return np.mean([seed[:num, 0] for seed in seeds], 0), heights.mean(0), deviation

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from tensordict import TensorDict
 
@@ -23,6 +25,15 @@ _REQUIRED = (
     ("next", keys.TRUNCATED),
     ("next", keys.IS_DECISION),
 )
+_REQUIRED_DECISIONS = (
+    keys.OPTION,
+    ("next", keys.DECISION_OBSERVATION),
+    ("next", keys.OPTION_RETURN),
+    ("next", keys.OPTION_STEPS),
+    ("next", keys.OBSERVATION),
+    ("next", keys.TERMINATED),
+    ("next", keys.IS_DECISION),
+)
 
 
 class Demonstrations:
@@ -36,26 +47,45 @@ class Demonstrations:
             `observation`, the action leaves, `is_decision` and, where the agent chooses options, `option`; under
             `next` `observation`, `reward`, `done`, `terminated`, `truncated` and `is_decision`; shapes and types are
             the environment's.
-        device: where the batch is kept.
+        device: where the tensors are kept.
+        decisions: `[K]`, for selectors, where more is known of what the options earned than the transitions show: at
+            the root `option`, under `next` `decision_observation`, `option_return`, `option_steps`, `observation`,
+            `terminated` and `is_decision`, which is true. None: the decisions in the transitions.
 
     Attributes:
         batch: the transitions `[1, M]`, with the sums that `with_option_sums` adds.
+        decisions: `[1, K]` or None.
 
     Raises:
         DataError: a key is missing, or the episodes are out of order.
     """
 
     batch: TensorDict
+    decisions: TensorDict | None
 
-    def __init__(self, transitions: TensorDict, device: torch.device | None = None) -> None:
-        present = set(transitions.keys(True, True))
-        missing = [name for name in _REQUIRED if name not in present]
-        if missing:
-            raise DataError(f"the transitions lack {', '.join(map(_dotted, missing))}")
+    def __init__(
+        self, transitions: TensorDict, device: torch.device | None = None, *, decisions: TensorDict | None = None
+    ) -> None:
+        _check_keys("transitions", transitions, _REQUIRED)
         if (transitions[TRAJECTORY].diff() < 0).any():
             raise DataError(f"the transitions' episode numbers ({_dotted(TRAJECTORY)}) must be in ascending order")
-        batch = with_option_sums(transitions).unsqueeze(0)
-        self.batch = batch if device is None else batch.to(device)
+        self.batch = _batch(with_option_sums(transitions), device)
+        self.decisions = None
+        if decisions is not None:
+            _check_keys("decisions", decisions, _REQUIRED_DECISIONS)
+            self.decisions = _batch(decisions, device)
+
+
+def _check_keys(what: str, rows: TensorDict, required: Sequence[str | tuple[str, str]]) -> None:
+    present = set(rows.keys(True, True))
+    missing = [name for name in required if name not in present]
+    if missing:
+        raise DataError(f"the {what} lack {', '.join(map(_dotted, missing))}")
+
+
+def _batch(rows: TensorDict, device: torch.device | None) -> TensorDict:
+    batch = rows.unsqueeze(0)
+    return batch if device is None else batch.to(device)
 
 
 def _dotted(name: str | tuple[str, ...]) -> str:

@@ -158,10 +158,15 @@ class HierarchicalAgent(nn.Module):
             scalars.update({f"{prefix}/{name}": value for name, value in learned.items()})
         return scalars
 
-    def add_demonstrations(self, batch: TensorDictBase) -> None:
-        """Let the selector learn from a data set `[*B, T]`, if it can, and the learners keep their own transitions."""
+    def add_demonstrations(self, batch: TensorDictBase, decisions: TensorDictBase | None = None) -> None:
+        """Let the selector learn from a data set `[*B, T]`, if it can, and the learners keep their own transitions.
+
+        Args:
+            batch: the transitions.
+            decisions: `[*B, K]` for the selector; None: those in the batch.
+        """
         if self.selector is not None and "offline" in self.selector.modes:
-            self._teach_selector(self.selector, batch)
+            self._teach_selector(self.selector, batch if decisions is None else decisions)
         for _, learner, rows, mask in self._shares(batch):
             learner.add_demonstrations(rows, mask)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -197,11 +198,14 @@ class Learner(nn.Module):
         modes: what the learner can learn from. `train`: transitions that the agent collects (`mode=train`). `offline`:
             a data set (`mode=offline`, or `data=...` with `mode=train`).
         has_value: whether `value` is implemented.
+        progress: the buffers, by the last part of their names, that say how far a run has come: counters of its steps
+            and the exploration that follows from them. They begin afresh where a new run takes over the learner.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train",)
     has_value: ClassVar[bool] = False
+    progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 
     policy: TensorDictModuleBase
 
@@ -239,6 +243,18 @@ class Learner(nn.Module):
         Called repeatedly with `mode=offline`, in which `learn` is not called, on learners with the mode `offline`.
         """
         raise NotImplementedError
+
+    def load_networks(self, state: Mapping[str, Tensor]) -> None:
+        """Take over what an earlier run's learner has learned, but not how far its run had come (`progress`).
+
+        Args:
+            state: the `state_dict` of that learner.
+
+        Raises:
+            RuntimeError: it is of another class or size.
+        """
+        fresh = {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in self.progress}
+        self.load_state_dict({name: fresh.get(name, value) for name, value in state.items()})
 
     def value(self, observation: Tensor) -> Tensor:
         """Return the expected return from observations `[B, observation_dim]` on, `[B]`; see `has_value`."""

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
 from hpamdp.config import Config, ConfigError, constructor_arguments
+from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
@@ -32,7 +32,7 @@ class Parts:
         policy: acts in `env`.
         agent: selector and learners.
         evaluation: scores the agent on environments of its own.
-        data: transitions `[1, M]` of others to learn from, if there are any.
+        data: what others did, to learn from, if there is any.
         logger: takes the run's numbers beside its own files.
         device: of all of them.
     """
@@ -41,7 +41,7 @@ class Parts:
     policy: TensorDictModuleBase
     agent: HierarchicalAgent
     evaluation: Evaluation
-    data: TensorDict | None
+    data: Demonstrations | None
     logger: Logger
     device: torch.device
 
@@ -113,10 +113,10 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     return agent.to(device)
 
 
-def make_data(config: Config, env: PAMDPEnv) -> TensorDict | None:
-    """Build the data set and return its transitions `[1, M]`, if there is one."""
-    demonstrations = config.data.build(env=env)
-    return None if demonstrations is None else demonstrations.batch
+def make_data(config: Config, env: PAMDPEnv) -> Demonstrations | None:
+    """Build the data set, if there is one."""
+    demonstrations: Demonstrations | None = config.data.build(env=env)
+    return demonstrations
 
 
 def make_evaluation(config: Config, env: PAMDPEnv) -> Evaluation:

@@ -29,6 +29,7 @@ from torchrl.data import ReplayBuffer
 from hpamdp.config import ConfigError
 from hpamdp.messages import first_line, one_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Learner
 from hpamdp.run.folder import CHECKPOINT_NAME as FILE_NAME
 
 _FORMAT = 2
@@ -162,7 +163,7 @@ def progress_of(file: Path) -> dict[str, Any]:
 
 
 def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:
-    """Fill the agent's learners, but neither their optimizers nor their replay, from another run's checkpoint.
+    """Fill the agent's learners from another run's checkpoint, but neither their optimizers, replay nor `progress`.
 
     Raises:
         ConfigError: the checkpoint is damaged or of other learners.
@@ -174,7 +175,10 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
     if own and saved_num != num:
         raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} learners, but this agent has {num}")
     try:
-        agent.learners.load_state_dict(own)
+        for i, learner in enumerate(agent.learners):
+            assert isinstance(learner, Learner)
+            start = f"{i}."
+            learner.load_networks({name.removeprefix(start): own[name] for name in own if name.startswith(start)})
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
             f"low.checkpoint={file}: of another class or size than low: {one_line(error):.160}"

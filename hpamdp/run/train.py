@@ -191,7 +191,7 @@ class Trainer:
             if self.last_score is None and self.frames == 0:
                 self._evaluate(bar)
                 if self.parts.data is not None:
-                    self.parts.agent.add_demonstrations(self.parts.data)
+                    self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             while not self._is_over() and request.signal is None:
                 num = self._learn(collection)
                 last = self.frames

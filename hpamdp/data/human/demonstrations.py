@@ -11,7 +11,7 @@ from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.rest_to_rest import to_rest_to_rest
-from hpamdp.data.human.transitions import transitions
+from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
 
@@ -21,6 +21,9 @@ class HumanDemonstrations(Demonstrations):
 
     Where the environment has a fixed key map, each key is replaced by the one that pushes the boat in the same
     direction under that key map. Where it has a fixed controller, only the episodes with this controller are taken.
+
+    Selectors learn from the episodes as they were recorded, with their outcomes and the fuel that was left, whatever
+    the log of their presses misses and `rest_to_rest` leaves out.
 
     Args:
         env: the boat-docking environment, which determines controller, key map, reward and observation.
@@ -56,12 +59,13 @@ class HumanDemonstrations(Demonstrations):
             best_people=best_people,
             controller=rules.controller if rules.controller in harbour.CONTROLLERS else None,
         )
+        recorded = decisions(data, reward=rules.reward, observation=rules.observation) if env.has_choice else None
         if rest_to_rest:
             data = to_rest_to_rest(data)
         if isinstance(rules.keymap, int):
             data = with_keymap(data, rules.keymap)
         rows = transitions(data, reward=rules.reward, observation=rules.observation, has_choice=env.has_choice)
-        super().__init__(rows, env.device)
+        super().__init__(rows, env.device, decisions=recorded)
 
 
 def with_keymap(data: HumanData, keymap: int) -> HumanData:

@@ -50,10 +50,7 @@ def transitions(
     Raises:
         DataError: no such reward or observation, or the harbours have different centres.
     """
-    _check_one_of("reward", reward, _REWARDS)
-    _check_one_of("observation", observation, _OBSERVATIONS)
-    if not (data.episodes["centre"] == torch.tensor(harbour.CENTRE)).all():
-        raise DataError("the harbours have different centres; read the file with one_frame=True")
+    _check(data, reward, observation)
     rules = Rules(controller="choose" if has_choice else "random", reward=reward, observation=observation)
     presses = data.presses
     episodes = data.episodes[presses["episode"]]  # the episode of each press
@@ -72,6 +69,84 @@ def transitions(
     following[keys.IS_DECISION] = following[keys.DONE].clone()
     rows["next"] = following
     return rows
+
+
+def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: ObservationForm = "scaled") -> TensorDict:
+    """Return each recorded episode as one decision for a selector, `[E]`: the first observation, the boat, the return.
+
+    The return is what the environment would have paid for the episode as it ended: its outcome and its `tank` were
+    recorded, whatever the log of its presses misses. Every episode is terminated; those without a logged press are
+    there, too.
+
+    At the root: `option` `[E]`. Under `next`: `decision_observation` and `observation` `[E, 16]` (14 with `pixels`),
+    `option_return`, `option_steps` (the logged presses, at least 1), `is_decision`, `done`, `terminated` and
+    `truncated` `[E, 1]`.
+
+    Args:
+        data: as recorded, read with `one_frame=True`.
+        reward, observation: as in BoatDockEnv.
+
+    Raises:
+        DataError: no such reward or observation, or the harbours have different centres.
+    """
+    _check(data, reward, observation)
+    rules = Rules(reward=reward, observation=observation)
+    episodes = data.episodes
+    start = episodes["start"] - torch.tensor(harbour.CENTRE)
+    goal = episodes["goal"] - torch.tensor(harbour.CENTRE)
+    # The last logged press; without one, the boat heads for its goal from the start.
+    position, heading = start.clone(), torch.nn.functional.normalize(goal - start, dim=1)
+    duration = torch.zeros(len(start))
+    last = data.presses[data.presses["is_final"]]
+    number = last["episode"]
+    controller, keymap = (episodes[name].to(torch.int32) for name in ("controller", "keymap"))
+    position[number] = last["position"] - torch.tensor(harbour.CENTRE)
+    heading[number] = torch.stack(harbour.direction(controller[number], keymap[number], last["key"].int()), 1)
+    duration[number] = last["duration"]
+    full = torch.full_like(duration, physics.TANK)
+    end = _final_position(position, goal, full, heading, duration, episodes["outcome"])
+
+    zeros = torch.zeros_like(full)
+    steps = episodes["presses"].clamp(min=1)
+    before = BoatState(
+        start_x=start[:, 0],
+        start_y=start[:, 1],
+        goal_x=goal[:, 0],
+        goal_y=goal[:, 1],
+        x=start[:, 0],
+        y=start[:, 1],
+        velocity_x=zeros,
+        velocity_y=zeros,
+        fuel=full,
+        controller=torch.full_like(controller, harbour.NOT_CHOSEN),
+        keymap=keymap,
+        presses=torch.zeros_like(controller),
+        outcome=torch.full_like(controller, physics.SAILING),
+        episode=torch.zeros_like(controller),
+    )
+    after = before._replace(
+        x=end[:, 0],
+        y=end[:, 1],
+        fuel=episodes["tank"] / FRAMES_PER_SECOND,
+        controller=controller,
+        presses=steps.to(torch.int32),
+        outcome=episodes["outcome"].int(),
+    )
+    ended = _read(after, rules)
+    ended[keys.DECISION_OBSERVATION] = _read(before, rules)[keys.OBSERVATION]
+    # The progress of an episode's presses sums to that of one step from its start to its end.
+    ended[keys.OPTION_RETURN] = episode.reward_of(before, after, rules).unsqueeze(-1)
+    ended[keys.OPTION_STEPS] = steps.unsqueeze(-1)
+    ended[keys.IS_DECISION] = ended[keys.DONE].clone()
+    return TensorDict({keys.OPTION: episodes["controller"].clone(), "next": ended}, batch_size=[len(start)])
+
+
+def _check(data: HumanData, reward: str, observation: str) -> None:
+    """Check what `transitions` and `decisions` are given."""
+    _check_one_of("reward", reward, _REWARDS)
+    _check_one_of("observation", observation, _OBSERVATIONS)
+    if not (data.episodes["centre"] == torch.tensor(harbour.CENTRE)).all():
+        raise DataError("the harbours have different centres; read the file with one_frame=True")
 
 
 def _check_one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -40,8 +40,7 @@ class PlatformEnv(PAMDPEnv):
         noise: factor on the published noise of jumps, of the agent's speed and of the enemies' speed; 0 is none.
         device: of the tensors.
         seed: of the noise; the global generators are neither read nor moved. Nothing else is random, so
-            `fixed_episodes` is None: `set_seed` and `reset` fix the episodes of an evaluation. With the same seed as
-            training, these have the noise of training's first episodes, which no observation reveals in advance.
+            `fixed_episodes` is None: `seed_evaluation` and `reset` fix the episodes of an evaluation.
         first_env: number of the first course, where other processes have the courses before it.
 
     Raises:
@@ -76,6 +75,11 @@ class PlatformEnv(PAMDPEnv):
         self._parameter_high = torch.tensor(rules.PARAMETER_HIGH, device=self.device)
         self._make_specs()
         self._set_seed(seed)
+
+    def seed_evaluation(self, seed: int) -> None:
+        """Seed the noise as `set_seed` does, but from a stream that training never meets, whatever its seed."""
+        self.set_seed(seed)
+        self._noise_stream = counter_rng.EVALUATION_NOISE
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]`: whether the agent arrived."""
@@ -113,6 +117,7 @@ class PlatformEnv(PAMDPEnv):
         self.done_spec = self.make_done_spec()
 
     def _set_seed(self, seed: int | None) -> None:
+        self._noise_stream = counter_rng.NOISE
         self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
         self._state = rules.start(torch.full_like(self._environment, -1))
 
@@ -137,7 +142,7 @@ class PlatformEnv(PAMDPEnv):
             is_idle = is_idle | ~mask.reshape(self.num_envs)
         # Rows that do not move simulate a run, which is shorter than a jump.
         simulated = torch.where(is_idle, rules.RUN, discrete)
-        rng = counter_rng.key_for(self._seed, counter_rng.NOISE, self._environment, before.episode)
+        rng = counter_rng.key_for(self._seed, self._noise_stream, self._environment, before.episode)
         after = rules.act(before, simulated, parameter, rng, self.noise)
         is_out_of_time = (after.steps >= self.max_steps) & (after.outcome == rules.ON_THE_WAY)
         after = after._replace(outcome=torch.where(is_out_of_time, rules.TIME_LIMIT, after.outcome))

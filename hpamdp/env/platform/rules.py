@@ -89,7 +89,7 @@ def start(episode: Tensor) -> PlatformState:
     )
 
 
-def act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: Tensor, noise: float) -> PlatformState:
+def act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: counter_rng.Key, noise: float) -> PlatformState:
     """Return the states after one action in every environment.
 
     The action is simulated at full length, `[T, N]`, and then cut off where something ends it.
@@ -98,7 +98,7 @@ def act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: Tensor, 
         state: before the action.
         discrete: RUN, HOP or LEAP, `[N]`.
         parameter: of the chosen action, within its bounds, `[N]`.
-        rng: int32 `[N]` from `counter_rng.key_for`, from which the random numbers come.
+        rng: `[N]` from `counter_rng.key_for`, from which the random numbers come.
         noise: factor on the published noise.
     """
     edge = torch.where(state.x < LEFT[2] - _BODY_WIDTH, RIGHT[1], RIGHT[2])
@@ -113,7 +113,7 @@ def act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: Tensor, 
     # Tick k of a jump, counted from 0, ends at the height (k + 1) (rise - k fall) tick.
     fall = 0.5 * _GRAVITY * _TICK
     length = torch.where(is_jump, (rise / fall).floor().clamp(min=-1.0) + 2.0, _RUN_TICKS)
-    tick = torch.arange(int(length.max()), dtype=torch.int32, device=rng.device).unsqueeze(-1)
+    tick = torch.arange(int(length.max()), dtype=torch.int32, device=rng.bits.device).unsqueeze(-1)
     index = first + 2 + 2 * tick
     drag = noise * _TICK_NOISE * counter_rng.normal(rng, index).abs()
     gust = noise * _TICK_NOISE * counter_rng.normal(rng, index + 1)

@@ -255,6 +255,9 @@ class QPAMDP(Learner):
     high: Tensor
     best_return: Tensor  # of the current phase's windows
     window_return: Tensor  # sum over the current window
+    # A new run goes on from the phase: a second warm-up would fit other bases than those of the weights.
+    progress: ClassVar[frozenset[str]] = frozenset()
+
     frames: Tensor
     phase: Tensor
     window_episodes: Tensor

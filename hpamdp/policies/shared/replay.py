@@ -67,7 +67,7 @@ class ReplayLearner(Learner):
         self.frames = self.frames + num_steps
         if frames < self.warmup_frames:
             return {}
-        if before < self.warmup_frames:
+        if before < self.warmup_frames and int(self.updates) == 0:  # a learner of an earlier run has started already
             self.start()
         self.explore(frames - self.warmup_frames)
         return self._make_updates(self.updates_due(before, frames))
