@@ -71,12 +71,13 @@ def episodes(*lengths: int) -> TensorDict:
     return TensorDict(rows, batch_size=[num])
 
 
-def test_option_sums_start_anew_with_every_episode():
+@pytest.mark.parametrize("gamma", [1.0, 0.9])
+def test_option_sums_start_anew_with_every_episode(gamma):
     rows = episodes(1, 3, 2)
     given = rows.clone()
-    extended = with_option_sums(rows)
+    extended = with_option_sums(rows, gamma)
     reward = rows["next", keys.REWARD].squeeze(-1)
-    expected = torch.cat([part.cumsum(0) for part in reward.split([1, 3, 2])])
+    expected = torch.cat([(gamma ** torch.arange(len(part)) * part).cumsum(0) for part in reward.split([1, 3, 2])])
     torch.testing.assert_close(extended["next", keys.OPTION_RETURN].squeeze(-1), expected)
     assert extended["next", keys.OPTION_STEPS].squeeze(-1).tolist() == [1, 1, 2, 3, 1, 2]
     first = rows[keys.OBSERVATION][[0, 1, 1, 1, 4, 4]]
@@ -90,6 +91,14 @@ def test_demonstrations_are_one_batch_with_option_sums():
     assert batch.shape == (1, 4)
     assert batch["next", keys.OPTION_STEPS].flatten().tolist() == [1, 2, 1, 2]
     assert batch[0][keys.PARAMETERS].equal(rows[keys.PARAMETERS])
+
+
+def test_demonstrations_are_discounted_as_a_selector_asks():
+    demonstrations = Demonstrations(episodes(2, 2))
+    assert demonstrations.discounted(1.0) is demonstrations.batch
+    reward = demonstrations.batch[0]["next", keys.REWARD].squeeze(-1)
+    total = demonstrations.discounted(0.5)["next", keys.OPTION_RETURN].flatten()
+    torch.testing.assert_close(total[[1, 3]], reward[[0, 2]] + 0.5 * reward[[1, 3]])
 
 
 def test_demonstrations_name_missing_keys_and_refuse_episodes_out_of_order():

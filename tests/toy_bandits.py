@@ -51,6 +51,7 @@ def ended(chosen: TensorDict, rewards: Tensor) -> TensorDict:
     after = {
         keys.OBSERVATION: torch.zeros_like(chosen[keys.OBSERVATION]),
         keys.TERMINATED: is_end,
+        keys.DONE: is_end.clone(),
         keys.IS_DECISION: is_end,
         keys.OPTION_RETURN: rewards.unsqueeze(-1),
         keys.OPTION_STEPS: is_end.long(),

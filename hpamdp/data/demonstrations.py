@@ -57,28 +57,33 @@ class Demonstrations:
         batch = with_option_sums(transitions).unsqueeze(0)
         self.batch = batch if device is None else batch.to(device)
 
+    def discounted(self, gamma: float) -> TensorDict:
+        """Return `batch` with option returns that are discounted by `gamma` a step, as a selector asks for."""
+        return self.batch if gamma == 1.0 else with_option_sums(self.batch.squeeze(0), gamma).unsqueeze(0)
+
 
 def _dotted(name: str | tuple[str, ...]) -> str:
     return name if isinstance(name, str) else ".".join(name)
 
 
-def with_option_sums(transitions: TensorDict) -> TensorDict:
+def with_option_sums(transitions: TensorDict, gamma: float = 1.0) -> TensorDict:
     """Return the transitions with what `DecisionTracker` writes where an option lasts a whole episode.
 
-    Under `next`, `option_return` `[N, 1]` is the sum of the rewards since the episode began, undiscounted,
-    `option_steps` `[N, 1]` the number of these steps, and `decision_observation` `[N, observation_dim]` the episode's
-    first observation.
+    Under `next`, `option_return` `[N, 1]` is the discounted sum of the rewards since the episode began, `option_steps`
+    `[N, 1]` the number of these steps, and `decision_observation` `[N, observation_dim]` the episode's first
+    observation.
 
     Args:
         transitions: `[N]`, one episode after another, with ascending episode numbers under `TRAJECTORY`.
+        gamma: discount of a step.
     """
     episode = transitions[TRAJECTORY]
     first = torch.searchsorted(episode, episode)  # the row in which each row's episode begins
+    option_steps = torch.arange(len(first), device=first.device) - first + 1
     # Double precision, because the sum runs over all episodes before it is taken apart.
-    reward = transitions["next", keys.REWARD].squeeze(-1).double()
+    reward = gamma ** (option_steps - 1).double() * transitions["next", keys.REWARD].squeeze(-1).double()
     total = reward.cumsum(0)
     option_return = total - total[first] + reward[first]
-    option_steps = torch.arange(len(first), device=first.device) - first + 1
     extended = transitions.copy()
     extended["next", keys.OPTION_RETURN] = option_return.float().unsqueeze(-1)
     extended["next", keys.OPTION_STEPS] = option_steps.unsqueeze(-1)

@@ -131,18 +131,6 @@ class HierarchicalAgent(nn.Module):
         """Return the policy that always holds one option and otherwise acts like this agent."""
         return TensorDictSequential(HeldOption(option), self.router)
 
-    @torch.no_grad()
-    def option_values(self, observation: Tensor) -> Tensor:
-        """Return the value of observations `[B, observation_dim]` under each option's learner, `[B, num_options]`."""
-        if not self.is_shared:
-            return torch.stack([learner.value(observation) for learner in self._learners()], -1)
-        shared = next(self._learners())
-        values = []
-        for one_hot in torch.eye(self.specs.num_options).to(observation):
-            option = one_hot.expand(len(observation), -1)
-            values.append(shared.value(torch.cat([observation, option], -1)))
-        return torch.stack(values, -1)
-
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
@@ -207,7 +195,4 @@ class HierarchicalAgent(nn.Module):
             return {}
         # Time first, so that the selector sees the decisions oldest first.
         decisions = batch.transpose(0, -1)[is_end.transpose(0, -1)]
-        if selector.needs_values:
-            decided_at = decisions.get(("next", keys.DECISION_OBSERVATION))
-            decisions.set(keys.OPTION_VALUES, self.option_values(decided_at))
         return selector.learn(decisions)

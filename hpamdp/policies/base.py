@@ -71,11 +71,8 @@ class Selector(TensorDictModuleBase):
             writes more than its observation: with `oracle` its planner's best action for each option (the `ORACLE_`
             keys of `hpamdp.keys`), with `human` the probabilities of the human choices (`HUMAN_OPTION`). Append the
             keys that `select` reads to `in_keys`. Environments without such an argument are refused.
-        needs_values: whether `learn` reads `option_values`, the learners' own estimates of a state. Learners without
-            `has_value` are then refused.
-        gamma: discount of a step, if options may end before their episode (`agent.option_length`): `option_return` is
-            discounted by it, and a selector that bootstraps multiplies what follows by `gamma ** option_steps`.
-            Options that last an episode are not discounted.
+        gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
+            it, and so is the value of the next decision, see `next_discount`.
         modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others
             made. A selector with keys of its own in `out_keys` usually has `train` alone, as a data set lacks them.
         is_uniform: bool scalar, a buffer that the agent sets. While it is true, for the first
@@ -85,7 +82,6 @@ class Selector(TensorDictModuleBase):
 
     needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
-    needs_values: bool = False
     gamma: float = 1.0
     is_uniform: Tensor
 
@@ -127,15 +123,24 @@ class Selector(TensorDictModuleBase):
 
         - `option` int64 `[N]` and the other `out_keys`, as chosen (a data set holds `option` alone);
         - `("next", "decision_observation")` `[N, observation_dim]`: the observation at the decision;
-        - `("next", "option_return")` `[N, 1]`: the sum of the option's rewards, discounted as described at `gamma`;
+        - `("next", "option_return")` `[N, 1]`: the sum of the option's rewards, discounted by `gamma`;
         - `("next", "option_steps")` int64 `[N, 1]`: how many steps the option took;
-        - `("next", "observation")` `[N, observation_dim]` and `("next", "terminated")` bool `[N, 1]`: where it ended,
-          and whether nothing follows;
-        - `option_values` `[N, num_options]`, if `needs_values`: what each option's learner expects at the decision.
+        - `("next", "observation")` `[N, observation_dim]` and `("next", "done")` bool `[N, 1]`: where it ended, and
+          whether its episode ended there, too;
 
         `observation`, without `next`, belongs to the option's last step: it is not what the choice was based on.
         """
         return {}
+
+    def next_discount(self, decisions: TensorDictBase) -> Tensor:
+        """Return the factor `[N]` of the next decision's value in the target of each of the decisions `[N]`.
+
+        It is `gamma ** option_steps` where an option ended inside its episode. It is 0 where the episode ended, by its
+        time limit, too: otherwise an option that idles until the limit would be worth as much as the best one.
+        """
+        after = decisions.get("next")
+        goes_on = ~after.get(keys.DONE).squeeze(-1)
+        return self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1) * goes_on
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by name: optimisers, replay buffers.
@@ -167,7 +172,6 @@ class Learner(nn.Module):
     - `policy`, which acts;
     - `learn`, to learn from the agent's own transitions;
     - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in `modes`;
-    - `value` and `has_value = True`, if it can estimate the value of a state;
     - `stateful`, if it has optimisers or a replay buffer.
 
     `policies.shared.replay.ReplayLearner` implements `learn`, `add_demonstrations`, `update` and `stateful` for
@@ -196,12 +200,10 @@ class Learner(nn.Module):
         needs: what the environment must reveal beyond its observation, as in `Selector`.
         modes: what the learner can learn from. `train`: transitions that the agent collects (`mode=train`). `offline`:
             a data set (`mode=offline`, or `data=...` with `mode=train`).
-        has_value: whether `value` is implemented.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train",)
-    has_value: ClassVar[bool] = False
 
     policy: TensorDictModuleBase
 
@@ -238,10 +240,6 @@ class Learner(nn.Module):
 
         Called repeatedly with `mode=offline`, in which `learn` is not called, on learners with the mode `offline`.
         """
-        raise NotImplementedError
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return the expected return from observations `[B, observation_dim]` on, `[B]`; see `has_value`."""
         raise NotImplementedError
 
     def stateful(self) -> dict[str, Any]:

@@ -58,9 +58,8 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     check_collector(config, env)
     check_modes(config)
     agent = make_agent(config, PAMDPSpecs.from_env(env), device)
-    check_values(config, agent)
     is_new = config.run.mode != "eval" and config.run.resume is None
-    data = make_data(config, env) if is_new else None
+    data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and config.run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(config.run.low.checkpoint, "low.checkpoint"), agent, device)
     evaluation = make_evaluation(config, env)
@@ -113,10 +112,10 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     return agent.to(device)
 
 
-def make_data(config: Config, env: PAMDPEnv) -> TensorDict | None:
-    """Build the data set and return its transitions `[1, M]`, if there is one."""
+def make_data(config: Config, env: PAMDPEnv, gamma: float) -> TensorDict | None:
+    """Build the data set and return its transitions `[1, M]`, option returns discounted by `gamma`, if there is one."""
     demonstrations = config.data.build(env=env)
-    return None if demonstrations is None else demonstrations.batch
+    return None if demonstrations is None else demonstrations.discounted(gamma)
 
 
 def make_evaluation(config: Config, env: PAMDPEnv) -> Evaluation:
@@ -128,15 +127,19 @@ def make_evaluation(config: Config, env: PAMDPEnv) -> Evaluation:
 
 def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
     """Return the environment to train in, with its decisions tracked, and the policy that acts there."""
-    gamma = 1.0 if agent.selector is None else agent.selector.gamma
+    gamma = _gamma(agent)
     if config.run.low.freeze:
-        return _with_decisions(OptionChoiceEnv(agent.router, env), config, gamma), agent.selector
+        return _with_decisions(OptionChoiceEnv(agent.router, env, gamma), config), agent.selector
     return _with_decisions(env, config, gamma), agent.policy
+
+
+def _gamma(agent: HierarchicalAgent) -> float:
+    return 1.0 if agent.selector is None else agent.selector.gamma
 
 
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
     length = config.run.agent.option_length
-    return with_decisions(env) if length == "episode" else with_decisions(env, gamma, length)
+    return with_decisions(env, gamma, None if length == "episode" else length)
 
 
 def check_choice(config: Config, env: PAMDPEnv) -> None:
@@ -187,18 +190,6 @@ def check_modes(config: Config) -> None:
         raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
     if mode == "offline" and config.run.low.freeze:
         raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
-
-
-def check_values(config: Config, agent: HierarchicalAgent) -> None:
-    """Refuse a selector that needs values of learners that have none.
-
-    Raises:
-        ConfigError: with the settings to change.
-    """
-    if agent.selector is None or not agent.selector.needs_values or agent.learners[0].has_value:
-        return
-    bootstrap = config.high.options.get("bootstrap")
-    raise ConfigError(f"high.bootstrap={bootstrap}: {config.low} has no value of a state; use high.bootstrap=0")
 
 
 def check_collector(config: Config, env: PAMDPEnv) -> None:
