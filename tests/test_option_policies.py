@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_bandits import CPU, SPECS, by_sign, due, ended, play
 
 from hpamdp import keys
-from hpamdp.policies.high_level.actor import LOG_PROB, Actor
+from hpamdp.policies.high_level.actor import LOG_PROB, WEIGHT, Actor
 from hpamdp.policies.high_level.meta_critic import MetaCritic
 
 OPTIONS = {
@@ -123,7 +123,10 @@ def test_an_option_that_idles_until_the_time_limit_is_worth_what_it_paid():
     assert critic.critics(torch.zeros(1, 2)).mean(0)[0].tolist() == pytest.approx([3.0, 0.0], abs=0.1)
     with torch.no_grad():
         actor.critic[-1].bias.fill_(5.0)
-    assert actor._rows(decisions.set(LOG_PROB, torch.zeros(100)))["target"].tolist() == [3.0, 0.0] * 50
+    assert (
+        actor._rows(decisions.update({LOG_PROB: torch.zeros(100), WEIGHT: torch.ones(100)}))["target"].tolist()
+        == [3.0, 0.0] * 50
+    )
 
 
 def test_the_probability_of_a_random_option_falls_from_1_after_the_warm_up():
@@ -202,6 +205,40 @@ def test_decisions_that_wait_for_an_update_are_part_of_the_state_dict():
         assert one.learn(decisions) and not one.waiting
     for one, two in zip(actor.parameters(), other.parameters(), strict=True):
         torch.testing.assert_close(one, two)
+
+
+def test_uniform_options_are_weighted_by_the_policys_probability_over_the_uniform_one():
+    actor = make(Actor)
+    actor.is_uniform.fill_(True)
+    observation = torch.tensor([[0.5, -0.5]]).expand(20_000, 2)
+    td = actor(due(observation))
+    probability = actor.logits(observation[0]).softmax(-1).detach()
+    assert td[keys.OPTION].float().mean().item() == pytest.approx(0.5, abs=0.015)
+    torch.testing.assert_close(td[LOG_PROB], probability.log()[td[keys.OPTION]])
+    torch.testing.assert_close(td[WEIGHT], (probability / 0.5)[td[keys.OPTION]])
+    actor.is_uniform.fill_(False)
+    assert (actor(due(observation))[WEIGHT] == 1.0).all()
+
+
+def test_actor_settles_on_the_better_options_while_options_are_chosen_uniformly():
+    actor = make(Actor)
+    actor.is_uniform.fill_(True)
+    play(actor, by_sign, 4000, 50, noise=0.5)
+    assert greedy_regret(actor) < 0.2
+    observation = torch.tensor([[0.8, 0.0], [-0.8, 0.0]])
+    assert actor.logits(observation).softmax(-1).amax(-1).min() > 0.9
+
+
+def test_the_value_of_the_actor_is_that_of_its_policy_while_options_are_chosen_uniformly():
+    actor = make(Actor, lr=1e-2)
+    with torch.no_grad():
+        actor.logits[-1].weight.zero_()
+        actor.logits[-1].bias.copy_(torch.tensor([0.0, 2.0]))
+    actor.is_uniform.fill_(True)
+    actor.surrogate = lambda log_ratio, advantage: 0.0 * log_ratio  # so that the policy stays as it is
+    play(actor, lambda observation: torch.tensor([0.0, 1.0]).expand(len(observation), 2), 6000, 100, noise=0.0)
+    likely = torch.tensor([0.0, 2.0]).softmax(-1)[1].item()
+    assert actor.critic(torch.zeros(1, 2)).item() == pytest.approx(likely, abs=0.05)
 
 
 @pytest.mark.parametrize("cls", [MetaCritic, Actor])
