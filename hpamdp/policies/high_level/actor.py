@@ -8,7 +8,7 @@ Differs from the sources:
 - options end where the environment or a fixed length says so; their ends are not learned;
 - decisions with uniform options are weighted by the policy's probability over the uniform one, and the clip is around
   the policy that they were made beside (the decoupled objective of Hilton, Cobbe and Schulman 2021, *Batch
-  size-invariance for policy optimization*, arXiv 2110.00641, equation 5);
+  size-invariance for policy optimization*, arXiv 2110.00641);
 - the advantage is the option's return, bootstrapped if its episode goes on, minus a learned value of the state; an
   episode that a time limit ends does not go on.
 
