@@ -146,7 +146,7 @@ def test_learners_of_another_run_go_on_learning_where_they_are_not_frozen(traine
 def test_frozen_learners_that_need_no_training_need_no_checkpoint(tmp_path):
     words = [*SMALL, "high=ucb", "low=random", "low.freeze=true"]
     parts = train(make_config(words), tmp_path / "out")
-    assert parts.agent.selector.statistics.num_decisions.item() == 256
+    assert parts.agent.selector.num_decisions.item() == 256
 
 
 def test_options_of_a_fixed_length_are_chosen_and_discounted_as_the_selector_asks(tmp_path):

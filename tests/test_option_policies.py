@@ -123,10 +123,8 @@ def test_an_option_that_idles_until_the_time_limit_is_worth_what_it_paid():
     assert critic.critics(torch.zeros(1, 2)).mean(0)[0].tolist() == pytest.approx([3.0, 0.0], abs=0.1)
     with torch.no_grad():
         actor.critic[-1].bias.fill_(5.0)
-    assert (
-        actor._rows(decisions.update({LOG_PROB: torch.zeros(100), WEIGHT: torch.ones(100)}))["target"].tolist()
-        == [3.0, 0.0] * 50
-    )
+    decisions.update({LOG_PROB: torch.zeros(100), WEIGHT: torch.ones(100)})
+    assert actor._rows(decisions)["target"].tolist() == [3.0, 0.0] * 50
 
 
 def test_the_probability_of_a_random_option_falls_from_1_after_the_warm_up():

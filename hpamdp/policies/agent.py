@@ -137,7 +137,9 @@ class HierarchicalAgent(nn.Module):
         self.frames += batch.numel()
         if self.selector is not None:
             self._set_is_uniform()
-            learned = self._teach_selector(self.selector, batch)
+            self._set_pending(self.selector, batch)
+            decisions = _finished_decisions(batch)
+            learned = self.selector.learn(decisions) if len(decisions) else {}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
@@ -147,15 +149,18 @@ class HierarchicalAgent(nn.Module):
         return scalars
 
     def add_demonstrations(self, batch: TensorDictBase) -> None:
-        """Let the selector learn from a data set `[*B, T]`, if it can, and the learners keep their own transitions."""
+        """Let the selector take a data set `[*B, T]`, if it can, and the learners keep their own transitions."""
         if self.selector is not None and "offline" in self.selector.modes:
-            self._teach_selector(self.selector, batch)
+            self.selector.add_demonstrations(_finished_decisions(batch))
         for _, learner, rows, mask in self._shares(batch):
             learner.add_demonstrations(rows, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Let each learner make updates from its stored transitions; return scalars named `low/...`."""
+        """Let both levels make updates from a data set; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
+        if self.selector is not None:
+            learned = self.selector.update(num_updates)
+            scalars.update({f"high/{name}": value for name, value in learned.items()})
         for i, learner in enumerate(self._learners()):
             learned = learner.update(num_updates)
             scalars.update({f"{self._prefix_of(i)}/{name}": value for name, value in learned.items()})
@@ -189,10 +194,14 @@ class HierarchicalAgent(nn.Module):
         if self.selector is not None:
             self.selector.is_uniform.fill_(self.frames < self.uniform_option_frames)
 
-    def _teach_selector(self, selector: Selector, batch: TensorDictBase) -> dict[str, float]:
-        is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
-        if not is_end.any():
-            return {}
-        # Time first, so that the selector sees the decisions oldest first.
-        decisions = batch.transpose(0, -1)[is_end.transpose(0, -1)]
-        return selector.learn(decisions)
+    def _set_pending(self, selector: Selector, batch: TensorDictBase) -> None:
+        last = batch[..., -1]
+        is_held = ~last.get(("next", keys.IS_DECISION)).squeeze(-1)
+        held = last.get(keys.OPTION)[is_held]
+        selector.pending.copy_(torch.bincount(held, minlength=self.specs.num_options))
+
+
+def _finished_decisions(batch: TensorDictBase) -> TensorDictBase:
+    """Return the last step of every option that ended in a batch `[*B, T]`, `[N]`, oldest first."""
+    is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
+    return batch.transpose(0, -1)[is_end.transpose(0, -1)]

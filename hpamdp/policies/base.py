@@ -78,12 +78,16 @@ class Selector(TensorDictModuleBase):
         is_uniform: bool scalar, a buffer that the agent sets. While it is true, for the first
             `agent.uniform_option_frames` steps of a run, exploring choices come from `choose_uniformly`, so that every
             option's learner gets transitions to learn from.
+        pending: how many decisions for each option have been made whose end `learn` has not yet seen, int64
+            `[num_options]`, a buffer that the agent sets after every batch. A selector that needs the number within a
+            batch adds the choices that it makes.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0
     is_uniform: Tensor
+    pending: Tensor
 
     in_keys: list[NestedKey]
     out_keys: list[NestedKey]
@@ -94,6 +98,7 @@ class Selector(TensorDictModuleBase):
         self.out_keys = [keys.OPTION]
         self.specs = specs
         self.register_buffer("is_uniform", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("pending", torch.zeros(specs.num_options, dtype=torch.long))
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return an option for every environment, int64 `[*B]`.
@@ -116,8 +121,7 @@ class Selector(TensorDictModuleBase):
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first, and return scalars to log as `high/<name>`.
 
-        Called after each collected batch in which an option ended, before the learners learn from the batch, and, with
-        the mode `offline`, once before training with the decisions in the run's data set.
+        Called after each collected batch in which an option ended, before the learners learn from the batch.
 
         A decision is represented by the last step of its option:
 
@@ -129,6 +133,23 @@ class Selector(TensorDictModuleBase):
           whether its episode ended there, too;
 
         `observation`, without `next`, belongs to the option's last step: it is not what the choice was based on.
+        """
+        return {}
+
+    def add_demonstrations(self, decisions: TensorDictBase) -> None:
+        """Learn from the decisions `[N]` of a data set, as in `learn`, or keep them for `update`.
+
+        Called once, before training, on selectors with the mode `offline`. It is not experience: what falls with the
+        decisions that the selector has made, such as its exploration, stays where it is. Override it if `learn` counts
+        them or makes updates.
+        """
+        self.learn(decisions)
+
+    def update(self, num_updates: int) -> dict[str, float]:
+        """Make updates from the decisions of a data set and return scalars to log, averaged over them.
+
+        Called repeatedly with `mode=offline`, in which `learn` is not called, on selectors with the mode `offline`.
+        Those that learn in closed form have nothing left to do.
         """
         return {}
 

@@ -33,14 +33,14 @@ class MetaCritic(Selector):
         device: where the networks live.
         hidden_dims, num_members: of the ensemble.
         exploration: `epsilon`: a random option with a probability that falls linearly from 1 to `epsilon_final` over
-            `epsilon_decisions` after the warm-up. `ucb`: the highest mean + `ucb_width` x standard deviation over the
-            members.
+            the `epsilon_decisions` decisions that end after the warm-up. `ucb`: the highest mean + `ucb_width` x
+            standard deviation over the members.
         epsilon_final, epsilon_decisions, ucb_width: see `exploration`.
         gamma: discount of an environment step, of the options' returns and of what follows them.
         buffer_size: decisions that are stored. Returns change while the learners improve, so old ones mislead.
         batch_size: decisions in an update.
         updates_per_decision, max_updates: updates for each finished decision, and at most in one call of `learn`.
-        warmup_decisions: decisions with random options before the first update.
+        warmup_decisions: decisions with random options before the first update; those of a data set do not count.
         lr: learning rate of Adam.
         tau: step of the target critics towards the learned ones after each update.
     """
@@ -121,10 +121,16 @@ class MetaCritic(Selector):
         if now < self.warmup_decisions:
             return {}
         due = int(now * self.updates_per_decision) - int(before * self.updates_per_decision)
-        losses = [self._update(self.buffer.sample(self.batch_size)) for _ in range(min(due, self.max_updates))]
-        scalars = {"critic": torch.stack(losses).mean().item()} if losses else {}
-        scalars["epsilon"] = self.epsilon
-        return scalars
+        return {**self.update(min(due, self.max_updates)), "epsilon": self.epsilon}
+
+    def add_demonstrations(self, decisions: TensorDictBase) -> None:
+        """Store the decisions; the exploration schedule stays where it is."""
+        self.buffer.extend(self._rows(decisions))
+
+    def update(self, num_updates: int) -> dict[str, float]:
+        """Make updates from the stored decisions."""
+        losses = [self._update(self.buffer.sample(self.batch_size)) for _ in range(num_updates)]
+        return {"critic": torch.stack(losses).mean().item()} if losses else {}
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what is stored of decisions `[N]`."""
