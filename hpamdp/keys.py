@@ -22,6 +22,3 @@ ORACLE_PARAMETERS = ("oracle", "parameters")
 
 # Written by an environment with human data: how often people choose each option; read by the `human` selector.
 HUMAN_OPTION = ("human", "option")
-
-# Written by the agent for a selector that needs it: the value of the state by each option's learner.
-OPTION_VALUES = "option_values"

@@ -71,12 +71,13 @@ def episodes(*lengths: int) -> TensorDict:
     return TensorDict(rows, batch_size=[num])
 
 
-def test_option_sums_start_anew_with_every_episode():
+@pytest.mark.parametrize("gamma", [1.0, 0.9])
+def test_option_sums_start_anew_with_every_episode(gamma):
     rows = episodes(1, 3, 2)
     given = rows.clone()
-    extended = with_option_sums(rows)
+    extended = with_option_sums(rows, gamma)
     reward = rows["next", keys.REWARD].squeeze(-1)
-    expected = torch.cat([part.cumsum(0) for part in reward.split([1, 3, 2])])
+    expected = torch.cat([(gamma ** torch.arange(len(part)) * part).cumsum(0) for part in reward.split([1, 3, 2])])
     torch.testing.assert_close(extended["next", keys.OPTION_RETURN].squeeze(-1), expected)
     assert extended["next", keys.OPTION_STEPS].squeeze(-1).tolist() == [1, 1, 2, 3, 1, 2]
     first = rows[keys.OBSERVATION][[0, 1, 1, 1, 4, 4]]
@@ -99,6 +100,18 @@ def test_demonstrations_hold_the_decisions_that_they_are_given_and_name_missing_
     assert Demonstrations(rows, decisions=decisions).decisions.shape == (1, 2)
     with pytest.raises(DataError, match=r"the decisions lack option, next\.option_return$"):
         Demonstrations(rows, decisions=decisions.exclude(keys.OPTION, ("next", keys.OPTION_RETURN)))
+
+
+def test_demonstrations_are_discounted_as_a_selector_asks():
+    rows = episodes(2, 2)
+    demonstrations = Demonstrations(rows)
+    reward = demonstrations.batch[0]["next", keys.REWARD].squeeze(-1)
+    demonstrations.discount(0.5)
+    total = demonstrations.batch["next", keys.OPTION_RETURN].flatten()
+    torch.testing.assert_close(total[[1, 3]], reward[[0, 2]] + 0.5 * reward[[1, 3]])
+    decisions = with_option_sums(rows)[1::2].set(keys.OPTION, torch.tensor([0, 1]))
+    with pytest.raises(DataError, match=r"known only undiscounted; use 1$"):
+        Demonstrations(rows, decisions=decisions).discount(0.5)
 
 
 def test_demonstrations_name_missing_keys_and_refuse_episodes_out_of_order():

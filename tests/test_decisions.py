@@ -187,7 +187,7 @@ def make_meta_critic() -> MetaCritic:
     torch.manual_seed(0)
     options = dict(
         hidden_dims=[64], num_members=1, exploration="epsilon", epsilon_final=0.2, epsilon_decisions=2000,
-        ucb_width=2.0, gamma=GAMMA, bootstrap=0.0, buffer_size=5000, batch_size=64, updates_per_decision=0.15,
+        ucb_width=2.0, gamma=GAMMA, buffer_size=5000, batch_size=64, updates_per_decision=0.15,
         max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
     )  # fmt: skip
     return MetaCritic(PAMDPSpecs.from_env(Crossing()), torch.device("cpu"), **options)

@@ -21,7 +21,7 @@ from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.run.assemble import assemble
-from hpamdp.run.train import run
+from hpamdp.run.train import Trainer, run
 from hpamdp.specs import PAMDPSpecs
 
 ALL = {"complete": False, "successes": False, "best_people": None, "checksum": None}
@@ -59,12 +59,13 @@ def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, pat
 
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])
 def test_a_selector_learns_from_the_decisions_in_the_data(high, path, tmp_path):
-    parts = assemble(make_config(overrides(path, "iql", high)), tmp_path)
+    words = [*overrides(path, "iql", high), *(["high.memory=all"] if high != "meta_critic" else [])]
+    parts = assemble(make_config(words), tmp_path)
     parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
     num_episodes = len(read(path, checksum=None).episodes)
     selector = parts.agent.selector
     if high in ("ucb", "linucb"):
-        assert selector.statistics.num_decisions == num_episodes
+        assert selector.statistics.counts.sum() == num_episodes
     else:
         assert len(selector.buffer) == num_episodes
 
@@ -98,6 +99,43 @@ def test_selectors_learn_what_every_episode_returned_whatever_becomes_of_its_pre
 def test_where_the_boat_is_given_there_are_no_decisions(path):
     env = BoatDockEnv(controller="congruent")
     assert HumanDemonstrations(env, path=path, rest_to_rest=True, **ALL).decisions is None
+
+
+def test_the_meta_critic_makes_as_many_updates_offline_as_the_learners_and_keeps_its_exploration(path, tmp_path):
+    words = [*overrides(path, "iql", "meta_critic"), "offline.updates=7", "offline.eval_every=0", "high.batch_size=16"]
+    parts = assemble(make_config(words), tmp_path)
+    made = []
+    update = parts.agent.selector._update
+    parts.agent.selector._update = lambda rows: made.append(len(rows)) or update(rows)
+    assert not Trainer(make_config(words), parts, tmp_path).train()
+    assert made == [16] * 7 == [16] * int(parts.agent.learners[0].updates)
+    assert parts.agent.selector.num_decisions == 0 and parts.agent.selector.epsilon == 1.0
+
+
+def test_decisions_of_a_data_set_use_up_no_exploration_of_a_run_that_goes_on_with_its_own(path, tmp_path):
+    words = [f"data.path={path}", "data=human", "data.checksum=null", "low=iql", "eval.layouts=4", "num_envs=4"]
+    for high in ("meta_critic", "epsilon_greedy", "ucb"):
+        parts = assemble(make_config([*words, f"high={high}"]), tmp_path)
+        parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
+        assert parts.agent.selector.num_decisions == 0 and parts.agent.selector.pending.tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("high", ["exp3", "actor"])
+def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(high, path, tmp_path):
+    with pytest.raises(ConfigError) as refusal:
+        assemble(make_config(overrides(path, "iql", high)), tmp_path)
+    assert str(refusal.value) == f"high={high}: learns from its own choices only; use mode=train, or another high"
+
+
+@pytest.mark.parametrize("high", ["exp3", "actor"])
+def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path, tmp_path, no_pictures):
+    words = [f"data.path={path}", "data=human", "data.checksum=null", "low=pdqn", f"high={high}", "eval.layouts=4"]
+    words += ["num_envs=8", "steps_per_batch=4", "total_frames=256", "low.batch_size=16", "eval.every=0"]
+    words += ["high.minibatch_size=8"] if high == "actor" else []
+    assert run(compose_config(words), tmp_path, words) == 0
+    header = (tmp_path / "metrics.csv").read_text().splitlines()[0]
+    assert any(name.startswith("high/") for name in header.split(","))
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 256
 
 
 def test_decision_sums_match_those_of_the_decision_tracker(path):

@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_bandits import CPU, SPECS, by_sign, due, ended, play
 
 from hpamdp import keys
-from hpamdp.policies.high_level.actor import LOG_PROB, Actor
+from hpamdp.policies.high_level.actor import LOG_PROB, WEIGHT, Actor
 from hpamdp.policies.high_level.meta_critic import MetaCritic
 
 OPTIONS = {
@@ -20,7 +20,6 @@ OPTIONS = {
         epsilon_decisions=1000,
         ucb_width=2.0,
         gamma=1.0,
-        bootstrap=0.0,
         buffer_size=4000,
         batch_size=64,
         updates_per_decision=0.1,
@@ -56,13 +55,18 @@ def greedy_regret(selector: MetaCritic | Actor) -> float:
 
 
 def mid_episode(selector: MetaCritic | Actor) -> TensorDict:
-    """Return two decisions of 3 steps with the return 0.7; the episode goes on after the first, but not the second."""
-    decisions = ended(selector(due(torch.tensor([[0.1, 0.2], [0.3, 0.4]]))), torch.tensor([0.7, 0.7]))
+    """Return three decisions of 3 steps with the return 0.7.
+
+    The episode goes on after the first one, terminates with the second and is cut off by its time limit with the third.
+    """
+    observation = torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.2, 0.3]])
+    decisions = ended(selector(due(observation)), torch.full((3,), 0.7))
     after = decisions["next"]
-    after[keys.OBSERVATION] = torch.tensor([[0.5, 0.6], [0.7, 0.8]])
-    after[keys.TERMINATED] = torch.tensor([[False], [True]])
-    after[keys.OPTION_STEPS] = torch.tensor([[3], [3]])
-    decisions[keys.OBSERVATION] = torch.full((2, 2), 9.0)  # at the last step, which nobody should use
+    after[keys.OBSERVATION] = torch.tensor([[0.5, 0.6], [0.7, 0.8], [0.6, 0.7]])
+    after[keys.TERMINATED] = torch.tensor([[False], [True], [False]])
+    after[keys.DONE] = torch.tensor([[False], [True], [True]])
+    after[keys.OPTION_STEPS] = torch.full((3, 1), 3)
+    decisions[keys.OBSERVATION] = torch.full((3, 2), 9.0)  # at the last step, which nobody should use
     return decisions
 
 
@@ -92,43 +96,35 @@ def test_the_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
             layer.bias.normal_()
     decisions = mid_episode(critic)
     rows = critic._rows(decisions)
-    torch.testing.assert_close(rows["discount"], torch.tensor([0.9**3, 0.0]))
-    torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
+    torch.testing.assert_close(rows["discount"], torch.tensor([0.9**3, 0.0, 0.0]))
+    torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.2, 0.3]]))
     q = critic.critics(rows["state"])[0].detach()
     next_value = critic.target_critics(torch.tensor([[0.5, 0.6]]))[0, 0].max().item()
-    targets = [0.7 + 0.9**3 * next_value, 0.7]
+    targets = [0.7 + 0.9**3 * next_value, 0.7, 0.7]
     chosen = decisions[keys.OPTION].tolist()
-    expected = sum((q[i, chosen[i]].item() - targets[i]) ** 2 for i in (0, 1)) / 2
+    expected = sum((q[i, chosen[i]].item() - targets[i]) ** 2 for i in range(3)) / 3
     assert critic._update(rows).item() == pytest.approx(expected, rel=1e-5)
 
 
-def test_without_bootstrap_only_the_chosen_option_has_a_target():
+def test_only_the_chosen_option_has_a_target():
     critic = make(MetaCritic, num_members=1)
-    rows = critic._rows(mid_episode(critic).set(keys.OPTION, torch.tensor([1, 1])))
+    rows = critic._rows(mid_episode(critic).set(keys.OPTION, torch.ones(3, dtype=torch.long)))
     critic._update(rows)
     gradient = critic.critics.layers[-1].bias.grad[0, 0]
     assert gradient[0] == 0.0 and gradient[1] != 0.0
 
 
-@pytest.mark.parametrize("bootstrap", [1.0, 0.5])
-def test_the_learners_values_teach_about_options_that_were_never_chosen(bootstrap):
-    critic = make(MetaCritic, bootstrap=bootstrap, updates_per_decision=0.2)
-    assert critic.needs_values
-    for _ in range(30):
-        root = due(torch.rand(50, 2) * 2 - 1, option=torch.zeros(50, dtype=torch.long))
-        values = by_sign(root[keys.OBSERVATION])
-        reward = torch.full((50,), 100.0) if bootstrap == 1.0 else values[:, 0]
-        critic.learn(ended(root, reward).set(keys.OPTION_VALUES, values))
-    assert greedy_regret(critic) < 0.2
-
-
-def test_targets_mix_returns_and_values_by_the_bootstrap_weight():
-    critic = make(MetaCritic, bootstrap=0.25, num_members=1)
-    decisions = mid_episode(critic).set(keys.OPTION, torch.tensor([1, 0]))[1:]  # the terminated one
-    decisions.set(keys.OPTION_VALUES, torch.tensor([[2.0, 3.0]]))
-    q = critic.critics(torch.tensor([[0.3, 0.4]]))[0, 0].tolist()
-    expected = (q[0] - (0.75 * 0.7 + 0.25 * 2.0)) ** 2 + 0.25 * (q[1] - 3.0) ** 2
-    assert critic._update(critic._rows(decisions)).item() == pytest.approx(expected, rel=1e-5)
+def test_an_option_that_idles_until_the_time_limit_is_worth_what_it_paid():
+    critic, actor = make(MetaCritic, updates_per_decision=1.0, warmup_decisions=0), make(Actor)
+    decisions = ended(due(100, option=torch.tensor([0, 1]).repeat(50)), torch.tensor([3.0, 0.0]).repeat(50))
+    decisions["next", keys.TERMINATED] = torch.tensor([[True], [False]]).repeat(50, 1)
+    for _ in range(5):
+        critic.learn(decisions)
+    assert critic.critics(torch.zeros(1, 2)).mean(0)[0].tolist() == pytest.approx([3.0, 0.0], abs=0.1)
+    with torch.no_grad():
+        actor.critic[-1].bias.fill_(5.0)
+    decisions.update({LOG_PROB: torch.zeros(100), WEIGHT: torch.ones(100)})
+    assert actor._rows(decisions)["target"].tolist() == [3.0, 0.0] * 50
 
 
 def test_the_probability_of_a_random_option_falls_from_1_after_the_warm_up():
@@ -190,8 +186,8 @@ def test_the_targets_of_the_actor_are_discounted_by_the_options_length_and_end_w
     decisions = mid_episode(actor)
     rows = actor._rows(decisions)
     next_value = actor.critic(torch.tensor([[0.5, 0.6]])).item()
-    assert rows["target"].tolist() == pytest.approx([0.7 + 0.9**3 * next_value, 0.7])
-    torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4]]))
+    assert rows["target"].tolist() == pytest.approx([0.7 + 0.9**3 * next_value, 0.7, 0.7])
+    torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.2, 0.3]]))
 
 
 def test_decisions_that_wait_for_an_update_are_part_of_the_state_dict():
@@ -207,6 +203,40 @@ def test_decisions_that_wait_for_an_update_are_part_of_the_state_dict():
         assert one.learn(decisions) and not one.waiting
     for one, two in zip(actor.parameters(), other.parameters(), strict=True):
         torch.testing.assert_close(one, two)
+
+
+def test_uniform_options_are_weighted_by_the_policys_probability_over_the_uniform_one():
+    actor = make(Actor)
+    actor.is_uniform.fill_(True)
+    observation = torch.tensor([[0.5, -0.5]]).expand(20_000, 2)
+    td = actor(due(observation))
+    probability = actor.logits(observation[0]).softmax(-1).detach()
+    assert td[keys.OPTION].float().mean().item() == pytest.approx(0.5, abs=0.015)
+    torch.testing.assert_close(td[LOG_PROB], probability.log()[td[keys.OPTION]])
+    torch.testing.assert_close(td[WEIGHT], (probability / 0.5)[td[keys.OPTION]])
+    actor.is_uniform.fill_(False)
+    assert (actor(due(observation))[WEIGHT] == 1.0).all()
+
+
+def test_actor_settles_on_the_better_options_while_options_are_chosen_uniformly():
+    actor = make(Actor)
+    actor.is_uniform.fill_(True)
+    play(actor, by_sign, 4000, 50, noise=0.5)
+    assert greedy_regret(actor) < 0.2
+    observation = torch.tensor([[0.8, 0.0], [-0.8, 0.0]])
+    assert actor.logits(observation).softmax(-1).amax(-1).min() > 0.9
+
+
+def test_the_value_of_the_actor_is_that_of_its_policy_while_options_are_chosen_uniformly():
+    actor = make(Actor, lr=1e-2)
+    with torch.no_grad():
+        actor.logits[-1].weight.zero_()
+        actor.logits[-1].bias.copy_(torch.tensor([0.0, 2.0]))
+    actor.is_uniform.fill_(True)
+    actor.surrogate = lambda log_ratio, advantage: 0.0 * log_ratio  # so that the policy stays as it is
+    play(actor, lambda observation: torch.tensor([0.0, 1.0]).expand(len(observation), 2), 6000, 100, noise=0.0)
+    likely = torch.tensor([0.0, 2.0]).softmax(-1)[1].item()
+    assert actor.critic(torch.zeros(1, 2)).item() == pytest.approx(likely, abs=0.05)
 
 
 @pytest.mark.parametrize("cls", [MetaCritic, Actor])

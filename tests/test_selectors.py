@@ -28,6 +28,7 @@ from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.policies.shared.fractions import Fraction
 from hpamdp.run.assemble import assemble
+from hpamdp.run.collection.single import SingleCollection
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -144,6 +145,27 @@ def test_a_selector_that_learns_from_its_own_choices_alone_leaves_a_data_set_to_
     agent.add_demonstrations(data_set)
     assert [learner.num_kept for learner in agent.learners] == torch.bincount(data_set[keys.OPTION].flatten()).tolist()
     assert all(torch.equal(value, before[name]) for name, value in selector.named_parameters())
+
+
+@pytest.mark.parametrize("freeze", [False, True])
+def test_pending_decisions_are_those_whose_end_the_selector_has_not_seen(freeze, tmp_path):
+    words = ["high=ucb", "low=random", "num_envs=6", "steps_per_batch=7", "eval.layouts=4", f"low.freeze={freeze}"]
+    config = make_config(words)
+    parts = assemble(config, tmp_path)
+    selector = parts.agent.selector
+    collection = SingleCollection(config, parts)
+    num_made = 0
+    for _ in range(6):
+        batch = collection.next()
+        num_made += batch[keys.IS_DECISION].sum().item()
+        assert selector.num_decisions + selector.pending.sum() == num_made  # as the selector itself counted them
+        parts.agent.learn(batch)
+        goes_on = ~batch["next", keys.IS_DECISION][:, -1].squeeze(-1)
+        held = torch.bincount(batch[keys.OPTION][:, -1][goes_on], minlength=2)
+        assert selector.pending.tolist() == held.tolist()
+        assert selector.num_decisions + held.sum() == num_made
+    collection.close()
+    assert num_made > 12
 
 
 def test_the_example_in_the_documentation_of_selectors_learns_the_better_option():

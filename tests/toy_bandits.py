@@ -51,6 +51,7 @@ def ended(chosen: TensorDict, rewards: Tensor) -> TensorDict:
     after = {
         keys.OBSERVATION: torch.zeros_like(chosen[keys.OBSERVATION]),
         keys.TERMINATED: is_end,
+        keys.DONE: is_end.clone(),
         keys.IS_DECISION: is_end,
         keys.OPTION_RETURN: rewards.unsqueeze(-1),
         keys.OPTION_STEPS: is_end.long(),
@@ -75,6 +76,7 @@ def play(selector: Selector, means: Means, num: int, batch: int = 1, noise: floa
         offered = means(chosen[keys.OBSERVATION])
         earned = offered.gather(-1, chosen[keys.OPTION].unsqueeze(-1)).squeeze(-1)
         selector.learn(ended(chosen, earned + noise * torch.randn(batch)))
+        selector.pending.zero_()  # as the agent does where every option has ended
         options.append(chosen[keys.OPTION])
         regrets.append(offered.amax(-1) - earned)
     return torch.cat(options), torch.cat(regrets)

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -126,17 +126,11 @@ class WholeStep(TensorDictModuleBase):
 
 
 class Stepper(Learner):
-    """Take whole steps, learn nothing, and give each place a fixed value."""
-
-    has_value: ClassVar[bool] = True
+    """Take whole steps and learn nothing."""
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)
         self.policy = WholeStep()
-        self.weight = nn.Parameter(torch.linspace(0.0, 1.0, specs.observation_dim))
-
-    def value(self, observation: Tensor) -> Tensor:
-        return observation @ self.weight
 
 
 def steppers(selector: Selector, specs: PAMDPSpecs) -> HierarchicalAgent:

@@ -31,7 +31,7 @@ _REQUIRED_DECISIONS = (
     ("next", keys.OPTION_RETURN),
     ("next", keys.OPTION_STEPS),
     ("next", keys.OBSERVATION),
-    ("next", keys.TERMINATED),
+    ("next", keys.DONE),
     ("next", keys.IS_DECISION),
 )
 
@@ -50,7 +50,7 @@ class Demonstrations:
         device: where the tensors are kept.
         decisions: `[K]`, for selectors, where more is known of what the options earned than the transitions show: at
             the root `option`, under `next` `decision_observation`, `option_return`, `option_steps`, `observation`,
-            `terminated` and `is_decision`, which is true. None: the decisions in the transitions.
+            `done` and `is_decision`, which is true. None: the decisions in the transitions.
 
     Attributes:
         batch: the transitions `[1, M]`, with the sums that `with_option_sums` adds.
@@ -75,6 +75,18 @@ class Demonstrations:
             _check_keys("decisions", decisions, _REQUIRED_DECISIONS)
             self.decisions = _batch(decisions, device)
 
+    def discount(self, gamma: float) -> None:
+        """Discount the option returns by `gamma` a step, as a selector asks for.
+
+        Raises:
+            DataError: the returns of given decisions are known only as they are.
+        """
+        if gamma == 1.0:
+            return
+        if self.decisions is not None:
+            raise DataError("its decisions' returns are known only undiscounted; use 1")
+        self.batch = with_option_sums(self.batch.squeeze(0), gamma).unsqueeze(0)
+
 
 def _check_keys(what: str, rows: TensorDict, required: Sequence[str | tuple[str, str]]) -> None:
     present = set(rows.keys(True, True))
@@ -92,23 +104,24 @@ def _dotted(name: str | tuple[str, ...]) -> str:
     return name if isinstance(name, str) else ".".join(name)
 
 
-def with_option_sums(transitions: TensorDict) -> TensorDict:
+def with_option_sums(transitions: TensorDict, gamma: float = 1.0) -> TensorDict:
     """Return the transitions with what `DecisionTracker` writes where an option lasts a whole episode.
 
-    Under `next`, `option_return` `[N, 1]` is the sum of the rewards since the episode began, undiscounted,
-    `option_steps` `[N, 1]` the number of these steps, and `decision_observation` `[N, observation_dim]` the episode's
-    first observation.
+    Under `next`, `option_return` `[N, 1]` is the discounted sum of the rewards since the episode began, `option_steps`
+    `[N, 1]` the number of these steps, and `decision_observation` `[N, observation_dim]` the episode's first
+    observation.
 
     Args:
         transitions: `[N]`, one episode after another, with ascending episode numbers under `TRAJECTORY`.
+        gamma: discount of a step.
     """
     episode = transitions[TRAJECTORY]
     first = torch.searchsorted(episode, episode)  # the row in which each row's episode begins
+    option_steps = torch.arange(len(first), device=first.device) - first + 1
     # Double precision, because the sum runs over all episodes before it is taken apart.
-    reward = transitions["next", keys.REWARD].squeeze(-1).double()
+    reward = gamma ** (option_steps - 1).double() * transitions["next", keys.REWARD].squeeze(-1).double()
     total = reward.cumsum(0)
     option_return = total - total[first] + reward[first]
-    option_steps = torch.arange(len(first), device=first.device) - first + 1
     extended = transitions.copy()
     extended["next", keys.OPTION_RETURN] = option_return.float().unsqueeze(-1)
     extended["next", keys.OPTION_STEPS] = option_steps.unsqueeze(-1)

@@ -19,22 +19,25 @@ class OptionChoiceEnv(PAMDPEnv):
     """Choose an option and receive the episode's return: an ordinary environment with one discrete action.
 
     The action is `option` int64 `[N]`. A step plays the episode to its end with the greedy low-level policy and is
-    terminal; its reward is the episode's return, and what it observes is what the episode's last step observed.
+    terminal; its reward is the episode's discounted return, and what it observes is what the episode's last step
+    observed.
 
     Args:
         low_policy: writes the action leaves, given `observation` and `option`.
         env: an environment in which the agent chooses options.
+        gamma: discount of a step of `env`.
 
     Raises:
         ValueError: the environment has no option to choose.
     """
 
-    def __init__(self, low_policy: TensorDictModuleBase, env: PAMDPEnv) -> None:
+    def __init__(self, low_policy: TensorDictModuleBase, env: PAMDPEnv, gamma: float = 1.0) -> None:
         if not env.has_choice:
             raise ValueError("OptionChoiceEnv: the environment has no option to choose")
         super().__init__(device=env.device, batch_size=env.batch_size)
         # In a tuple: as attributes, the modules' parameters would be registered as the environment's own.
         self._wrapped = (low_policy, env)
+        self.gamma = gamma
         self.option_names = env.option_names
         self.parameter_dims = env.parameter_dims
         self.max_steps = 1
@@ -89,9 +92,9 @@ class OptionChoiceEnv(PAMDPEnv):
         total = torch.zeros(*self.batch_size, 1, device=self.device)
         # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-            for _ in range(self._inner_env.max_steps):
+            for step in range(self._inner_env.max_steps):
                 td = self._inner_env._step(self._low_policy(td.set(keys.OPTION, option)))
-                total = total + td.get(keys.REWARD)
+                total = total + self.gamma**step * td.get(keys.REWARD)
                 if td.get(keys.DONE).all():
                     break
         done = torch.ones_like(td.get(keys.DONE))

@@ -21,7 +21,8 @@ class DecisionTracker(Transform):
 
     - `is_decision`, bool: in a step's root, the agent chooses an option at this step; under `next`, the option ended
       with this step.
-    - `option_return`: discounted sum of rewards since the option began, and `option_steps`, its number of steps.
+    - `option_return`: sum of rewards since the option began, discounted by `gamma`, and `option_steps`, its number of
+      steps.
     - `decision_observation` `[*B, observation_dim]`: the observation at which the option was chosen.
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
@@ -31,7 +32,7 @@ class DecisionTracker(Transform):
     Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.
 
     Args:
-        gamma: discount of a step within the option.
+        gamma: discount of an environment step within the option.
         option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode.
     """
 

@@ -131,25 +131,15 @@ class HierarchicalAgent(nn.Module):
         """Return the policy that always holds one option and otherwise acts like this agent."""
         return TensorDictSequential(HeldOption(option), self.router)
 
-    @torch.no_grad()
-    def option_values(self, observation: Tensor) -> Tensor:
-        """Return the value of observations `[B, observation_dim]` under each option's learner, `[B, num_options]`."""
-        if not self.is_shared:
-            return torch.stack([learner.value(observation) for learner in self._learners()], -1)
-        shared = next(self._learners())
-        values = []
-        for one_hot in torch.eye(self.specs.num_options).to(observation):
-            option = one_hot.expand(len(observation), -1)
-            values.append(shared.value(torch.cat([observation, option], -1)))
-        return torch.stack(values, -1)
-
     def learn(self, batch: TensorDictBase) -> dict[str, float]:
         """Let both levels learn from a collected batch `[*B, T]`; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
         self.frames += batch.numel()
         if self.selector is not None:
             self._set_is_uniform()
-            learned = self._teach_selector(self.selector, batch)
+            self._set_pending(self.selector, batch)
+            decisions = _finished_decisions(batch)
+            learned = self.selector.learn(decisions) if len(decisions) else {}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
@@ -166,13 +156,16 @@ class HierarchicalAgent(nn.Module):
             decisions: `[*B, K]` for the selector; None: those in the batch.
         """
         if self.selector is not None and "offline" in self.selector.modes:
-            self._teach_selector(self.selector, batch if decisions is None else decisions)
+            self.selector.add_demonstrations(_finished_decisions(batch if decisions is None else decisions))
         for _, learner, rows, mask in self._shares(batch):
             learner.add_demonstrations(rows, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Let each learner make updates from its stored transitions; return scalars named `low/...`."""
+        """Let both levels make updates from a data set; return scalars named `high/...` and `low/...`."""
         scalars: dict[str, float] = {}
+        if self.selector is not None:
+            learned = self.selector.update(num_updates)
+            scalars.update({f"high/{name}": value for name, value in learned.items()})
         for i, learner in enumerate(self._learners()):
             learned = learner.update(num_updates)
             scalars.update({f"{self._prefix_of(i)}/{name}": value for name, value in learned.items()})
@@ -206,13 +199,14 @@ class HierarchicalAgent(nn.Module):
         if self.selector is not None:
             self.selector.is_uniform.fill_(self.frames < self.uniform_option_frames)
 
-    def _teach_selector(self, selector: Selector, batch: TensorDictBase) -> dict[str, float]:
-        is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
-        if not is_end.any():
-            return {}
-        # Time first, so that the selector sees the decisions oldest first.
-        decisions = batch.transpose(0, -1)[is_end.transpose(0, -1)]
-        if selector.needs_values:
-            decided_at = decisions.get(("next", keys.DECISION_OBSERVATION))
-            decisions.set(keys.OPTION_VALUES, self.option_values(decided_at))
-        return selector.learn(decisions)
+    def _set_pending(self, selector: Selector, batch: TensorDictBase) -> None:
+        last = batch[..., -1]
+        is_held = ~last.get(("next", keys.IS_DECISION)).squeeze(-1)
+        held = last.get(keys.OPTION)[is_held]
+        selector.pending.copy_(torch.bincount(held, minlength=self.specs.num_options))
+
+
+def _finished_decisions(batch: TensorDictBase) -> TensorDictBase:
+    """Return the last step of every option that ended in a batch `[*B, T]`, `[N]`, oldest first."""
+    is_end = batch.get(("next", keys.IS_DECISION)).squeeze(-1)
+    return batch.transpose(0, -1)[is_end.transpose(0, -1)]

@@ -72,23 +72,23 @@ class Selector(TensorDictModuleBase):
             writes more than its observation: with `oracle` its planner's best action for each option (the `ORACLE_`
             keys of `hpamdp.keys`), with `human` the probabilities of the human choices (`HUMAN_OPTION`). Append the
             keys that `select` reads to `in_keys`. Environments without such an argument are refused.
-        needs_values: whether `learn` reads `option_values`, the learners' own estimates of a state. Learners without
-            `has_value` are then refused.
-        gamma: discount of a step, if options may end before their episode (`agent.option_length`): `option_return` is
-            discounted by it, and a selector that bootstraps multiplies what follows by `gamma ** option_steps`.
-            Options that last an episode are not discounted.
+        gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
+            it, and so is the value of the next decision, see `next_discount`.
         modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others
             made. A selector with keys of its own in `out_keys` usually has `train` alone, as a data set lacks them.
         is_uniform: bool scalar, a buffer that the agent sets. While it is true, for the first
             `agent.uniform_option_frames` steps of a run, exploring choices come from `choose_uniformly`, so that every
             option's learner gets transitions to learn from.
+        pending: how many decisions for each option have been made whose end `learn` has not yet seen, int64
+            `[num_options]`, a buffer that the agent sets after every batch. A selector that needs the number within a
+            batch adds the choices that it makes.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
-    needs_values: bool = False
     gamma: float = 1.0
     is_uniform: Tensor
+    pending: Tensor
 
     in_keys: list[NestedKey]
     out_keys: list[NestedKey]
@@ -99,6 +99,7 @@ class Selector(TensorDictModuleBase):
         self.out_keys = [keys.OPTION]
         self.specs = specs
         self.register_buffer("is_uniform", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("pending", torch.zeros(specs.num_options, dtype=torch.long))
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return an option for every environment, int64 `[*B]`.
@@ -121,22 +122,47 @@ class Selector(TensorDictModuleBase):
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first, and return scalars to log as `high/<name>`.
 
-        Called after each collected batch in which an option ended, before the learners learn from the batch, and, with
-        the mode `offline`, once before training with the decisions in the run's data set.
+        Called after each collected batch in which an option ended, before the learners learn from the batch.
 
         A decision is represented by the last step of its option:
 
         - `option` int64 `[N]` and the other `out_keys`, as chosen (a data set holds `option` alone);
         - `("next", "decision_observation")` `[N, observation_dim]`: the observation at the decision;
-        - `("next", "option_return")` `[N, 1]`: the sum of the option's rewards, discounted as described at `gamma`;
+        - `("next", "option_return")` `[N, 1]`: the sum of the option's rewards, discounted by `gamma`;
         - `("next", "option_steps")` int64 `[N, 1]`: how many steps the option took;
-        - `("next", "observation")` `[N, observation_dim]` and `("next", "terminated")` bool `[N, 1]`: where it ended,
-          and whether nothing follows;
-        - `option_values` `[N, num_options]`, if `needs_values`: what each option's learner expects at the decision.
+        - `("next", "observation")` `[N, observation_dim]` and `("next", "done")` bool `[N, 1]`: where it ended, and
+          whether its episode ended there, too;
 
         `observation`, without `next`, belongs to the option's last step: it is not what the choice was based on.
         """
         return {}
+
+    def add_demonstrations(self, decisions: TensorDictBase) -> None:
+        """Learn from the decisions `[N]` of a data set, as in `learn`, or keep them for `update`.
+
+        Called once, before training, on selectors with the mode `offline`. It is not experience: what falls with the
+        decisions that the selector has made, such as its exploration, stays where it is. Override it if `learn` counts
+        them or makes updates.
+        """
+        self.learn(decisions)
+
+    def update(self, num_updates: int) -> dict[str, float]:
+        """Make updates from the decisions of a data set and return scalars to log, averaged over them.
+
+        Called repeatedly with `mode=offline`, in which `learn` is not called, on selectors with the mode `offline`.
+        Those that learn in closed form have nothing left to do.
+        """
+        return {}
+
+    def next_discount(self, decisions: TensorDictBase) -> Tensor:
+        """Return the factor `[N]` of the next decision's value in the target of each of the decisions `[N]`.
+
+        It is `gamma ** option_steps` where an option ended inside its episode. It is 0 where the episode ended, by its
+        time limit, too: otherwise an option that idles until the limit would be worth as much as the best one.
+        """
+        after = decisions.get("next")
+        goes_on = ~after.get(keys.DONE).squeeze(-1)
+        return self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1) * goes_on
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by name: optimisers, replay buffers.
@@ -168,7 +194,6 @@ class Learner(nn.Module):
     - `policy`, which acts;
     - `learn`, to learn from the agent's own transitions;
     - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in `modes`;
-    - `value` and `has_value = True`, if it can estimate the value of a state;
     - `stateful`, if it has optimisers or a replay buffer.
 
     `policies.shared.replay.ReplayLearner` implements `learn`, `add_demonstrations`, `update` and `stateful` for
@@ -197,14 +222,12 @@ class Learner(nn.Module):
         needs: what the environment must reveal beyond its observation, as in `Selector`.
         modes: what the learner can learn from. `train`: transitions that the agent collects (`mode=train`). `offline`:
             a data set (`mode=offline`, or `data=...` with `mode=train`).
-        has_value: whether `value` is implemented.
         progress: the buffers, by the last part of their names, that say how far a run has come: counters of its steps
             and the exploration that follows from them. They begin afresh where a new run takes over the learner.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train",)
-    has_value: ClassVar[bool] = False
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 
     policy: TensorDictModuleBase
@@ -255,10 +278,6 @@ class Learner(nn.Module):
         """
         fresh = {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in self.progress}
         self.load_state_dict({name: fresh.get(name, value) for name, value in state.items()})
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return the expected return from observations `[B, observation_dim]` on, `[B]`; see `has_value`."""
-        raise NotImplementedError
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, as `Selector.stateful` does."""

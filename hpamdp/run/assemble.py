@@ -13,6 +13,7 @@ from torchrl.envs import TransformedEnv
 
 from hpamdp.config import Config, ConfigError, constructor_arguments
 from hpamdp.data.demonstrations import Demonstrations
+from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
@@ -58,9 +59,8 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     check_collector(config, env)
     check_modes(config)
     agent = make_agent(config, PAMDPSpecs.from_env(env), device)
-    check_values(config, agent)
     is_new = config.run.mode != "eval" and config.run.resume is None
-    data = make_data(config, env) if is_new else None
+    data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and config.run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(config.run.low.checkpoint, "low.checkpoint"), agent, device)
     evaluation = make_evaluation(config, env)
@@ -113,9 +113,15 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     return agent.to(device)
 
 
-def make_data(config: Config, env: PAMDPEnv) -> Demonstrations | None:
-    """Build the data set, if there is one."""
+def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | None:
+    """Build the data set, if there is one, with option returns that are discounted by the selector's `gamma`."""
     demonstrations: Demonstrations | None = config.data.build(env=env)
+    if demonstrations is None:
+        return None
+    try:
+        demonstrations.discount(gamma)
+    except DataError as error:
+        raise ConfigError(f"high.gamma={gamma}: {config.data}: {error}") from error
     return demonstrations
 
 
@@ -128,15 +134,19 @@ def make_evaluation(config: Config, env: PAMDPEnv) -> Evaluation:
 
 def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
     """Return the environment to train in, with its decisions tracked, and the policy that acts there."""
-    gamma = 1.0 if agent.selector is None else agent.selector.gamma
+    gamma = _gamma(agent)
     if config.run.low.freeze:
-        return _with_decisions(OptionChoiceEnv(agent.router, env), config, gamma), agent.selector
+        return _with_decisions(OptionChoiceEnv(agent.router, env, gamma), config), agent.selector
     return _with_decisions(env, config, gamma), agent.policy
+
+
+def _gamma(agent: HierarchicalAgent) -> float:
+    return 1.0 if agent.selector is None else agent.selector.gamma
 
 
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
     length = config.run.agent.option_length
-    return with_decisions(env) if length == "episode" else with_decisions(env, gamma, length)
+    return with_decisions(env, gamma, None if length == "episode" else length)
 
 
 def check_choice(config: Config, env: PAMDPEnv) -> None:
@@ -187,18 +197,6 @@ def check_modes(config: Config) -> None:
         raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
     if mode == "offline" and config.run.low.freeze:
         raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
-
-
-def check_values(config: Config, agent: HierarchicalAgent) -> None:
-    """Refuse a selector that needs values of learners that have none.
-
-    Raises:
-        ConfigError: with the settings to change.
-    """
-    if agent.selector is None or not agent.selector.needs_values or agent.learners[0].has_value:
-        return
-    bootstrap = config.high.options.get("bootstrap")
-    raise ConfigError(f"high.bootstrap={bootstrap}: {config.low} has no value of a state; use high.bootstrap=0")
 
 
 def check_collector(config: Config, env: PAMDPEnv) -> None:

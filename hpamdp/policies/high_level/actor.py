@@ -6,7 +6,11 @@ equation 7.
 
 Differs from the sources:
 - options end where the environment or a fixed length says so; their ends are not learned;
-- the advantage is the option's return, bootstrapped if its episode goes on, minus a learned value of the state.
+- decisions with uniform options are weighted by the policy's probability over the uniform one, and the clip is around
+  the policy that they were made beside (the decoupled objective of Hilton, Cobbe and Schulman 2021, *Batch
+  size-invariance for policy optimization*, arXiv 2110.00641);
+- the advantage is the option's return, bootstrapped if its episode goes on, minus a learned value of the state; an
+  episode that a time limit ends does not go on.
 
 TorchRL's `ClipPPOLoss` computes the same loss and gradients, but wants both networks wrapped as tensordict modules and
 takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 times for 256), and H-PPO needs
@@ -15,7 +19,6 @@ takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 ti
 
 from __future__ import annotations
 
-import math
 from typing import ClassVar
 
 import torch
@@ -30,7 +33,9 @@ from hpamdp.policies.shared.networks import mlp, sample_index
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
-LOG_PROB = "option_log_prob"  # of the held option at its decision, float32 [*B]
+# Of the held option at its decision, float32 [*B] each.
+LOG_PROB = "option_log_prob"  # by the policy, also where the option was chosen uniformly
+WEIGHT = "option_weight"  # its probability by the policy over the one with which it was chosen
 
 
 class Actor(OnPolicy, Selector):
@@ -40,7 +45,7 @@ class Actor(OnPolicy, Selector):
         specs: of the problem.
         device: where the networks live.
         hidden_dims: of the policy and of the value.
-        gamma: discount of a step, for options that end before their episode.
+        gamma: discount of an environment step, of the options' returns and of what follows them.
         entropy: weight of the entropy bonus.
         lr: learning rate of Adam.
         epochs, minibatch_size, clip, max_grad_norm: as in `OnPolicy`, whose rows are decisions here.
@@ -63,7 +68,7 @@ class Actor(OnPolicy, Selector):
         max_grad_norm: PositiveFloat,
     ) -> None:
         super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
-        self.out_keys = [*self.out_keys, LOG_PROB]
+        self.out_keys = [*self.out_keys, LOG_PROB, WEIGHT]
         self.gamma = gamma
         self.entropy = entropy
         self.logits = mlp(specs.observation_dim, hidden_dims, specs.num_options)
@@ -73,17 +78,22 @@ class Actor(OnPolicy, Selector):
 
     @torch.no_grad()
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return options (the most likely if the policy is greedy, else samples) and log-probabilities, `[*B]` each."""
+        """Return options, log-probabilities and weights, `[*B]` each.
+
+        The options are the most likely ones if the policy is greedy, else samples.
+        """
         log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
         option = log_probs.argmax(-1) if is_greedy() else sample_index(log_probs)
-        return {keys.OPTION: option, LOG_PROB: log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)}
+        log_prob = log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        return {keys.OPTION: option, LOG_PROB: log_prob, WEIGHT: torch.ones_like(log_prob)}
 
+    @torch.no_grad()
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return uniformly random options and their log-probabilities, `[*B]` each."""
+        """Return uniformly random options, the policy's log-probabilities and the weights, `[*B]` each."""
         chosen = super().choose_uniformly(td)
-        uniform = -math.log(self.specs.num_options)
-        chosen[LOG_PROB] = torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)
-        return chosen
+        log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
+        log_prob = log_probs.gather(-1, chosen[keys.OPTION].unsqueeze(-1)).squeeze(-1)
+        return {**chosen, LOG_PROB: log_prob, WEIGHT: log_prob.exp() * self.specs.num_options}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
@@ -97,14 +107,13 @@ class Actor(OnPolicy, Selector):
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what an update needs of decisions `[N]`; `target` is that of the value."""
         after = decisions.get("next")
-        goes_on = ~after.get(keys.TERMINATED).squeeze(-1)
-        discount = self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1) * goes_on
         next_value = self.critic(after.get(keys.OBSERVATION)).squeeze(-1)
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),
             "option": decisions.get(keys.OPTION),
             "log_prob": decisions.get(LOG_PROB),
-            "target": after.get(keys.OPTION_RETURN).squeeze(-1) + discount * next_value,
+            "weight": decisions.get(WEIGHT),
+            "target": after.get(keys.OPTION_RETURN).squeeze(-1) + self.next_discount(decisions) * next_value,
         }
         return TensorDict(rows, batch_size=decisions.shape)
 
@@ -112,8 +121,8 @@ class Actor(OnPolicy, Selector):
         """Make one update from decisions `[B]`; return scalars to log."""
         log_probs = self.logits(rows["state"]).log_softmax(-1)
         log_prob = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
-        surrogate = self.surrogate(log_prob - rows["log_prob"], rows["advantage"]).mean()
+        surrogate = (rows["weight"] * self.surrogate(log_prob - rows["log_prob"], rows["advantage"])).mean()
         entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
-        critic_loss = (self.critic(rows["state"]).squeeze(-1) - rows["target"]).square().mean()
+        critic_loss = (rows["weight"] * (self.critic(rows["state"]).squeeze(-1) - rows["target"]).square()).mean()
         self.optimizer_step(0.5 * critic_loss - surrogate - self.entropy * entropy)
         return {"critic": critic_loss.detach(), "entropy": entropy.detach()}

@@ -21,7 +21,8 @@ class EpsilonGreedy(Bandit):
 
     Args:
         specs: of the problem.
-        epsilon_scale: epsilon(t) = epsilon_scale / t at decision t, clipped to [`epsilon_final`, 1].
+        epsilon_scale: epsilon(t) = epsilon_scale / t at decision t, clipped to [`epsilon_final`, 1]; t counts the
+            decisions that were made, whether or not their rewards are known.
         epsilon_final: lower bound of epsilon(t); 0 suits stationary rewards.
         memory, discount, window: which rewards count, as in `RewardStatistics`.
     """
@@ -43,7 +44,7 @@ class EpsilonGreedy(Bandit):
     def sample(self, num: int) -> Tensor:
         """Return `num` choices; all are random as long as an option is untried."""
         device = self.statistics.counts.device
-        time = self.statistics.num_decisions + torch.arange(1, num + 1, device=device)
+        time = self.num_decisions + self.pending.sum() + torch.arange(1, num + 1, device=device)
         epsilon = (self.epsilon_scale / time).clamp(self.epsilon_final, 1.0)
         is_random = torch.rand(num, device=device) < epsilon
         anything = torch.randint(self.specs.num_options, (num,), device=device)

@@ -3,8 +3,7 @@
 Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2. Exploration by the upper confidence
 bounds of an ensemble: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
 
-Differs from the sources: the target of an option's return may be mixed with the learners' own values of the state,
-which also exist for the options that were not chosen.
+Differs from the sources: where a time limit ends an episode, nothing follows.
 """
 
 from __future__ import annotations
@@ -34,15 +33,14 @@ class MetaCritic(Selector):
         device: where the networks live.
         hidden_dims, num_members: of the ensemble.
         exploration: `epsilon`: a random option with a probability that falls linearly from 1 to `epsilon_final` over
-            `epsilon_decisions` after the warm-up. `ucb`: the highest mean + `ucb_width` x standard deviation over the
-            members.
+            the `epsilon_decisions` decisions that end after the warm-up. `ucb`: the highest mean + `ucb_width` x
+            standard deviation over the members.
         epsilon_final, epsilon_decisions, ucb_width: see `exploration`.
-        gamma: discount of a step, for options that end before their episode.
-        bootstrap: weight of the learners' own values in the targets; with 0 they are not used.
+        gamma: discount of an environment step, of the options' returns and of what follows them.
         buffer_size: decisions that are stored. Returns change while the learners improve, so old ones mislead.
         batch_size: decisions in an update.
         updates_per_decision, max_updates: updates for each finished decision, and at most in one call of `learn`.
-        warmup_decisions: decisions with random options before the first update.
+        warmup_decisions: decisions with random options before the first update; those of a data set do not count.
         lr: learning rate of Adam.
         tau: step of the target critics towards the learned ones after each update.
     """
@@ -61,7 +59,6 @@ class MetaCritic(Selector):
         epsilon_decisions: NonNegativeInt,
         ucb_width: NonNegativeFloat,
         gamma: PositiveFraction,
-        bootstrap: Fraction,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_decision: PositiveFloat,
@@ -71,9 +68,7 @@ class MetaCritic(Selector):
         tau: PositiveFraction,
     ) -> None:
         super().__init__(specs)
-        self.needs_values = bootstrap > 0.0
         self.gamma = gamma
-        self.bootstrap = bootstrap
         self.exploration = exploration
         self.epsilon_final = epsilon_final
         self.epsilon_decisions = epsilon_decisions
@@ -126,24 +121,27 @@ class MetaCritic(Selector):
         if now < self.warmup_decisions:
             return {}
         due = int(now * self.updates_per_decision) - int(before * self.updates_per_decision)
-        losses = [self._update(self.buffer.sample(self.batch_size)) for _ in range(min(due, self.max_updates))]
-        scalars = {"critic": torch.stack(losses).mean().item()} if losses else {}
-        scalars["epsilon"] = self.epsilon
-        return scalars
+        return {**self.update(min(due, self.max_updates)), "epsilon": self.epsilon}
+
+    def add_demonstrations(self, decisions: TensorDictBase) -> None:
+        """Store the decisions; the exploration schedule stays where it is."""
+        self.buffer.extend(self._rows(decisions))
+
+    def update(self, num_updates: int) -> dict[str, float]:
+        """Make updates from the stored decisions."""
+        losses = [self._update(self.buffer.sample(self.batch_size)) for _ in range(num_updates)]
+        return {"critic": torch.stack(losses).mean().item()} if losses else {}
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what is stored of decisions `[N]`."""
         after = decisions.get("next")
-        goes_on = ~after.get(keys.TERMINATED).squeeze(-1)
         rows = {
             "state": after.get(keys.DECISION_OBSERVATION),
             "option": decisions.get(keys.OPTION),
             "return": after.get(keys.OPTION_RETURN).squeeze(-1),
             "next_state": after.get(keys.OBSERVATION),
-            "discount": self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1) * goes_on,
+            "discount": self.next_discount(decisions),
         }
-        if self.needs_values:
-            rows["values"] = decisions.get(keys.OPTION_VALUES)
         return TensorDict(rows, batch_size=decisions.shape)
 
     def _update(self, rows: TensorDictBase) -> Tensor:
@@ -151,17 +149,11 @@ class MetaCritic(Selector):
         q = self.critics(rows["state"])
         with torch.no_grad():
             next_value = self.target_critics(rows["next_state"]).mean(0).amax(-1)
-            chosen_target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
-            # Weight of each option's error; without bootstrapping only the chosen option has a target.
-            weight = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)
-            target = chosen_target.expand_as(weight)
-            if self.needs_values:
-                mixed = chosen_target.lerp(rows["values"], self.bootstrap)
-                target = torch.where(weight > 0.0, mixed, rows["values"])
-                weight = weight.clamp(min=self.bootstrap)
+            target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
+            is_chosen = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)
             # Each member sees a random half of the decisions, which keeps the members apart.
             is_seen = torch.rand(*q.shape[:2], 1, device=q.device) < 0.5 if len(q) > 1 else 1.0
-        loss = ((q - target).square() * weight * is_seen).sum(-1).mean()
+        loss = ((q - target).square() * is_chosen * is_seen).sum(-1).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()

@@ -6,7 +6,7 @@ Discounted and sliding-window UCB: Garivier and Moulines 2011, arXiv 0805.3415, 
 Differs from the sources:
 - rewards need not lie in [0, 1]: the width is in units of their standard deviation;
 - many environments decide at the same time. They are served one after another, and each choice narrows the width of its
-  option as if its reward were already known; otherwise all of them would choose the same option.
+  option as if its reward were already known, until it is; otherwise all of them would choose the same option.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from hpamdp.specs import PAMDPSpecs
 
 class UCB(Bandit):
     """Choose the option with the highest mean reward + exploration x standard deviation x sqrt(2 ln t / n).
+
+    The mean is that of the known rewards; n counts the choices of the option, and t those of all options, whether or
+    not their rewards are known.
 
     Args:
         specs: of the problem.
@@ -43,12 +46,12 @@ class UCB(Bandit):
     def sample(self, num: int) -> Tensor:
         """Return `num` choices made one after another, in random order."""
         statistics = self.statistics
-        total = statistics.counts.sum()
-        earlier_choices = torch.arange(num, device=statistics.counts.device)
-        counts = statistics.counts.unsqueeze(-1) + earlier_choices
-        width = (2.0 * (total + num).clamp(min=2.0).log() / counts).sqrt()
+        chosen_before = statistics.counts + self.pending
+        earlier_choices = torch.arange(num, device=chosen_before.device)
+        counts = chosen_before.unsqueeze(-1) + earlier_choices
+        width = (2.0 * (chosen_before.sum() + num).clamp(min=2.0).log() / counts).sqrt()
         # The bound of an untried option is infinite; once it is chosen, its mean is taken to be that of all rewards.
-        mean_of_all = statistics.sums.sum() / total.clamp(min=1.0)
+        mean_of_all = statistics.sums.sum() / statistics.counts.sum().clamp(min=1.0)
         means = torch.where(statistics.is_untried, mean_of_all, statistics.means)
         # bounds[i, j] is the bound of option i after j of these choices. It falls with j, so choosing the highest bound
         # `num` times in a row means choosing the `num` highest bounds.

@@ -19,7 +19,7 @@ product.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -72,8 +72,6 @@ class HPPOPolicy(TensorDictModuleBase):
 class HPPO(OnPolicy, Learner):
     """Clipped policy-gradient updates of both actors from the steps just collected."""
 
-    has_value: ClassVar[bool] = True
-
     frames: Tensor
 
     def __init__(
@@ -124,10 +122,6 @@ class HPPO(OnPolicy, Learner):
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return V(s), `[B]`."""
-        return self.critic(observation).squeeze(-1)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import copy
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
@@ -95,8 +95,6 @@ class HSACPolicy(TensorDictModuleBase):
 class HSAC(ReplayLearner):
     """Soft policy iteration over discrete actions and their parameters, from a replay buffer of its own."""
 
-    has_value: ClassVar[bool] = True
-
     policy: HSACPolicy
 
     def __init__(
@@ -157,10 +155,6 @@ class HSAC(ReplayLearner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
             "temperatures": torch.optim.Adam(temperatures, lr=temperature_lr, fused=True),
         }
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return the soft value, `[B]`."""
-        return self.soft_value(self.critics, observation)[0]
 
     def explore(self, frames: int) -> None:
         """Explore with the actor from the end of the warm-up on."""

@@ -145,8 +145,6 @@ class HyARPolicy(TensorDictModuleBase):
 class HyAR(ReplayLearner):
     """TD3 over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
-    has_value: ClassVar[bool] = True
-
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
 
     policy: HyARPolicy
@@ -217,11 +215,6 @@ class HyAR(ReplayLearner):
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return Q of the actor's latent action, `[B]`."""
-        latent = self.actor(observation).tanh()
-        return self.critics(torch.cat([observation, latent], -1)).squeeze(-1).amin(0)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the rows to store, with the latent actions that the actor gave."""

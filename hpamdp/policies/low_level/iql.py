@@ -17,7 +17,7 @@ TorchRL's IQLLoss does not fit: it reads a single action leaf.
 from __future__ import annotations
 
 import copy
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
@@ -34,8 +34,6 @@ from hpamdp.specs import PAMDPSpecs
 
 class IQL(ReplayLearner):
     """Twin critics, a state value and an advantage-weighted policy, from a data set or a replay buffer."""
-
-    has_value: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -23,7 +23,7 @@ the parameters, which come from a network with a target and a loss of its own.
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -105,8 +105,6 @@ class PDQNPolicy(TensorDictModuleBase):
 class PDQN(ReplayLearner):
     """Q-learning over discrete actions and gradient ascent on their parameters, from a replay buffer of its own."""
 
-    has_value: ClassVar[bool] = True
-
     policy: PDQNPolicy
 
     def __init__(
@@ -167,10 +165,6 @@ class PDQN(ReplayLearner):
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return the highest Q at the actor's parameters, `[B]`."""
-        return self.critics(observation, self.actor(observation)).amin(0).amax(-1)
 
     def explore(self, frames: int) -> None:
         """Lower the fraction of random actions."""

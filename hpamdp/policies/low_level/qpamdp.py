@@ -20,7 +20,7 @@ Differs from the source:
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -247,8 +247,6 @@ class QPAMDP(Learner):
     A phase consists of windows of finished episodes: Sarsa updates in every batch, eNAC once at the end of a window.
     """
 
-    has_value: ClassVar[bool] = True
-
     policy: QPAMDPPolicy
     mask: Tensor
     low: Tensor
@@ -322,10 +320,6 @@ class QPAMDP(Learner):
         for name in ("frames", "phase", "window_episodes", "windows", "windows_since_best", "updates"):
             self.register_buffer(name, torch.zeros((), dtype=torch.long))
         self.to(device)
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return the highest value of a discrete action, `[B]`."""
-        return (self.policy.phi(observation) @ self.policy.w.T).amax(-1)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Collect the ranges of the features during the warm-up; then learn what the phase learns, and end it if due.

@@ -15,7 +15,7 @@ TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, wi
 from __future__ import annotations
 
 import copy
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -90,8 +90,6 @@ class TD3BCPolicy(TensorDictModuleBase):
 class TD3BC(ReplayLearner):
     """Q-learning on the data's discrete actions with parameters near the data's, from a data set or a replay buffer."""
 
-    has_value: ClassVar[bool] = True
-
     policy: TD3BCPolicy
     parameter_mask: Tensor
 
@@ -144,11 +142,6 @@ class TD3BC(ReplayLearner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
             "behaviour": torch.optim.Adam(self.behaviour.parameters(), lr=actor_lr, fused=True),
         }
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return the highest Q of the allowed discrete actions at the actor's parameters, `[B]`."""
-        q = self.critics(observation, self.actor(observation)).amin(0)
-        return q.masked_fill(self.policy.is_rare(observation), -torch.inf).amax(-1)
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update critics and behaviour; every `policy_delay` updates, also actor and targets. Return scalars."""

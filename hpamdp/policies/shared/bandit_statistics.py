@@ -34,7 +34,6 @@ class RewardStatistics(nn.Module):
 
     Attributes:
         counts, sums, squares: of each option's rewards, float64 `[num_options]`.
-        num_decisions: how many decisions were added, forgotten ones included.
         recent_options, recent_rewards: of the last decisions, `[window]`, oldest first; the option is -1 where there is
             no decision yet. Empty unless the memory is `sliding_window`.
     """
@@ -42,7 +41,6 @@ class RewardStatistics(nn.Module):
     counts: Tensor
     sums: Tensor
     squares: Tensor
-    num_decisions: Tensor
     recent_options: Tensor
     recent_rewards: Tensor
 
@@ -54,7 +52,6 @@ class RewardStatistics(nn.Module):
         self.register_buffer("counts", torch.zeros(num_options, dtype=torch.float64))
         self.register_buffer("sums", torch.zeros(num_options, dtype=torch.float64))
         self.register_buffer("squares", torch.zeros(num_options, dtype=torch.float64))
-        self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
         size = window if memory == "sliding_window" else 0
         self.register_buffer("recent_options", torch.full((size,), -1, dtype=torch.long))
         self.register_buffer("recent_rewards", torch.zeros(size, dtype=torch.float64))
@@ -85,7 +82,6 @@ class RewardStatistics(nn.Module):
 
     def add(self, options: Tensor, rewards: Tensor) -> None:
         """Add the rewards `[N]` of the options `[N]`, oldest first."""
-        self.num_decisions += len(options)
         rewards = rewards.double()
         if self.memory == "sliding_window":
             size = len(self.recent_options)
@@ -110,11 +106,19 @@ class Bandit(Selector):
     Args:
         specs: of the problem.
         memory, discount, window: which rewards count, as in `RewardStatistics`.
+
+    Attributes:
+        statistics: of the rewards that are known.
+        num_decisions: how many decisions of its own have ended, forgotten ones included; those of a data set do not
+            count. With the `pending` ones they are the decisions that it has made.
     """
+
+    num_decisions: Tensor
 
     def __init__(self, specs: PAMDPSpecs, memory: Memory, discount: float, window: int) -> None:
         super().__init__(specs)
         self.statistics = RewardStatistics(specs.num_options, memory, discount, window)
+        self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
 
     def sample(self, num: int) -> Tensor:
         """Return `num` exploring choices, int64 `[num]`, for decisions that are due at the same time."""
@@ -130,12 +134,19 @@ class Bandit(Selector):
         if is_greedy():
             return torch.full_like(is_decision, self.best(), dtype=torch.long)
         choices = torch.zeros_like(is_decision, dtype=torch.long)
-        choices[is_decision] = self.sample(int(is_decision.sum()))
+        chosen = self.sample(int(is_decision.sum()))
+        self.pending += torch.bincount(chosen, minlength=self.specs.num_options)
+        choices[is_decision] = chosen
         return choices
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the rewards of finished decisions, oldest first; return the mean reward of each option."""
-        rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
-        self.statistics.add(decisions.get(keys.OPTION), rewards)
+        self.num_decisions += len(decisions)
+        self.add_demonstrations(decisions)
         means = self.statistics.means.tolist()
         return {f"reward_{name}": mean for name, mean in zip(self.specs.option_names, means, strict=True)}
+
+    def add_demonstrations(self, decisions: TensorDictBase) -> None:
+        """Add the rewards of decisions, oldest first."""
+        rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1)
+        self.statistics.add(decisions.get(keys.OPTION), rewards)

@@ -19,6 +19,8 @@ class SingleCollection(Collection):
 
     def __init__(self, config: Config, parts: Parts) -> None:
         self.env = parts.env
+        selector = parts.agent.selector
+        pending = None if selector is None else selector.pending.clone()
         self._collector = Collector(
             parts.env,
             parts.policy,
@@ -26,6 +28,8 @@ class SingleCollection(Collection):
             total_frames=-1,
             auto_register_policy_transforms=False,
         )
+        if selector is not None and pending is not None:
+            selector.pending.copy_(pending)  # TorchRL has just tried the policy: those were no decisions
         self._batches = iter(self._collector)
         self._is_idle = True
 
