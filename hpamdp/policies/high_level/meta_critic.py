@@ -20,7 +20,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
+from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.replay import linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -67,7 +67,7 @@ class MetaCritic(Selector):
         updates_per_decision: PositiveFloat,
         max_updates: PositiveInt,
         warmup_decisions: NonNegativeInt,
-        lr: PositiveFloat,
+        lr: LearningRate,
         tau: PositiveFraction,
     ) -> None:
         super().__init__(specs)

@@ -39,7 +39,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel, Prediction
-from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -242,7 +242,7 @@ class DLPA(ReplayLearner):
         form: Form,
         hidden_dims: list[PositiveInt],
         num_members: PositiveInt,
-        lr: PositiveFloat,
+        lr: LearningRate,
         state_weight: PositiveFloat,
         reward_weight: PositiveFloat,
         termination_weight: PositiveFloat,
