@@ -85,6 +85,11 @@ def main() -> None:
             print(help_page(conf))
             return
         _check_groups(arguments.overrides, conf)
+        saved = _saved_choices(arguments, conf)
+        if saved:
+            place = sys.argv.index(arguments.overrides[0])
+            sys.argv[place:place] = saved
+            arguments = _parse()
         _run_hydra(conf, arguments)
     except OverrideParseException as error:
         _exit_with(f"{error.override}: {_GRAMMAR}")
@@ -161,16 +166,49 @@ def _parse() -> argparse.Namespace:
 def _check_groups(words: list[str], conf: Path) -> None:
     """Refuse a choice that is no name, such as `low=3`, on which Hydra ends in a traceback."""
     for override in OverridesParser.create().parse_overrides(words):
-        if not override.key_or_group:
+        if not override.key_or_group or override.key_or_group == "hydra":
             raise ConfigError(f"{override.input_line}: {_GRAMMAR}")
         folder = conf / override.key_or_group
         if not folder.is_dir() or override.is_delete():
             continue
         values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
-        if not all(isinstance(value, str | QuotedString) for value in values):
+        if not all(_is_choice(value) for value in values):
             raise ConfigError(
                 f"{override.input_line}: no such choice; conf/{folder.name} has {', '.join(_choices(folder))}"
             )
+
+
+def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
+    """Return the choices of the run that this one starts from, as words of the command line, without those given."""
+    overrides = OverridesParser.create().parse_overrides(arguments.overrides)
+    values = {o.key_or_group: o.value() for o in overrides if not o.is_sweep_override() and not o.is_delete()}
+    where = "resume" if values.get("resume") else "checkpoint"
+    source = values.get(where)
+    source = source.text if isinstance(source, QuotedString) else source
+    if not isinstance(source, str) or not source or "${" in source:
+        return []
+    if where == "checkpoint" and values.get("mode") != "eval":
+        return []  # which is refused
+    if arguments.multirun:
+        return []  # a job is known by its words
+    from hpamdp.run.resume import saved_choices  # takes seconds, which --help need not wait for
+
+    given = {override.key_or_group for override in overrides}
+    has_own_files = arguments.config_dir is not None or "hydra.searchpath" in given
+    choices = saved_choices(source, where, arguments.overrides)
+    return [
+        f"{group}={name}"
+        for group, name in choices.items()
+        if group not in given and (has_own_files or (conf / group / f"{name}.yaml").is_file())
+    ]
+
+
+def _is_choice(value: object) -> bool:
+    """Return whether the value can name a yaml file in a group's folder, or in a folder there."""
+    if not isinstance(value, str | QuotedString):
+        return False
+    name = value if isinstance(value, str) else value.text
+    return not set(name.split("/")) & {"", "..", "."}
 
 
 def _run_job(cfg: DictConfig, start: str) -> float | None:

@@ -78,6 +78,8 @@ class MetaCritic(Selector):
         self.epsilon_final = epsilon_final
         self.epsilon_decisions = epsilon_decisions
         self.ucb_width = ucb_width
+        if batch_size > buffer_size:
+            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
         self.batch_size = batch_size
         self.updates_per_decision = updates_per_decision
         self.max_updates = max_updates

@@ -105,6 +105,8 @@ class HPPO(OnPolicy, Learner):
             raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
         if not min_scale_final < max_scale:
             raise ValueError(f"min_scale_final={min_scale_final}: must be less than {max_scale=}")
+        if lr_final > lr:
+            raise ValueError(f"lr_final={lr_final}: must be at most {lr=}")
         super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
         self.gamma = gamma
         self.gae_lambda = gae_lambda

@@ -43,6 +43,8 @@ class ReplayLearner(Learner):
         batch_size: int,
         updates_per_frame: float,
     ) -> None:
+        if batch_size > buffer_size:
+            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
         super().__init__(specs)
         self.gamma = gamma
         self.warmup_frames = warmup_frames
