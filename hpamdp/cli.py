@@ -147,6 +147,10 @@ def _parse() -> argparse.Namespace:
     """Read the flags as Hydra will, and refuse what it refuses with a traceback or a page of text."""
 
     def refuse(message: str) -> NoReturn:
+        # argparse takes the settings on one side of a flag for all of them.
+        split = re.fullmatch(r"unrecognized arguments: ([^-].*=.*)", message)
+        if split:
+            raise ConfigError(f"{split.group(1)}: settings on both sides of a flag; write all of them after the flags")
         raise ConfigError(f"{message}; see --help")
 
     parser = get_args_parser()

@@ -32,6 +32,10 @@ MISTAKES = [
     (["~low.tua"], "low.tua: no such option of HyAR (conf/low/hyar.yaml); did you mean tau? It has "),
     (["~low.tau"], "low.tau: missing (HyAR, conf/low/hyar.yaml)"),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
+    # A name that leaves its group.
+    (["low=../env/boatdock"], "low=../env/boatdock: no such choice; conf/low has bc, "),
+    (["env=/etc/passwd"], "env=/etc/passwd: no such choice; conf/env has boatdock, "),
+    (["hydra=null"], "hydra=null: not understood"),
     # An override that isn't one.
     (["high="], "high=: no such choice; conf/high has actor, "),
     (["=3"], "=3: not understood; write GROUP=CHOICE or KEY=VALUE"),
@@ -68,6 +72,7 @@ MISTAKES = [
     (["-m", "low.lrr=1,2"], "low.lrr: no such option of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
     (["-m", "seed=-1"], "seed=-1: seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
     (["-m", "seed=range(1"], "seed=range(1: not understood"),
+    (["seed=1", "-m", "low=random"], "low=random: settings on both sides of a flag; write all of them after the flags"),
 ]
 
 

@@ -165,7 +165,7 @@ def _children(space: spaces.Space) -> dict[int | str, spaces.Space]:
     """Return the entries of a Tuple or Dict; none of another space."""
     if isinstance(space, spaces.Tuple):
         return dict(enumerate(space.spaces))
-    return dict(space.spaces) if isinstance(space, spaces.Dict) else {}
+    return {**space.spaces} if isinstance(space, spaces.Dict) else {}
 
 
 def _leaves(space: spaces.Space) -> Iterator[tuple[tuple[int | str, ...], spaces.Space]]:
