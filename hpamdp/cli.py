@@ -36,6 +36,8 @@ _EXTRAS = {
     "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
     "hydra/sweeper": {"optuna": "optuna"},
 }
+# What Hydra raises for a wrong command line or yaml file.
+_BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UnicodeDecodeError)
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
 
 _HELP = """\
@@ -117,11 +119,13 @@ def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
         if isinstance(error, RuntimeError) and "srun" in str(error):  # which submitit looks for
             raise ConfigError(f"hydra/launcher=submitit_slurm: {error}") from error
         # Once a job has started, such errors are not about the command line.
-        if not has_started and isinstance(error, HydraException | OmegaConfBaseException | yaml.YAMLError | OSError):
+        if not has_started and isinstance(error, _BEFORE_A_JOB):
             raise ConfigError(_explain(error, conf, arguments)) from error
         raise
     if sweep.has_begun(start):
         sys.exit(sweep.report(start))
+    if arguments.multirun:
+        raise ConfigError(f"{' '.join(arguments.overrides)}: stands for no job; see that no sweep is empty")
 
 
 def help_page(conf: Path) -> str:
@@ -267,6 +271,8 @@ def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str
         return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted(error.options))}"
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
+    if isinstance(error, UnicodeDecodeError):
+        return f"a yaml file that was chosen is not written in UTF-8 ({error})"
     overrides = OverridesParser.create().parse_overrides(arguments.overrides)
     for override in overrides:
         if override.is_sweep_override() and not arguments.multirun:
@@ -281,9 +287,11 @@ def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
 
 
 def _first_lines(error: Exception) -> str:
-    """Return the first line of an error and that of its cause."""
+    """Return the first line of an error, the next one where it announces one, and the first line of its cause."""
     causes = [error] if error.__cause__ is None else [error, error.__cause__]
     lines = [first_line(cause).rstrip(".") for cause in causes]
+    if lines[0].endswith(":"):
+        lines[:1] = [lines[0].rstrip(":"), first_line(str(error).partition("\n")[2])]
     return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
 
 

@@ -71,6 +71,7 @@ MISTAKES = [
     ),
     (["-m", "low.lrr=1,2"], "low.lrr: no such option of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
     (["-m", "seed=-1"], "seed=-1: seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
+    (["-m", "seed=range(0,0)"], "seed=range(0,0): stands for no job"),
     (["-m", "seed=range(1"], "seed=range(1: not understood"),
     (["seed=1", "-m", "low=random"], "low=random: settings on both sides of a flag; write all of them after the flags"),
 ]
@@ -90,6 +91,22 @@ def test_a_broken_yaml_is_named_with_the_line(command, tmp_path):
     code, _, err = command("--config-dir", str(tmp_path / "mine"), "experiment=broken")
     assert code == 2 and err.count("\n") == 1
     assert "broken.yaml, line 3: " in err
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        (b"\xff\xfe\x00", "a yaml file that was chosen is not written in UTF-8 ("),
+        (b"- 1\n- 2\n", "Cannot merge DictConfig with ListConfig"),
+        (b"", "env: nothing chosen; set env=NAME"),
+        (b"_target_: collections.OrderedDict\n", "env=mine: OrderedDict is no PAMDPEnv (hpamdp.env.base)"),
+    ],
+)
+def test_a_yaml_that_is_none_or_of_something_else_is_told_in_one_line(content, line, command, tmp_path):
+    (tmp_path / "mine/env").mkdir(parents=True)
+    (tmp_path / "mine/env/mine.yaml").write_bytes(content)
+    code, _, err = command("--config-dir", str(tmp_path / "mine"), "env=mine")
+    assert code == 2 and err.count("\n") == 1 and line in err
 
 
 def test_a_refused_run_leaves_no_folder_behind(command, tmp_path):

@@ -192,7 +192,8 @@ def check_run_memory(config: Config, device: torch.device) -> None:
 def check_agent_memory(config: Config, specs: PAMDPSpecs, device: torch.device) -> None:
     """Refuse replay buffers, batches and layers that there is no memory for, before any of them is built.
 
-    They are known by the names of their options: `buffer_size`, `batch_size`, `hidden_dims` and `..._hidden_dims`.
+    They are known by the names of their options: `buffer_size`, `batch_size`, `minibatch_size` and those
+    that end in `hidden_dims`.
 
     Raises:
         ConfigError: with the bytes that are surely needed.
@@ -206,7 +207,7 @@ def check_agent_memory(config: Config, specs: PAMDPSpecs, device: torch.device) 
             setting = f"{component.group}.{name}={value}"
             if name == "buffer_size":
                 needs[setting] = num * value * row
-            elif name == "batch_size":
+            elif name in ("batch_size", "minibatch_size"):
                 needs[setting] = value * row
             elif name.endswith("hidden_dims"):
                 sizes = [specs.observation_dim, *value]
@@ -275,7 +276,7 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
 
 
 def check_modes(config: Config) -> None:
-    """Refuse a learner that cannot learn from what the run has: its own steps, a data set or both.
+    """Refuse a learner that cannot learn from what the run has: its own steps, batches of them, a data set or both.
 
     Raises:
         ConfigError: with the settings to change.
@@ -292,6 +293,12 @@ def check_modes(config: Config) -> None:
         raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
     if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
         raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
+    n_step = config.low.options.get("n_step", 1)
+    if mode == "train" and n_step > config.run.steps_per_batch:
+        raise ConfigError(
+            f"low.n_step={n_step}: must be at most steps_per_batch={config.run.steps_per_batch}, as sums of rewards "
+            "end with a batch"
+        )
     if mode == "offline" and config.run.low.freeze:
         raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
 

@@ -96,6 +96,11 @@ class Planner:
     ) -> None:
         if num_elites > num_samples:
             raise ValueError(f"num_elites={num_elites}, but must be at most num_samples={num_samples}")
+        if horizon * num_samples * num_iterations > 1e9:
+            raise ValueError(
+                f"horizon={horizon}, num_samples={num_samples}, num_iterations={num_iterations}: a plan would try more "
+                "than 1,000,000,000 actions"
+            )
         self.model = model
         self.specs = specs
         self.horizon = horizon

@@ -297,6 +297,8 @@ class QPAMDP(Learner):
                 raise ValueError(f"features={features}: name some of the observation's entries 0 to {last}; null: all")
             if len(set(features)) < len(features):
                 raise ValueError(f"features={features}: names an entry twice")
+        if sigma_final > sigma:
+            raise ValueError(f"sigma_final={sigma_final}: must be at most {sigma=}")
         for basis, order, max_coupled in (("phi", phi_order, phi_max_coupled), ("psi", psi_order, psi_max_coupled)):
             num = num_fourier_features(1 if features is None else len(features), order, max_coupled)
             if num > MAX_FEATURES:
