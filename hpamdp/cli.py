@@ -271,8 +271,6 @@ def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str
         return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted(error.options))}"
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
-    if isinstance(error, UnicodeDecodeError):
-        return f"a yaml file that was chosen is not written in UTF-8 ({error})"
     overrides = OverridesParser.create().parse_overrides(arguments.overrides)
     for override in overrides:
         if override.is_sweep_override() and not arguments.multirun:
@@ -288,6 +286,8 @@ def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
 
 def _first_lines(error: Exception) -> str:
     """Return the first line of an error, the next one where it announces one, and the first line of its cause."""
+    if isinstance(error, UnicodeDecodeError):  # which does not name the file
+        return f"a yaml file that was chosen is not written in UTF-8 ({error})"
     causes = [error] if error.__cause__ is None else [error, error.__cause__]
     lines = [first_line(cause).rstrip(".") for cause in causes]
     if lines[0].endswith(":"):
