@@ -163,9 +163,12 @@ class RunningStatistics(RunningMeanStd):
 
 def _children(space: spaces.Space) -> dict[int | str, spaces.Space]:
     """Return the entries of a Tuple or Dict; none of another space."""
+    children: dict[int | str, spaces.Space] = {}
     if isinstance(space, spaces.Tuple):
-        return dict(enumerate(space.spaces))
-    return {**space.spaces} if isinstance(space, spaces.Dict) else {}
+        children.update(enumerate(space.spaces))
+    elif isinstance(space, spaces.Dict):
+        children.update(space.spaces.items())
+    return children
 
 
 def _leaves(space: spaces.Space) -> Iterator[tuple[tuple[int | str, ...], spaces.Space]]:
