@@ -271,6 +271,8 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     names = chosen_names(cfg) if choices is None else choices
     for group in GROUPS:
         if cfg.get(group) is None or _TARGET not in cfg[group]:
+            if names.get(group) is not None:
+                raise ConfigError(f"{group}={names[group]}: {_file(group, names[group])} names no class as {_TARGET}")
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
     own = cfg.copy()
     OmegaConf.set_struct(own, False)

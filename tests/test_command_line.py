@@ -94,18 +94,19 @@ def test_a_broken_yaml_is_named_with_the_line(command, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("content", "line"),
+    ("group", "content", "line"),
     [
-        (b"\xff\xfe\x00", "a yaml file that was chosen is not written in UTF-8 ("),
-        (b"- 1\n- 2\n", "Cannot merge DictConfig with ListConfig"),
-        (b"", "env: nothing chosen; set env=NAME"),
-        (b"_target_: collections.OrderedDict\n", "env=mine: OrderedDict is no PAMDPEnv (hpamdp.env.base)"),
+        ("env", b"\xff\xfe\x00", "a yaml file that was chosen is not written in UTF-8 ("),
+        ("env", b"- 1\n- 2\n", "env=mine: conf/env/mine.yaml names no class as _target_"),
+        ("low", b"- 1\n- 2\n", "Cannot merge DictConfig with ListConfig"),
+        ("high", b"", "high=mine: conf/high/mine.yaml names no class as _target_"),
+        ("env", b"_target_: collections.OrderedDict\n", "env=mine: OrderedDict is no PAMDPEnv (hpamdp.env.base)"),
     ],
 )
-def test_a_yaml_that_is_none_or_of_something_else_is_told_in_one_line(content, line, command, tmp_path):
-    (tmp_path / "mine/env").mkdir(parents=True)
-    (tmp_path / "mine/env/mine.yaml").write_bytes(content)
-    code, _, err = command("--config-dir", str(tmp_path / "mine"), "env=mine")
+def test_a_yaml_that_is_none_or_of_something_else_is_told_in_one_line(group, content, line, command, tmp_path):
+    (tmp_path / "mine" / group).mkdir(parents=True)
+    (tmp_path / "mine" / group / "mine.yaml").write_bytes(content)
+    code, _, err = command("--config-dir", str(tmp_path / "mine"), f"{group}=mine")
     assert code == 2 and err.count("\n") == 1 and line in err
 
 
