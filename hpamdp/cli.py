@@ -36,6 +36,8 @@ _EXTRAS = {
     "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
     "hydra/sweeper": {"optuna": "optuna"},
 }
+# What Hydra raises for a wrong command line or yaml file.
+_BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UnicodeDecodeError)
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
 
 _HELP = """\
@@ -85,6 +87,11 @@ def main() -> None:
             print(help_page(conf))
             return
         _check_groups(arguments.overrides, conf)
+        saved = _saved_choices(arguments, conf)
+        if saved:
+            place = sys.argv.index(arguments.overrides[0])
+            sys.argv[place:place] = saved
+            arguments = _parse()
         _run_hydra(conf, arguments)
     except OverrideParseException as error:
         _exit_with(f"{error.override}: {_GRAMMAR}")
@@ -112,11 +119,13 @@ def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
         if isinstance(error, RuntimeError) and "srun" in str(error):  # which submitit looks for
             raise ConfigError(f"hydra/launcher=submitit_slurm: {error}") from error
         # Once a job has started, such errors are not about the command line.
-        if not has_started and isinstance(error, HydraException | OmegaConfBaseException | yaml.YAMLError | OSError):
+        if not has_started and isinstance(error, _BEFORE_A_JOB):
             raise ConfigError(_explain(error, conf, arguments)) from error
         raise
     if sweep.has_begun(start):
         sys.exit(sweep.report(start))
+    if arguments.multirun:
+        raise ConfigError(f"{' '.join(arguments.overrides)}: stands for no job; see that no sweep is empty")
 
 
 def help_page(conf: Path) -> str:
@@ -142,6 +151,10 @@ def _parse() -> argparse.Namespace:
     """Read the flags as Hydra will, and refuse what it refuses with a traceback or a page of text."""
 
     def refuse(message: str) -> NoReturn:
+        # argparse takes the settings on one side of a flag for all of them.
+        split = re.fullmatch(r"unrecognized arguments: ([^-].*=.*)", message)
+        if split:
+            raise ConfigError(f"{split.group(1)}: settings on both sides of a flag; write all of them after the flags")
         raise ConfigError(f"{message}; see --help")
 
     parser = get_args_parser()
@@ -161,16 +174,49 @@ def _parse() -> argparse.Namespace:
 def _check_groups(words: list[str], conf: Path) -> None:
     """Refuse a choice that is no name, such as `low=3`, on which Hydra ends in a traceback."""
     for override in OverridesParser.create().parse_overrides(words):
-        if not override.key_or_group:
+        if not override.key_or_group or override.key_or_group == "hydra":
             raise ConfigError(f"{override.input_line}: {_GRAMMAR}")
         folder = conf / override.key_or_group
         if not folder.is_dir() or override.is_delete():
             continue
         values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
-        if not all(isinstance(value, str | QuotedString) for value in values):
+        if not all(_is_choice(value) for value in values):
             raise ConfigError(
                 f"{override.input_line}: no such choice; conf/{folder.name} has {', '.join(_choices(folder))}"
             )
+
+
+def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
+    """Return the choices of the run that this one starts from, as words of the command line, without those given."""
+    overrides = OverridesParser.create().parse_overrides(arguments.overrides)
+    values = {o.key_or_group: o.value() for o in overrides if not o.is_sweep_override() and not o.is_delete()}
+    where = "resume" if values.get("resume") else "checkpoint"
+    source = values.get(where)
+    source = source.text if isinstance(source, QuotedString) else source
+    if not isinstance(source, str) or not source or "${" in source:
+        return []
+    if where == "checkpoint" and values.get("mode") != "eval":
+        return []  # which is refused
+    if arguments.multirun:
+        return []  # a job is known by its words
+    from hpamdp.run.resume import saved_choices  # takes seconds, which --help need not wait for
+
+    given = {override.key_or_group for override in overrides}
+    has_own_files = arguments.config_dir is not None or "hydra.searchpath" in given
+    choices = saved_choices(source, where, arguments.overrides)
+    return [
+        f"{group}={name}"
+        for group, name in choices.items()
+        if group not in given and (has_own_files or (conf / group / f"{name}.yaml").is_file())
+    ]
+
+
+def _is_choice(value: object) -> bool:
+    """Return whether the value can name a yaml file in a group's folder, or in a folder there."""
+    if not isinstance(value, str | QuotedString):
+        return False
+    name = value if isinstance(value, str) else value.text
+    return not set(name.split("/")) & {"", "..", "."}
 
 
 def _run_job(cfg: DictConfig, start: str) -> float | None:
@@ -239,9 +285,13 @@ def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
 
 
 def _first_lines(error: Exception) -> str:
-    """Return the first line of an error and that of its cause."""
+    """Return the first line of an error, the next one where it announces one, and the first line of its cause."""
+    if isinstance(error, UnicodeDecodeError):  # which does not name the file
+        return f"a yaml file that was chosen is not written in UTF-8 ({error})"
     causes = [error] if error.__cause__ is None else [error, error.__cause__]
     lines = [first_line(cause).rstrip(".") for cause in causes]
+    if lines[0].endswith(":"):
+        lines[:1] = [lines[0].rstrip(":"), first_line(str(error).partition("\n")[2])]
     return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
 
 

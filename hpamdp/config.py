@@ -34,6 +34,7 @@ from pydantic import (
     create_model,
 )
 
+from hpamdp.memory import is_about_memory
 from hpamdp.messages import first_line
 
 if TYPE_CHECKING:
@@ -52,6 +53,9 @@ RUN_FILE = "conf/config.yaml"
 
 _CAN_BE_NONE = ("high", "data")
 _TARGET = "_target_"
+_MOST_COMPLAINTS = 3
+# Larger numbers leave those that a computation can hold; infinity is refused as well.
+_LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
 # Entries of a learner's yaml that are not options of its class.
 _NO_OPTIONS = ("budget", "checkpoint", "freeze")
 
@@ -107,6 +111,17 @@ class StartConfig(BaseModel):
 
     checkpoint: str | None
     freeze: bool
+
+
+class BudgetConfig(BaseModel):
+    """What a learner's yaml recommends; the values of a run take what is there."""
+
+    model_config = _STRICT
+
+    num_envs: PositiveInt | None = None
+    steps_per_batch: PositiveInt | None = None
+    total_frames: PositiveInt | None = None
+    eval_every: NonNegativeInt | None = None
 
 
 class RunConfig(BaseModel):
@@ -187,7 +202,7 @@ class Component:
             context: what the program supplies; each goes to a constructor that has an argument of that name.
 
         Raises:
-            ConfigError: the constructor refuses its arguments with a ValueError.
+            ConfigError: the constructor refuses its arguments with a ValueError, or memory does not suffice.
         """
         if self.cls is None:
             return None
@@ -200,6 +215,16 @@ class Component:
                 raise
             file = _file(self.group, self.name)
             raise ConfigError(f"{self.group}: {first_line(error)} ({self.cls.__name__}, {file})") from error
+        except Exception as error:
+            if not is_about_memory(error):
+                raise
+            raise ConfigError(f"{self.largest_sizes()}: takes more memory than there is") from error
+
+    def largest_sizes(self) -> str:
+        """Return in words the options that may have made this component too large."""
+        sizes = {name: value for name, value in self.options.items() if _is_size(value)}
+        largest = sorted(sizes, key=lambda name: _size(sizes[name]))[-2:]
+        return ", ".join(f"{self.group}.{name}={_as_json(sizes[name])}" for name in reversed(largest)) or str(self)
 
 
 @dataclass(frozen=True)
@@ -246,6 +271,8 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     names = chosen_names(cfg) if choices is None else choices
     for group in GROUPS:
         if cfg.get(group) is None or _TARGET not in cfg[group]:
+            if names.get(group) is not None:
+                raise ConfigError(f"{group}={names[group]}: {_file(group, names[group])} names no class as {_TARGET}")
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
     own = cfg.copy()
     OmegaConf.set_struct(own, False)
@@ -254,6 +281,12 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     values = {name: value for name, value in plain.items() if name not in GROUPS}
     values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
+    if "budget" in plain["low"]:
+        file = _file("low", names["low"])
+        budget = plain["low"]["budget"]
+        if not isinstance(budget, dict):
+            raise ConfigError(f"low.budget={_as_json(budget)}: must be a mapping ({file})")
+        _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
     return Config(run, **{group: component(group, names[group], plain[group]) for group in GROUPS})
 
@@ -420,7 +453,7 @@ def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what
     """Return the values as the model; an error names `what` they are and `where` they are set."""
     try:
         # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
-        return model.model_validate_json(json.dumps(values, default=str))
+        checked = model.model_validate_json(json.dumps(values, default=str))
     except ValidationError as error:
         unknown: list[str] = []
         wrong: dict[str, dict[str, None]] = {}
@@ -433,11 +466,48 @@ def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what
                 wrong[key] = {"missing": None}
             else:
                 message = problem["msg"].removeprefix("Value error, ").replace("valid array", "list")
+                message = message.replace("an object", "a mapping").replace(" or None", " or null")
+                message = message.removesuffix(f" after validation, not {_length(value)}")
                 message = re.sub("^(Input|String|List) should", "must", message)
                 # A union complains once for each of its types.
                 wrong.setdefault(f"{key}={_as_json(value)}", {})[message] = None
         complaints = [f"{key}: {' or '.join(messages)} ({where})" for key, messages in wrong.items()]
-        raise ConfigError("; ".join([*unknown, *complaints])) from error
+        raise ConfigError("; ".join([*_shortened(unknown), *complaints])) from error
+    _refuse_huge(model, values, prefix, where)
+    return checked
+
+
+def _length(value: Any) -> int | None:
+    return len(value) if isinstance(value, list) else None
+
+
+def _shortened(complaints: list[str]) -> list[str]:
+    """Return the first complaints, and how many more there are: options of another class may all be wrong."""
+    num_more = len(complaints) - _MOST_COMPLAINTS
+    return complaints if num_more <= 0 else [*complaints[:_MOST_COMPLAINTS], f"and {num_more} more like this"]
+
+
+def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: str) -> None:
+    """Refuse numbers that no computation can hold, in a model's own fields and in lists there."""
+    for name in model.model_fields:
+        value = values.get(name)
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, bool) or not isinstance(number, int | float):
+                continue
+            largest = _LARGEST_INT if isinstance(number, int) else _LARGEST_FLOAT
+            if abs(number) > largest:
+                raise ConfigError(
+                    f"{prefix}{name}={_as_json(value)}: must lie between -{largest} and {largest} ({where})"
+                )
+
+
+def _is_size(value: Any) -> bool:
+    numbers = value if isinstance(value, list | tuple) else [value]
+    return bool(numbers) and all(isinstance(number, int) and not isinstance(number, bool) for number in numbers)
+
+
+def _size(value: Any) -> int:
+    return max(value) if isinstance(value, list | tuple) else value
 
 
 def _locate(location: tuple[int | str, ...], values: dict[str, Any]) -> tuple[list[str], Any]:

@@ -268,7 +268,9 @@ BAD_ARGUMENTS = [
     {"motor_noise": -0.1},
     {"motor_noise": [0.1, 0.2, 0.3]},
     {"motor_noise": [0.1, math.nan]},
+    {"motor_noise": 1e30},
     {"sensor_noise": math.inf},
+    {"sensor_noise": 1e30},
     {"num_envs": 0},
 ]
 
@@ -277,3 +279,26 @@ BAD_ARGUMENTS = [
 def test_an_invalid_argument_is_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         BoatDockEnv(**arguments)
+
+
+@pytest.mark.parametrize("name", ["new", "seeded anew"])
+def test_a_step_before_the_reset_is_refused(name):
+    env = BoatDockEnv(2, controller="congruent")
+    if name == "seeded anew":
+        env.reset()
+        env.set_seed(1)
+    with pytest.raises(RuntimeError, match="call reset before step"):
+        press(env, [0, 1], 0.5)
+
+
+def test_float64_durations_leave_rewards_and_observations_float32():
+    env, doubled = (BoatDockEnv(2, controller="congruent") for _ in range(2))
+    env.reset()
+    doubled.reset()
+    single = action([0, 1], 0.5)
+    expected = env.step(single.clone())["next"]
+    single[keys.PARAMETERS] = single[keys.PARAMETERS].double()
+    following = doubled.step(single)["next"]
+    for leaf in (keys.OBSERVATION, keys.REWARD):
+        assert following[leaf].dtype == torch.float32
+        assert torch.equal(following[leaf], expected[leaf])

@@ -32,6 +32,10 @@ MISTAKES = [
     (["~low.tua"], "low.tua: no such option of HyAR (conf/low/hyar.yaml); did you mean tau? It has "),
     (["~low.tau"], "low.tau: missing (HyAR, conf/low/hyar.yaml)"),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
+    # A name that leaves its group.
+    (["low=../env/boatdock"], "low=../env/boatdock: no such choice; conf/low has bc, "),
+    (["env=/etc/passwd"], "env=/etc/passwd: no such choice; conf/env has boatdock, "),
+    (["hydra=null"], "hydra=null: not understood"),
     # An override that isn't one.
     (["high="], "high=: no such choice; conf/high has actor, "),
     (["=3"], "=3: not understood; write GROUP=CHOICE or KEY=VALUE"),
@@ -67,7 +71,9 @@ MISTAKES = [
     ),
     (["-m", "low.lrr=1,2"], "low.lrr: no such option of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
     (["-m", "seed=-1"], "seed=-1: seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
+    (["-m", "seed=range(0,0)"], "seed=range(0,0): stands for no job"),
     (["-m", "seed=range(1"], "seed=range(1: not understood"),
+    (["seed=1", "-m", "low=random"], "low=random: settings on both sides of a flag; write all of them after the flags"),
 ]
 
 
@@ -85,6 +91,23 @@ def test_a_broken_yaml_is_named_with_the_line(command, tmp_path):
     code, _, err = command("--config-dir", str(tmp_path / "mine"), "experiment=broken")
     assert code == 2 and err.count("\n") == 1
     assert "broken.yaml, line 3: " in err
+
+
+@pytest.mark.parametrize(
+    ("group", "content", "line"),
+    [
+        ("env", b"\xff\xfe\x00", "a yaml file that was chosen is not written in UTF-8 ("),
+        ("env", b"- 1\n- 2\n", "env=mine: conf/env/mine.yaml names no class as _target_"),
+        ("low", b"- 1\n- 2\n", "Cannot merge DictConfig with ListConfig"),
+        ("high", b"", "high=mine: conf/high/mine.yaml names no class as _target_"),
+        ("env", b"_target_: collections.OrderedDict\n", "env=mine: OrderedDict is no PAMDPEnv (hpamdp.env.base)"),
+    ],
+)
+def test_a_yaml_that_is_none_or_of_something_else_is_told_in_one_line(group, content, line, command, tmp_path):
+    (tmp_path / "mine" / group).mkdir(parents=True)
+    (tmp_path / "mine" / group / "mine.yaml").write_bytes(content)
+    code, _, err = command("--config-dir", str(tmp_path / "mine"), f"{group}=mine")
+    assert code == 2 and err.count("\n") == 1 and line in err
 
 
 def test_a_refused_run_leaves_no_folder_behind(command, tmp_path):

@@ -5,10 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from conftest import compose_config
+from gymnasium import spaces
 from gymnasium_players import make, step
 from torchrl.envs.utils import check_env_specs
 
+from hpamdp.config import ConfigError
+from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.run.train import run
 
 
 def test_observations_of_nested_spaces_are_one_vector():
@@ -85,3 +91,48 @@ def test_an_environment_for_evaluation_follows_the_statistics_without_updating_t
     make().set_scaling_from(make())
     with pytest.raises(ValueError, match="scaling can be shared only"):
         make().set_scaling_from(training)
+
+
+def test_an_entry_outside_its_space_is_named_with_the_setting_that_leaves_it_out():
+    env = GymnasiumEnv(2, entry_point="toy_environments:OldGoal", kwargs={"tick": 198}, max_steps=9)
+    assert env.reset()["observation"].shape == (2, 217)
+    with pytest.raises(ProblemError) as raised:
+        env.rollout(5)
+    line = "OldGoal: environment 0: gave an observation whose entry 1 is 200, outside Discrete(200); "
+    assert str(raised.value).endswith(f"{line}env.observation_keys=[0] leaves the entry out")
+
+
+@pytest.mark.parametrize("value", [-1, 4, 1.5, "a"])
+def test_no_value_outside_a_discrete_space_is_made_one_hot(value):
+    space = ObservationSpace(spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(3, start=1)), "none")
+    with pytest.raises(ValueError, match="entry b is"):
+        space.flat({"a": np.zeros(2), "b": value})
+    assert space.flat({"a": np.zeros(2), "b": np.array([3])}).tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_entries_are_chosen_in_their_order():
+    parts = spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(2), c=spaces.Tuple([spaces.MultiBinary(2)]))
+    space = ObservationSpace(parts, "none", ["c", "a"])
+    assert space.dim == 4
+    vector = space.flat({"a": np.float32([0.25, 0.5]), "b": 7, "c": (np.array([0, 1], np.int8),)})
+    assert vector.tolist() == [0.0, 1.0, 0.25, 0.5]
+    with pytest.raises(ValueError, match=r"without its entry c\.0"):
+        space.flat({"a": np.zeros(2)})
+
+
+@pytest.mark.parametrize("entries", [[], ["a"], [0, 0], [2]])
+def test_entries_that_are_not_there_are_refused(entries):
+    with pytest.raises(ValueError, match=r"observation_keys=.*: must name different entries of \[0, 1\]"):
+        GymnasiumEnv(entry_point="toy_environments:OldGoal", max_steps=9, observation_keys=entries)
+    with pytest.raises(ValueError, match="has no entries; use null"):
+        make(observation_keys=entries)
+
+
+def test_an_environment_with_a_counter_that_leaves_its_space_trains_unchanged(tmp_path, monkeypatch):
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
+    words = ["env=gymnasium", "env.entry_point=toy_environments:OldGoal", "env.max_steps=9", "env.kwargs={tick:197}"]
+    words += ["high=none", "low=hppo", "num_envs=4", "steps_per_batch=4", "total_frames=64", "eval.layouts=2"]
+    words += ["low.minibatch_size=16"]
+    assert run(compose_config([*words, "env.observation_keys=[0]"]), tmp_path / "chosen") == 0
+    with pytest.raises(ConfigError, match=r"^env: .*entry 1 is 200, outside Discrete\(200\)"):
+        run(compose_config(words), tmp_path / "all")

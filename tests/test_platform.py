@@ -289,8 +289,17 @@ def test_an_invalid_action_is_refused_and_changes_nothing(name):
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"num_envs": 0}, {"max_steps": 0}, {"noise": -0.1}, {"noise": math.nan}], ids=str
+    "arguments", [{"num_envs": 0}, {"max_steps": 0}, {"noise": -0.1}, {"noise": math.nan}, {"noise": 1e30}], ids=str
 )
 def test_an_invalid_argument_is_refused_by_name(arguments):
     with pytest.raises(ValueError, match=next(iter(arguments))):
         PlatformEnv(**arguments)
+
+
+def test_float64_parameters_leave_rewards_and_observations_float32():
+    env = PlatformEnv(2)
+    env.reset()
+    given = action([RUN, HOP], [5.0, 50.0])
+    given[keys.PARAMETERS] = given[keys.PARAMETERS].double()
+    following = env.step(given)["next"]
+    assert following[keys.OBSERVATION].dtype == following[keys.REWARD].dtype == torch.float32

@@ -16,6 +16,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from hpamdp.config import ConfigError, component, read
+from hpamdp.messages import warn
 from hpamdp.run import train
 
 TINY = ["num_envs=32", "steps_per_batch=4", "eval.layouts=10", "eval.every=0", "log_every=0", "low=random"]
@@ -37,13 +38,16 @@ def jobs(monkeypatch):
     """Replace training by a function that writes what a run does; return what each run was started with."""
     started = []
 
-    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False):
+    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
         started.append((cfg.seed, stopped_at))
         OmegaConf.save(OmegaConf.create(read(cfg).to_dict()), folder / "config.yaml")
         if cfg.seed == 1:
             raise ConfigError("these two\ndo not go together")
         if cfg.seed == 2:
             raise ZeroDivisionError("a bug")
+        if cfg.seed == 6:
+            tell("reward is nan at frame 7: training stopped")
+            return train.DIVERGED
         frames = 5 if cfg.seed == 5 or (cfg.seed == 3 and stopped_at is None) else cfg.total_frames
         (folder / "checkpoint.zip").touch()
         summary = {"score": float(cfg.seed), "frames": frames, "finished": cfg.seed == 5 or frames > 5}
@@ -64,6 +68,13 @@ def test_a_failing_job_loses_no_other_and_is_named_at_the_end(command, jobs, tmp
     assert "Traceback" in (tmp_path / "sweep/2/error.txt").read_text()
     assert out.endswith("4 jobs: 2 finished; 1 refused; 1 failed\nBest score 4.000: seed=4 high=fixed (sweep/3)\n")
     assert {path.name for path in (tmp_path / "sweep").iterdir()} == {"0", "1", "2", "3", "multirun.yaml"}
+
+
+def test_a_job_that_diverges_is_named_with_the_reason(command, jobs):
+    code, out, err = command("-m", "seed=0,6", "hydra.sweep.dir=sweep")
+    assert code == 1
+    assert err == "seed=6: reward is nan at frame 7: training stopped (sweep/1)\n"
+    assert "Job 1: failed: reward is nan at frame 7: training stopped\n" in out
 
 
 def test_a_sweep_that_fails_by_mistakes_alone_exits_with_2(command, jobs):
@@ -95,8 +106,8 @@ def test_a_run_that_ended_early_is_finished_and_one_that_was_stopped_is_not(comm
 def test_the_results_of_another_config_stay_as_they_are(command, jobs, tmp_path):
     command("-m", "seed=4", "hydra.sweep.dir=sweep")
     before = {file: file.read_bytes() for file in (tmp_path / "sweep/0").iterdir()}
-    code, _, err = command("-m", "seed=5,6", "eval.layouts=7", "hydra.sweep.dir=sweep")
-    assert code == 2 and [seed for seed, _ in jobs] == [4, 6]
+    code, _, err = command("-m", "seed=5,7", "eval.layouts=7", "hydra.sweep.dir=sweep")
+    assert code == 2 and [seed for seed, _ in jobs] == [4, 7]
     assert err.startswith(
         "seed=5 eval.layouts=7: its folder has the results of another config, with seed=4 for 5 and 1 "
     )
@@ -228,7 +239,7 @@ def test_a_missing_cluster_is_told_in_one_line(command, monkeypatch):
 def test_a_search_maximises_the_score_skips_finished_trials_and_survives_failed_ones(command, monkeypatch, tmp_path):
     tried = []
 
-    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False):
+    def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
         tried.append(cfg.low.clip)
         if len(tried) == 2:
             raise ZeroDivisionError("a bug")

@@ -157,6 +157,33 @@ class OldToy:
         return observation, reward, done, info
 
 
+class OldGoal:
+    """Has the spaces and the interface of gym-goal, and its counter of ticks, which leaves the space after 200 of them.
+
+    Args:
+        tick: of an episode's start.
+    """
+
+    def __init__(self, tick: int = 0):
+        boxes = [spaces.Box(-np.ones(size, np.float32), np.ones(size, np.float32)) for size in (2, 1, 1)]
+        self.action_space = old_space(spaces.Tuple([spaces.Discrete(3), spaces.Tuple(boxes)]))
+        self.observation_space = old_space(
+            spaces.Tuple([spaces.Box(-np.ones(17), np.ones(17), dtype=np.float32), spaces.Discrete(200)])
+        )
+        self.first = tick
+        self.tick = tick
+
+    def reset(self) -> Any:
+        self.tick = self.first
+        return np.zeros(17, np.float32), self.tick
+
+    def step(self, action: Any) -> tuple[Any, float, bool, dict]:
+        discrete, parameters = action
+        self.tick += 1
+        state = np.full(17, parameters[discrete][0] / 2.0, np.float32)
+        return (state, self.tick), float(state[0]), self.tick >= self.first + 5, {}
+
+
 def make_toy(**kwargs: Any) -> gymnasium.Env:
     return gymnasium.make("Toy-v0", **kwargs)
 

@@ -37,6 +37,10 @@ class Metric:
     kind: Literal["number", "share", "count"] = "number"
 
 
+class ProblemError(ValueError):
+    """A problem that breaks its own contract, such as with an observation outside its space; told in one line."""
+
+
 class PAMDPEnv(EnvBase):
     """`num_envs` copies of a problem with parameterised actions, in one batch dimension.
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,17 +13,25 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from hpamdp.config import Config, ConfigError, constructor_arguments
+from hpamdp.config import Component, Config, ConfigError, constructor_arguments
 from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
+from hpamdp.messages import first_line
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Learner, Selector
 from hpamdp.run import checkpoint
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.loggers import Logger
 from hpamdp.specs import PAMDPSpecs
+
+# Fewer steps or episodes than this need no estimate of their memory, for which an environment is built.
+_MANY = 1_000_000
+# A weight is there four times: itself, its gradient and two moments of Adam.
+_BYTES_A_WEIGHT = 16
 
 
 @dataclass
@@ -51,14 +61,18 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     """Build the parts of a run.
 
     Raises:
-        ConfigError: values that do not go together, or that a constructor refuses.
+        ConfigError: values that do not go together, that a constructor refuses, or for which there is no memory.
     """
+    check_classes(config)
     device = config.run.resolve_device()
+    check_run_memory(config, device)
     env = make_env(config, config.run.num_envs, device, config.run.seed)
     check_choice(config, env)
     check_collector(config, env)
     check_modes(config)
-    agent = make_agent(config, PAMDPSpecs.from_env(env), device)
+    specs = PAMDPSpecs.from_env(env)
+    check_agent_memory(config, specs, device)
+    agent = make_agent(config, specs, device)
     is_new = config.run.mode != "eval" and config.run.resume is None
     data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and config.run.low.checkpoint is not None:
@@ -149,6 +163,100 @@ def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> Transf
     return with_decisions(env, gamma, None if length == "episode" else length)
 
 
+def check_classes(config: Config) -> None:
+    """Refuse a class in the wrong group.
+
+    Raises:
+        ConfigError: with the class that it would have to be derived from.
+    """
+    bases: tuple[tuple[Component, type], ...] = ((config.env, PAMDPEnv), (config.high, Selector), (config.low, Learner))
+    for component, base in bases:
+        if component.cls is not None and not issubclass(component.cls, base):
+            raise ConfigError(f"{component}: {component.cls.__name__} is no {base.__name__} ({base.__module__})")
+
+
+def check_run_memory(config: Config, device: torch.device) -> None:
+    """Refuse more environments, steps or episodes than there is memory for, before any of them is built.
+
+    What counts are the tensors of a step, which an environment of its own gives, and the positions of an evaluation.
+
+    Raises:
+        ConfigError: with the bytes that are surely needed.
+    """
+    run = config.run
+    num_steps = 0 if run.mode != "train" else run.num_envs * run.steps_per_batch
+    if max(run.num_envs, num_steps, run.eval.layouts) < _MANY:
+        return
+    one = make_env(config, 1, device, run.seed)
+    step = one.fake_tensordict().bytes()
+    path = 0 if one.position is None else 8 * one.max_steps
+    one.close()
+    needs = {
+        f"num_envs={run.num_envs}": run.num_envs * step,
+        f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}": num_steps * step,
+        f"eval.layouts={run.eval.layouts}": run.eval.layouts * (step + path),
+    }
+    _check_memory(needs, device)
+
+
+def check_agent_memory(config: Config, specs: PAMDPSpecs, device: torch.device) -> None:
+    """Refuse replay buffers, batches and layers that there is no memory for, before any of them is built.
+
+    They are known by the names of their options: `buffer_size`, `batch_size`, `minibatch_size` and those
+    that end in `hidden_dims`.
+
+    Raises:
+        ConfigError: with the bytes that are surely needed.
+    """
+    # Two observations, the action, reward and flags.
+    row = 4 * (2 * specs.observation_dim + specs.num_parameters + 2)
+    is_shared = config.run.agent.sharing == "shared"
+    needs = {}
+    for component, num in ((config.high, 1), (config.low, 1 if is_shared else max(1, specs.num_options))):
+        for name, value in component.options.items():
+            setting = f"{component.group}.{name}={value}"
+            if name == "buffer_size":
+                needs[setting] = num * value * row
+            elif name in ("batch_size", "minibatch_size"):
+                needs[setting] = value * row
+            elif name.endswith("hidden_dims"):
+                sizes = [specs.observation_dim, *value]
+                weights = sum(a * b for a, b in zip(sizes, value, strict=False))
+                needs[setting] = num * weights * _BYTES_A_WEIGHT
+    _check_memory(needs, device)
+
+
+def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
+    """Refuse settings that need more bytes together than there are; the line names the one that needs most."""
+    if not needs:
+        return
+    available = total_memory(device)
+    setting = max(needs, key=needs.__getitem__)
+    if sum(needs.values()) > available:
+        raise ConfigError(
+            f"{setting}: the run takes at least {in_gigabytes(sum(needs.values()))} of memory, and there are "
+            f"{in_gigabytes(available)}"
+        )
+
+
+@contextmanager
+def memory_errors_explained(config: Config) -> Iterator[None]:
+    """Turn the errors of what does not fit into memory into one line that names the largest sizes.
+
+    Raises:
+        ConfigError: there was such an error.
+    """
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, ConfigError) or not is_about_memory(error):
+            raise
+        run = config.run
+        sizes = f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}, eval.layouts={run.eval.layouts}"
+        parts = f"{sizes}, {config.low.largest_sizes()}, {config.high.largest_sizes()}"
+        raise ConfigError(f"{parts}: the run takes more memory than there is ({first_line(error):.160})") from error
+
+
 def check_choice(config: Config, env: PAMDPEnv) -> None:
     """Refuse a selector where there is nothing to choose, none where there is, and options of an impossible length.
 
@@ -178,7 +286,7 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
 
 
 def check_modes(config: Config) -> None:
-    """Refuse a learner that cannot learn from what the run has: its own steps, a data set or both.
+    """Refuse a learner that cannot learn from what the run has: its own steps, batches of them, a data set or both.
 
     Raises:
         ConfigError: with the settings to change.
@@ -195,6 +303,12 @@ def check_modes(config: Config) -> None:
         raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
     if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
         raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
+    n_step = config.low.options.get("n_step", 1)
+    if mode == "train" and n_step > config.run.steps_per_batch:
+        raise ConfigError(
+            f"low.n_step={n_step}: must be at most steps_per_batch={config.run.steps_per_batch}, as sums of rewards "
+            "end with a batch"
+        )
     if mode == "offline" and config.run.low.freeze:
         raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
 

@@ -180,9 +180,7 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
             start = f"{i}."
             learner.load_networks({name.removeprefix(start): own[name] for name in own if name.startswith(start)})
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(
-            f"low.checkpoint={file}: of another class or size than low: {one_line(error):.160}"
-        ) from error
+        raise ConfigError(f"low.checkpoint={file}: of another class or size than low: {_misfit(error)}") from error
 
 
 def load(file: Path, agent: HierarchicalAgent, device: torch.device, *, with_training: bool) -> Saved:
@@ -208,8 +206,13 @@ def load(file: Path, agent: HierarchicalAgent, device: torch.device, *, with_tra
                 else:
                     part.load_state_dict(members[name])
     except (RuntimeError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise ConfigError(f"{file}: does not fit this agent: {first_line(error)}") from error
+        raise ConfigError(f"{file}: does not fit this agent, whose sizes env sets: {_misfit(error)}") from error
     return Saved(progress, {name: members.get(name, {}) for name in STATES}, members.get("rng", {}))
+
+
+def _misfit(error: Exception) -> str:
+    """Return the beginning of what torch says when weights do not fit, without its heading."""
+    return f"{one_line(error).partition('state_dict for ')[2].partition(': ')[2] or one_line(error):.160}"
 
 
 def _packed(state: object) -> bytes:

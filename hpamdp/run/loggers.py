@@ -6,14 +6,17 @@ import netrc
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol
 from urllib.parse import urlsplit
+
+from pydantic import Field, ValidationError
 
 from hpamdp.messages import first_line, warn
 
 # Seconds that an online wandb run may keep the training waiting, at its start and at its end.
 _WANDB_START, _WANDB_FINISH = 20.0, 60.0
 
+Name = Annotated[str, Field(min_length=1)]
 WandbMode = Literal["offline", "online", "disabled"]
 # What WANDB_MODE may say; two names are wandb's older ones.
 _WANDB_MODES: dict[str, WandbMode] = {
@@ -115,10 +118,10 @@ class WandbLogger:
 
     def __init__(
         self,
-        project: str,
-        entity: str | None,
-        group: str | None,
-        name: str | None,
+        project: Name | None,
+        entity: Name | None,
+        group: Name | None,
+        name: Name | None,
         mode: Literal["auto", "offline", "online", "disabled"],
         *,
         output_dir: Path,
@@ -128,13 +131,21 @@ class WandbLogger:
 
         output_dir.mkdir(parents=True, exist_ok=True)  # wandb goes to a temporary folder where this one is missing
         _check_wandb_mode()
-        wandb_settings = wandb.Settings(
-            silent=True,
-            console="off",
-            init_timeout=_WANDB_START,
-            login_timeout=_WANDB_START,
-            finish_timeout=_WANDB_FINISH,
-        )
+        try:
+            wandb_settings = wandb.Settings(
+                project=project,
+                silent=True,
+                console="off",
+                init_timeout=_WANDB_START,
+                login_timeout=_WANDB_START,
+                finish_timeout=_WANDB_FINISH,
+            )
+            server = wandb.setup(wandb_settings).settings.base_url
+        except wandb.errors.UsageError as error:
+            raise ValueError(f"project={project}: {first_line(error)}") from error
+        except ValidationError as error:  # of what wandb reads from the environment and from its own files
+            wrong = error.errors()[0]
+            raise ValueError(f"wandb: {'.'.join(map(str, wrong['loc']))}={wrong['input']}: {wrong['msg']}") from error
 
         def start(chosen: WandbMode) -> wandb.Run:
             # `setup` needs the mode, too: it silences the login, and keeps an offline run from reporting its use.
@@ -150,7 +161,7 @@ class WandbLogger:
                 settings=wandb_settings,
             )
 
-        chosen = _wandb_mode(mode, wandb.setup(wandb_settings).settings.base_url)
+        chosen = _wandb_mode(mode, server)
         try:
             self._run = start(chosen)
         except wandb.errors.Error as error:

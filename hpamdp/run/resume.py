@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -40,11 +41,41 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
     merged, names = compose_saved(saved)
     for key in ("mode", "resume", "checkpoint", "overwrite"):  # how that run began does not matter to this one
         merged[key] = cfg[key]
-    for override in overrides:
-        key = override.partition("=")[0].lstrip("+~")
-        if key.split(".")[0] in _AGENT:
-            raise ConfigError(f"{override}: {where} takes the agent from {file}; leave this out")
+    for override in _anew(overrides, saved, file, where):
+        key = _key(override)
         OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False)
         if key in GROUPS:
             names[key] = chosen_names(cfg)[key]
     return read(merged, names), file
+
+
+def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str, str]:
+    """Return the names that a saved run chose for the groups, so that the command line is read as an addition to it.
+
+    Args:
+        source: the run's output folder or its checkpoint.
+        where: the setting that names it.
+        overrides: the words of the command line.
+
+    Raises:
+        ConfigError: no such checkpoint, or a word that would change the saved agent.
+    """
+    file = checkpoint.find(source, where)
+    saved = checkpoint.progress_of(file)["config"]
+    _anew(overrides, saved, file, where)
+    return {group: saved[group]["name"] for group in GROUPS}
+
+
+def _anew(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
+    """Return the words that set something anew: without those that choose for a group what the saved run has."""
+    anew = [
+        word for word in overrides if _key(word) not in GROUPS or word != f"{_key(word)}={saved[_key(word)]['name']}"
+    ]
+    for word in anew:
+        if _key(word).split(".")[0] in _AGENT:
+            raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")
+    return anew
+
+
+def _key(override: str) -> str:
+    return override.partition("=")[0].lstrip("+~")

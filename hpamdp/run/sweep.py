@@ -109,7 +109,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     say(f"Job {job.number}: {job.overrides}")
     try:
         with locked(folder, _PATIENCE_S):
-            job.state, job.score = _go_on(cfg, overrides, folder)
+            job.state, job.score, job.reason = _go_on(cfg, overrides, folder)
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))
         with suppress(OSError):
@@ -126,8 +126,8 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     return job.score
 
 
-def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None]:
-    """Run what is not done yet in a job's folder; return the job's state and its score."""
+def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None, str]:
+    """Run what is not done yet in a job's folder; return the job's state, its score and why it failed."""
     from hpamdp.run import checkpoint, train  # takes seconds, which --help need not wait for
     from hpamdp.run.resume import resolve
 
@@ -137,17 +137,19 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
         _check_same(wanted, folder / "config.yaml")
     score = _final_score(folder)
     if score is not None:
-        return _SKIPPED, score
+        return _SKIPPED, score, ""
     (folder / "error.txt").unlink(missing_ok=True)
     is_resumed = source.exists()
     if is_resumed:
         say(f"Going on from {source}")
-    code = train.run(cfg, folder, overrides, source if is_resumed else None, may_overwrite=True)
-    if code == train.DIVERGED:
-        return _FAILED, None
+    reasons: list[str] = []
+    from_checkpoint = source if is_resumed else None
+    code = train.run(cfg, folder, overrides, from_checkpoint, may_overwrite=True, tell=reasons.append)
+    if code in (train.DIVERGED, train.FAILED):
+        return _FAILED, None, one_line(" ".join(reasons))
     if code:
-        return _STOPPED, None
-    return (_RESUMED if is_resumed else _FINISHED), _final_score(folder)
+        return _STOPPED, None, ""
+    return (_RESUMED if is_resumed else _FINISHED), _final_score(folder), ""
 
 
 def _final_score(folder: Path) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -16,17 +16,18 @@ from tqdm import tqdm
 
 from hpamdp import keys
 from hpamdp.config import Config, ConfigError
+from hpamdp.env.base import ProblemError
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import Parts, assemble
-from hpamdp.run.collection.base import Collection
+from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
+from hpamdp.run.collection.base import Collection, WorkerDiedError
 from hpamdp.run.folder import POLICY_NAME, check_unused
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import resolve
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
-INTERRUPTED, DIVERGED = 130, 3  # exit codes
+INTERRUPTED, DIVERGED, FAILED = 130, 3, 1  # exit codes
 DIVERGED_NAME = "checkpoint.diverged.zip"
 
 
@@ -41,11 +42,12 @@ def run(
     stopped_at: Path | None = None,
     *,
     may_overwrite: bool = False,
+    tell: Callable[[str], None] = warn,
 ) -> int:
     """Train or score an agent, write everything under `output_dir`, return the exit code.
 
     0: the run reached its end. 130: it was stopped by a signal, and saved. 3: a reward, a loss or a weight was not
-    finite; the last good checkpoint is kept.
+    finite; the last good checkpoint is kept. 1: a worker process died; what was learned is saved.
 
     Args:
         cfg: the composed config.
@@ -53,12 +55,29 @@ def run(
         overrides: the command line's words, which change a resumed run's config.
         stopped_at: the checkpoint of this very run, to continue from.
         may_overwrite: whether the results of a run in the folder may be overwritten, as with `overwrite=true`.
+        tell: is told in one line why the run ended with the exit codes 3 and 1.
 
     Raises:
         ConfigError: a wrong value or path, or values that do not go together.
     """
     config, source = resolve(cfg, overrides)
     source = stopped_at or source
+    with memory_errors_explained(config):
+        try:
+            return _run(config, source, output_dir, overrides, may_overwrite=may_overwrite, tell=tell)
+        except ProblemError as error:
+            raise ConfigError(f"env: {first_line(error)}") from error
+
+
+def _run(
+    config: Config,
+    source: Path | None,
+    output_dir: Path,
+    overrides: Sequence[str],
+    *,
+    may_overwrite: bool,
+    tell: Callable[[str], None],
+) -> int:
     is_own = source is not None and source.resolve().parent == output_dir.resolve()
     if not (may_overwrite or config.run.overwrite or is_own):
         check_unused(output_dir)
@@ -68,6 +87,9 @@ def run(
     trainer = Trainer(config, parts, output_dir)
     if source is not None:
         trainer.restore(source)
+        for word in overrides:
+            if word.startswith(("total_frames=", "offline.updates=")) and config.run.mode != "eval":
+                check_more(word, trainer.frames, config.run.num_frames)
     output_dir.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(OmegaConf.create(config.to_dict()), output_dir / "config.yaml")
     is_interrupted = False
@@ -75,8 +97,11 @@ def run(
         try:
             is_interrupted = trainer.train()
         except DivergedError as error:
-            warn(f"{error} at frame {trainer.frames:,}: training stopped; {trainer.keep_for_inspection()}")
+            tell(f"{error} at frame {trainer.frames:,}: training stopped; {trainer.keep_for_inspection()}")
             return DIVERGED
+        except WorkerDiedError as error:
+            tell(f"{error} at frame {trainer.frames:,}; to go on: python run.py resume={output_dir}")
+            return FAILED
     say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, not is_interrupted))
     say(f"Everything is in {output_dir}")
     if is_interrupted:
@@ -270,6 +295,16 @@ class Trainer:
             "cpu_s": self.cpu_s,
             "last_score": self.last_score,
         }
+
+
+def check_more(word: str, frames: int, wanted: int) -> None:
+    """Refuse to continue a run for fewer frames than it has.
+
+    Raises:
+        ConfigError: with how many those are.
+    """
+    if frames > wanted:
+        raise ConfigError(f"{word}: the run that is continued has {frames:,} already; set more, or leave it out")
 
 
 def check_rewards(batch: TensorDictBase) -> None:

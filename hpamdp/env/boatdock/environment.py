@@ -70,6 +70,7 @@ class BoatDockEnv(PAMDPEnv):
 
     Raises:
         ValueError: an argument, action or layout that is out of range; the boats are left as they were.
+        RuntimeError: a step before the first reset, or before the one after `set_seed`.
     """
 
     option_names = harbour.CONTROLLERS
@@ -157,6 +158,7 @@ class BoatDockEnv(PAMDPEnv):
     @state.setter
     def state(self, state: BoatState) -> None:
         self._state = BoatState(*(column.to(self.device) for column in state))
+        self._has_layouts = True
 
     @property
     def position(self) -> Tensor:
@@ -258,6 +260,7 @@ class BoatDockEnv(PAMDPEnv):
         integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
         columns = [floats] * 9 + [integers] * 4 + [integers - 1]
         self._state = BoatState(*columns)
+        self._has_layouts = False
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask, given = None, None
@@ -270,6 +273,7 @@ class BoatDockEnv(PAMDPEnv):
             self._state = where(mask, self._state._replace(**given), self._state)
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)
+        self._has_layouts = True
         return self._read()
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -309,8 +313,10 @@ class BoatDockEnv(PAMDPEnv):
         return columns
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self._has_layouts:
+            raise RuntimeError("BoatDockEnv: the boats have no layouts yet; call reset before step")
         self.check_action(tensordict)
-        key, durations = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
+        key, durations = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS).float()
         option = tensordict.get(keys.OPTION) if self.has_choice else self._state.controller
         state, reward, is_action = self._pure_step(
             self._state, option, key, durations, self._seed, self._environment, self.rules
@@ -355,7 +361,8 @@ def _check_arguments(num_envs: int, rules: Rules) -> None:
         raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
     if not 0.0 <= rules.slip <= 1.0:
         raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
-    for name, values in (("motor_noise", rules.motor_noise), ("sensor_noise", (rules.sensor_noise,))):
+    noises = (("motor_noise", rules.motor_noise, 10), ("sensor_noise", (rules.sensor_noise,), 1000))
+    for name, values, largest in noises:
         for value in values:
-            if not 0.0 <= value < float("inf"):
-                raise ValueError(f"BoatDockEnv: {name}={value}, but must be a finite number of at least 0")
+            if not 0.0 <= value <= largest:
+                raise ValueError(f"BoatDockEnv: {name}={value}, but must lie between 0 and {largest}")

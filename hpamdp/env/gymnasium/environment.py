@@ -17,7 +17,7 @@ from torchrl.data import Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import PAMDPEnv, ProblemError
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.four_value import FourValueEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
@@ -48,6 +48,8 @@ class GymnasiumEnv(PAMDPEnv):
         max_steps: steps after which an episode is truncated; None: the environment's own time limit.
         parameter_dims: how many parameters each discrete action takes of one box for all; None: each takes the whole
             box.
+        observation_keys: of a `Tuple` (numbers from 0) or `Dict` (names) of observations, the entries to keep, in this
+            order; None: all.
         observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
         device: of the tensors.
         seed: of the episodes, see above.
@@ -55,6 +57,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     Raises:
         ValueError: an argument, a space or an action is invalid; after an invalid action no copy has moved.
+        ProblemError: a copy gave what its own spaces do not have.
     """
 
     result_keys = (_SUCCESS,)
@@ -68,6 +71,7 @@ class GymnasiumEnv(PAMDPEnv):
         kwargs: dict[str, Any] | None = None,
         max_steps: int | None = None,
         parameter_dims: list[int] | None = None,
+        observation_keys: list[int | str] | None = None,
         observation_scaling: Scaling = "bounds",
         device: torch.device | str | None = "cpu",
         seed: int = 0,
@@ -86,7 +90,7 @@ class GymnasiumEnv(PAMDPEnv):
         self.max_steps = limit
         try:
             self._actions = ActionSpace(self.envs[0].action_space, parameter_dims)
-            self.observations = ObservationSpace(self.envs[0].observation_space, observation_scaling)
+            self.observations = ObservationSpace(self.envs[0].observation_space, observation_scaling, observation_keys)
         except ValueError as error:
             raise ValueError(f"{self._name}: {error}") from error
         self.parameter_dims = self._actions.parameter_dims
@@ -252,7 +256,7 @@ class GymnasiumEnv(PAMDPEnv):
         try:
             return self.observations.flat(observation)
         except ValueError as error:
-            raise ValueError(f"{self._name}: environment {row}: {error}") from error
+            raise ProblemError(f"{self._name}: environment {row}: {error}") from error
 
     def _keep(self, rows: list[int], observations: list[np.ndarray]) -> None:
         """Scale the new observations of these rows and keep them."""

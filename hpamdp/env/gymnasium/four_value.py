@@ -10,6 +10,8 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
+from hpamdp.env.base import ProblemError
+
 _ADVICE = "an environment with Gymnasium's interface must inherit from gymnasium.Env"
 
 
@@ -53,14 +55,16 @@ class FourValueEnv(gymnasium.Env):
         observation = self.env.reset(**arguments)
         has_info = isinstance(observation, tuple) and len(observation) == 2 and isinstance(observation[1], dict)
         if has_info and not isinstance(self.observation_space, spaces.Tuple):
-            raise ValueError(f"FourValueEnv: reset of {_kind(self.env)} returned an info, too; {_ADVICE}")
+            raise ProblemError(f"FourValueEnv: reset of {_kind(self.env)} returned an info, too; {_ADVICE}")
         return observation, {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take a step and split `done` into `terminated` and `truncated`."""
         values = self.env.step(action)
         if len(values) != 4:
-            raise ValueError(f"FourValueEnv: step of {_kind(self.env)} returned {len(values)} values, not 4; {_ADVICE}")
+            raise ProblemError(
+                f"FourValueEnv: step of {_kind(self.env)} returned {len(values)} values, not 4; {_ADVICE}"
+            )
         observation, reward, done, info = values
         info = info or {}
         is_truncated = bool(done) and bool(info.get("TimeLimit.truncated", False))

@@ -65,8 +65,8 @@ class PlatformEnv(PAMDPEnv):
         for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
             if value < 1:
                 raise ValueError(f"PlatformEnv: {name}={value}, but must be at least 1")
-        if not 0.0 <= noise < float("inf"):
-            raise ValueError(f"PlatformEnv: noise={noise}, but must be a finite number of at least 0")
+        if not 0.0 <= noise <= 100.0:
+            raise ValueError(f"PlatformEnv: noise={noise}, but must lie between 0 and 100")
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.max_steps = max_steps
@@ -130,7 +130,7 @@ class PlatformEnv(PAMDPEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.check_action(tensordict)
         discrete = tensordict.get(keys.DISCRETE)
-        parameters = tensordict.get(keys.PARAMETERS)
+        parameters = tensordict.get(keys.PARAMETERS).float()
         check_action_values(discrete, parameters, self.parameter_dims)
         chosen = discrete.long()
         parameter = parameters.gather(-1, chosen.unsqueeze(-1)).squeeze(-1)

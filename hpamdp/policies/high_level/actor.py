@@ -28,7 +28,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import mlp, sample_index
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
@@ -64,7 +64,7 @@ class Actor(OnPolicy, Selector):
         minibatch_size: PositiveInt,
         clip: PositiveFloat,
         entropy: NonNegativeFloat,
-        lr: PositiveFloat,
+        lr: LearningRate,
         max_grad_norm: PositiveFloat,
     ) -> None:
         super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)

@@ -19,7 +19,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
+from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.replay import linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -64,7 +64,7 @@ class MetaCritic(Selector):
         updates_per_decision: PositiveFloat,
         max_updates: PositiveInt,
         warmup_decisions: NonNegativeInt,
-        lr: PositiveFloat,
+        lr: LearningRate,
         tau: PositiveFraction,
     ) -> None:
         super().__init__(specs)
@@ -73,6 +73,8 @@ class MetaCritic(Selector):
         self.epsilon_final = epsilon_final
         self.epsilon_decisions = epsilon_decisions
         self.ucb_width = ucb_width
+        if batch_size > buffer_size:
+            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
         self.batch_size = batch_size
         self.updates_per_decision = updates_per_decision
         self.max_updates = max_updates

@@ -15,6 +15,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from hpamdp.policies.shared.fractions import LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
@@ -46,7 +47,7 @@ class BC(ReplayLearner):
         max_scale: PositiveFloat,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        lr: PositiveFloat,
+        lr: LearningRate,
         weight_decay: NonNegativeFloat,
     ) -> None:
         if not min_scale < max_scale:

@@ -39,7 +39,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel, Prediction
-from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -96,6 +96,11 @@ class Planner:
     ) -> None:
         if num_elites > num_samples:
             raise ValueError(f"num_elites={num_elites}, but must be at most num_samples={num_samples}")
+        if horizon * num_samples * num_iterations > 1e9:
+            raise ValueError(
+                f"horizon={horizon}, num_samples={num_samples}, num_iterations={num_iterations}: a plan would try more "
+                "than 1,000,000,000 actions"
+            )
         self.model = model
         self.specs = specs
         self.horizon = horizon
@@ -242,7 +247,7 @@ class DLPA(ReplayLearner):
         form: Form,
         hidden_dims: list[PositiveInt],
         num_members: PositiveInt,
-        lr: PositiveFloat,
+        lr: LearningRate,
         state_weight: PositiveFloat,
         reward_weight: PositiveFloat,
         termination_weight: PositiveFloat,

@@ -31,7 +31,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
-from hpamdp.policies.shared.fractions import Fraction
+from hpamdp.policies.shared.fractions import FinalLearningRate, Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
@@ -90,8 +90,8 @@ class HPPO(OnPolicy, Learner):
         clip: PositiveFloat,
         gamma: Fraction,
         gae_lambda: Fraction,
-        lr: PositiveFloat,
-        lr_final: NonNegativeFloat,
+        lr: LearningRate,
+        lr_final: FinalLearningRate,
         critic_weight: PositiveFloat,
         discrete_entropy: NonNegativeFloat,
         parameter_entropy: NonNegativeFloat,
@@ -101,6 +101,10 @@ class HPPO(OnPolicy, Learner):
     ) -> None:
         if not min_scale < initial_scale < max_scale:
             raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
+        if not min_scale_final < max_scale:
+            raise ValueError(f"min_scale_final={min_scale_final}: must be less than {max_scale=}")
+        if lr_final > lr:
+            raise ValueError(f"lr_final={lr_final}: must be at most {lr=}")
         super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
         self.gamma = gamma
         self.gae_lambda = gae_lambda

@@ -34,7 +34,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridDistribution
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -111,7 +111,7 @@ class HSAC(ReplayLearner):
         tune_parameter_temperature: bool,
         discrete_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0)],
         parameter_target_entropy: Annotated[float, Field(lt=math.log(2.0))],
-        temperature_lr: PositiveFloat,
+        temperature_lr: LearningRate,
         warmup_frames: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
@@ -119,8 +119,8 @@ class HSAC(ReplayLearner):
         policy_delay: PositiveInt,
         gamma: PositiveFraction,
         tau: PositiveFraction,
-        actor_lr: PositiveFloat,
-        critic_lr: PositiveFloat,
+        actor_lr: LearningRate,
+        critic_lr: LearningRate,
     ) -> None:
         if not min_scale < max_scale:
             raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")

@@ -33,7 +33,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
+from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -161,7 +161,7 @@ class HyAR(ReplayLearner):
         warmup_frames: PositiveInt,
         codec_pretrain_updates: PositiveInt,
         codec_every: PositiveInt,
-        codec_lr: PositiveFloat,
+        codec_lr: LearningRate,
         kl_weight: NonNegativeFloat,
         dynamics_weight: NonNegativeFloat,
         latent_coverage: PositiveFraction,
@@ -171,8 +171,8 @@ class HyAR(ReplayLearner):
         updates_per_frame: PositiveFloat,
         gamma: PositiveFraction,
         tau: PositiveFraction,
-        actor_lr: PositiveFloat,
-        critic_lr: PositiveFloat,
+        actor_lr: LearningRate,
+        critic_lr: LearningRate,
         policy_delay: PositiveInt,
         target_noise: NonNegativeFloat,
         target_noise_clip: NonNegativeFloat,

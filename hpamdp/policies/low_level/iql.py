@@ -25,7 +25,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -48,8 +48,8 @@ class IQL(ReplayLearner):
         max_weight: PositiveFloat,
         gamma: PositiveFraction,
         tau: PositiveFraction,
-        actor_lr: PositiveFloat,
-        critic_lr: PositiveFloat,
+        actor_lr: LearningRate,
+        critic_lr: LearningRate,
         warmup_frames: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,

@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
-from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
+from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -126,8 +126,8 @@ class PDQN(ReplayLearner):
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
         gamma: PositiveFraction,
-        actor_lr: PositiveFloat,
-        critic_lr: PositiveFloat,
+        actor_lr: LearningRate,
+        critic_lr: LearningRate,
         actor_tau: PositiveFraction,
         critic_tau: PositiveFraction,
         max_grad_norm: PositiveFloat | None,

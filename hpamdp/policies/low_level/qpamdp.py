@@ -31,7 +31,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
-from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
+from hpamdp.policies.low_level.qpamdp_features import MAX_FEATURES, FourierBasis, SizedByData, num_fourier_features
 from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import sample_index
 from hpamdp.specs import PAMDPSpecs
@@ -292,9 +292,20 @@ class QPAMDP(Learner):
         sigma_decay: PositiveFraction,
     ) -> None:
         super().__init__(specs)
-        if features is not None and not all(i < specs.observation_dim for i in features):
+        if features is not None:
             last = specs.observation_dim - 1
-            raise ValueError(f"features={features}: the observation has entries 0 to {last}; use null for all of them")
+            if not features or max(features) > last:
+                raise ValueError(f"features={features}: name some of the observation's entries 0 to {last}; null: all")
+            if len(set(features)) < len(features):
+                raise ValueError(f"features={features}: names an entry twice")
+        if sigma_final > sigma:
+            raise ValueError(f"sigma_final={sigma_final}: must be at most {sigma=}")
+        for basis, order, max_coupled in (("phi", phi_order, phi_max_coupled), ("psi", psi_order, psi_max_coupled)):
+            num = num_fourier_features(1 if features is None else len(features), order, max_coupled)
+            if num > MAX_FEATURES:
+                raise ValueError(
+                    f"{basis}_order={order}: gives {num:,} features, of which there may be {MAX_FEATURES:,}"
+                )
         self.features = features
         self.warmup_frames = warmup_frames
         self.initial_episodes = initial_episodes

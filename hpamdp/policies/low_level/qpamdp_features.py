@@ -25,6 +25,15 @@ class SizedByData(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
+# Natural policy gradient solves for as many regressors as there are features.
+MAX_FEATURES = 10_000
+
+
+def num_fourier_features(num_inputs: int, order: int, max_coupled: int) -> int:
+    """Return how many features `fourier_coefficients` has."""
+    return sum(math.comb(num_inputs, num) * order**num for num in range(min(max_coupled, num_inputs) + 1))
+
+
 def fourier_coefficients(num_inputs: int, order: int, max_coupled: int) -> Tensor:
     """Return the coefficients of the cosines, `[num_features, num_inputs]`.
 

@@ -26,7 +26,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
@@ -107,8 +107,8 @@ class TD3BC(ReplayLearner):
         parameter_noise: NonNegativeFloat,
         gamma: PositiveFraction,
         tau: PositiveFraction,
-        actor_lr: PositiveFloat,
-        critic_lr: PositiveFloat,
+        actor_lr: LearningRate,
+        critic_lr: LearningRate,
         warmup_frames: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,

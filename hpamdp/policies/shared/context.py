@@ -46,6 +46,8 @@ class ContextFeatures(nn.Module):
         if not inputs or not all(0 <= i < specs.observation_dim for i in inputs):
             last = specs.observation_dim - 1
             raise ValueError(f"inputs={inputs}: the observation has entries 0 to {last}; null: all")
+        if len(set(inputs)) < len(inputs):
+            raise ValueError(f"inputs={inputs}: names an entry twice")
         self.is_polynomial = features == "polynomial"
         self.num_features = math.comb(len(inputs) + degree, degree) if self.is_polynomial else degree + 1
         if self.num_features > 2000:

@@ -30,6 +30,8 @@ class OnPolicy(nn.Module):
     def __init__(
         self, specs: PAMDPSpecs, *, epochs: int, minibatch_size: int, clip: float, max_grad_norm: float
     ) -> None:
+        if epochs > 1000:
+            raise ValueError(f"epochs={epochs}: must be at most 1000, or an update never ends")
         super().__init__(specs)
         self.epochs = epochs
         self.minibatch_size = minibatch_size

@@ -43,6 +43,10 @@ class ReplayLearner(Learner):
         batch_size: int,
         updates_per_frame: float,
     ) -> None:
+        if batch_size > buffer_size:
+            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
+        if updates_per_frame > 1000.0:
+            raise ValueError(f"updates_per_frame={updates_per_frame}: must be at most 1000")
         super().__init__(specs)
         self.gamma = gamma
         self.warmup_frames = warmup_frames

@@ -8,6 +8,10 @@ from typing import Any, ClassVar
 from tensordict import TensorDictBase
 
 
+class WorkerDiedError(RuntimeError):
+    """A worker process that ended before the run did."""
+
+
 class Collection:
     """Gives batches of the agent acting in the run's environments, until it is closed.
 
@@ -21,7 +25,11 @@ class Collection:
     cpu_s: float = 0.0  # spent collecting in other processes
 
     def next(self) -> TensorDictBase:
-        """Collect a batch `[num_envs, steps_per_batch]`."""
+        """Collect a batch `[num_envs, steps_per_batch]`.
+
+        Raises:
+            WorkerDiedError: another process died.
+        """
         raise NotImplementedError
 
     def state(self) -> dict[str, Any]:

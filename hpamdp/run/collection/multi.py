@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
-from multiprocessing import resource_tracker
+from multiprocessing import connection, resource_tracker
 
 from pydantic import PositiveInt
 from torchrl.collectors import MultiSyncCollector
@@ -14,12 +15,25 @@ from hpamdp.run.collection.worker import EnvShard
 from hpamdp.run.collection.workers import WorkerCollection, children_without
 from hpamdp.run.stopping import STOP_SIGNALS
 
+_PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an exit code
+
 
 class MultiCollection(WorkerCollection):
     """Steps the environments in processes of TorchRL's MultiSyncCollector, which write into shared memory."""
 
     def __init__(self, config: Config, parts: Parts, frames: int, *, num_workers: PositiveInt) -> None:
         super().__init__(config, parts, frames, num_workers)
+
+    def _death(self) -> str | None:
+        workers = self._collector.procs
+        connection.wait([worker.sentinel for worker in workers if not worker._closed], _PATIENCE_S)
+        for i, worker in enumerate(workers):
+            if worker._closed or worker.exitcode is None:
+                continue
+            code = worker.exitcode
+            why = f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
+            return f"collector=multi: worker {i} of {len(workers)} died ({why})"
+        return None
 
     def _start(self, shares: Sequence[EnvShard], config: Config) -> MultiSyncCollector:
         # multiprocessing unblocks the signals when it starts this helper of its own.

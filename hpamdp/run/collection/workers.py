@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 
 from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.base import Collection
+from hpamdp.run.collection.base import Collection, WorkerDiedError
 from hpamdp.run.collection.worker import EnvShard, packed
 
 
@@ -61,16 +61,31 @@ class WorkerCollection(Collection):
         raise NotImplementedError
 
     def next(self) -> TensorDictBase:
-        """Send the policy's state, then collect a batch."""
+        """Send the policy's state, then collect a batch.
+
+        Raises:
+            WorkerDiedError: a worker died.
+        """
         self._is_idle = False
-        self.cpu_s = sum(self._call("policy.receive", packed(self._policy)))
-        batch = self._joined(next(self._batches))
+        try:
+            self.cpu_s = sum(self._call("policy.receive", packed(self._policy)))
+            batch = self._joined(next(self._batches))
+        except Exception as error:
+            # TorchRL ends the other workers by a signal that they block, and then complains of these.
+            death = self._death()
+            if death is None:
+                raise
+            raise WorkerDiedError(death) from error
         self._is_idle = True
         return batch.to(self._device)
 
     def _joined(self, batch: TensorDictBase) -> TensorDictBase:
         """Return what TorchRL's collector gave as `[num_envs, steps_per_batch]`."""
         return batch
+
+    def _death(self) -> str | None:
+        """Return in words which worker has died and why, if one has."""
+        return None
 
     def _call(self, method: str, *arguments: Any) -> list[Any]:
         """Return what a method of each worker's collector returns."""

@@ -1,0 +1,187 @@
+"""Settings that no run can have are refused in one line, before anything large is built."""
+
+import copy
+import functools
+import re
+
+import pytest
+import yaml
+from conftest import compose_config
+from omegaconf import DictConfig, OmegaConf
+
+from hpamdp import memory
+from hpamdp.config import GROUPS, ConfigError, read
+from hpamdp.run import assemble as assemble_module
+from hpamdp.run.assemble import assemble
+from hpamdp.run.train import run
+
+SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "eval.every=0"]
+PLATFORM = "env=platform high=none low=random "
+GYMNASIUM = "env=gymnasium high=none low=random env.max_steps=9 "
+
+REFUSED = [
+    # More than there is memory for.
+    ("num_envs=1000000000", "num_envs=1000000000, steps_per_batch=4: the run takes at least "),
+    ("num_envs=100000000000000000000", "num_envs=100000000000000000000: must lie between "),
+    ("steps_per_batch=1000000000", "num_envs=4, steps_per_batch=1000000000: the run takes at least "),
+    ("eval.layouts=1000000000", "eval.layouts=1000000000: the run takes at least "),
+    (PLATFORM + "eval.layouts=10000000000", "eval.layouts=10000000000: the run takes at least "),
+    ("low.buffer_size=10000000000", "low.buffer_size=10000000000: the run takes at least "),
+    ("low.buffer_size=10000000000 low.batch_size=10000000000", "low.buffer_size=10000000000: the run takes at least "),
+    ("low=hppo low.minibatch_size=100000000000", "low.minibatch_size=100000000000: the run takes at least "),
+    ("low=pdqn low.hidden_dims=[1000000,1000000]", "low.hidden_dims=[1000000, 1000000]: the run takes at least "),
+    ("low=hppo low.critic_hidden_dims=[10000000000]", "low.critic_hidden_dims=[10000000000]: the run takes at least "),
+    ("high=actor high.hidden_dims=[10000000000]", "high.hidden_dims=[10000000000]: the run takes at least "),
+    ("high=meta_critic high.buffer_size=100000000000", "high.buffer_size=100000000000: the run takes at least "),
+    ("low.codec_hidden_dim=1000000000000", "low.codec_hidden_dim=1000000000000, low.buffer_size=300000: takes more "),
+    ("low.latent_dim=1000000000000", "low.latent_dim=1000000000000, low.buffer_size=300000: takes more memory "),
+    ("high.memory=sliding_window high.window=10000000000000", "high.window=10000000000000: takes more memory "),
+    # Numbers out of all proportion.
+    ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO, conf/low/hppo.yaml)"),
+    ("low=pdqn low.actor_lr=5", "low.actor_lr=5: must be above 0 and at most 1"),
+    ("low=hsac low.temperature_lr=0", "low.temperature_lr=0: must be above 0 and at most 1"),
+    ("high=actor high.lr=-1", "high.lr=-1: must be above 0 and at most 1"),
+    ("low=hppo low.lr_final=0.5", "low: lr_final=0.5: must be at most lr=0.001"),
+    ("low=hppo low.min_scale_final=2", "low: min_scale_final=2.0: must be less than max_scale=1.0"),
+    ("low.kl_weight=1e30", "low.kl_weight=1e+30: must lie between -1000000000000.0 and 1000000000000.0 (HyAR"),
+    ("low=pdqn low.parameter_noise=1e30", "low.parameter_noise=1e+30: must lie between "),
+    ("high=epsilon_greedy high.epsilon_scale=1e300", "high.epsilon_scale=1e+300: must lie between "),
+    ("total_frames=100000000000000000000", "total_frames=100000000000000000000: must lie between "),
+    (PLATFORM + "env.max_steps=1000000000000000000000", "env.max_steps=1000000000000000000000: must lie between "),
+    (PLATFORM + "env.noise=1e9", "env: PlatformEnv: noise=1000000000.0, but must lie between 0 and 100"),
+    ("env.motor_noise=1e9", "env: BoatDockEnv: motor_noise=1000000000.0, but must lie between 0 and 10"),
+    ("env.motor_noise=[0,11]", "env: BoatDockEnv: motor_noise=11.0, but must lie between 0 and 10"),
+    ("env.sensor_noise=1e9", "env: BoatDockEnv: sensor_noise=1000000000.0, but must lie between 0 and 1000"),
+    # Values that contradict one another.
+    ("low.buffer_size=4 low.batch_size=64", "low: batch_size=64: must be at most buffer_size=4"),
+    ("high=meta_critic high.batch_size=60000", "high: batch_size=60000: must be at most buffer_size=50000"),
+    ("low=pdqn low.n_step=5", "low.n_step=5: must be at most steps_per_batch=4, as sums of rewards end with a batch"),
+    ("low=qpamdp low.sigma_final=5", "low: sigma_final=5.0: must be at most sigma=0.1"),
+    ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_samples=256, num_iterations=5: a plan would try"),
+    ("low=hppo low.epochs=100000", "low: epochs=100000: must be at most 1000"),
+    ("low.updates_per_frame=1e9", "low: updates_per_frame=1000000000.0: must be at most 1000"),
+    ("low=qpamdp low.features=[]", "low: features=[]: name some of the observation's entries 0 to 15; null: all"),
+    ("low=qpamdp low.features=[0,16]", "low: features=[0, 16]: name some of the observation's entries 0 to 15"),
+    ("low=qpamdp low.features=[0,0]", "low: features=[0, 0]: names an entry twice"),
+    ("low=qpamdp low.phi_order=1000000", "low: phi_order=1000000: gives "),
+    ("low=qpamdp low.psi_order=200", "low: psi_order=200: gives "),
+    ("high=linucb high.inputs=[1,1]", "high: inputs=[1, 1]: names an entry twice"),
+    # Budgets, of which the run may take nothing.
+    ("low.budget.num_envs=-1", "low.budget.num_envs=-1: must be greater than 0 (conf/low/hyar.yaml)"),
+    ("low.budget.eval_every=-5", "low.budget.eval_every=-5: must be greater than or equal to 0"),
+    ("low.budget.total_frames=abc", 'low.budget.total_frames="abc": must be a valid integer'),
+    ("low.budget.foo=3", "low.budget.foo: no such value of low.budget (conf/low/hyar.yaml); it has eval_every, "),
+    ("low.budget=3", "low.budget=3: must be a mapping (conf/low/hyar.yaml)"),
+    # Parts of another kind.
+    ("low=random low._target_=hpamdp.policies.random_agent.random_agent", "there is no class random_agent in "),
+    ("low=random low._target_=torch.nn.Identity", "low=random: Identity is no Learner (hpamdp.policies.base)"),
+    ("high=uniform high._target_=torch.nn.Identity", "high=uniform: Identity is no Selector (hpamdp.policies.base)"),
+    ("low._target_=collections.OrderedDict", "; and 22 more like this"),
+    ("agent=null", "agent=null: must be a mapping (conf/config.yaml)"),
+    ("env.motor_noise=[1]", "env.motor_noise=[1]: must be a valid number or must have at least 2 items (BoatDockEnv"),
+    ("low=hppo low.critic_hidden_dims=[]", "low.critic_hidden_dims=[]: must have at least 1 item (HPPO"),
+    ("env=boatdock_released high=none env.test_mode=2", "env.test_mode=2: must be 0, 1 or null (Released"),
+    ("logger=wandb logger.project=''", 'logger.project="": must have at least 1 character (WandbLogger'),
+    ("logger=wandb logger.project=a/b#c", "logger: project=a/b#c: Invalid project name 'a/b#c': cannot contain "),
+    # Observations of others.
+    (
+        GYMNASIUM + "env.entry_point=toy_environments:OldGoal env.observation_keys=[2]",
+        "observation_keys=[2]: must name different entries of [0, 1]; null: all",
+    ),
+    (
+        GYMNASIUM + "env.entry_point=toy_environments:Toy env.observation_keys=[0]",
+        "has no entries; use null",
+    ),
+    (GYMNASIUM + "env.id=CartPole-v1 env.observation_keys=0", "env.observation_keys=0: must be a list"),
+]
+
+
+@functools.cache
+def composed(*choices: str) -> DictConfig:
+    return compose_config([*SMALL, *choices])
+
+
+def config_of(words: str) -> DictConfig:
+    """Compose the choices of groups and set the other words, which is quicker than composing all of them."""
+    pairs = [word.partition("=") for word in words.split()]
+    cfg = copy.deepcopy(composed(*(f"{key}={value}" for key, _, value in pairs if key in GROUPS)))
+    for key, _, value in pairs:
+        if key not in GROUPS:
+            # YAML reads 1e30 as a text, Hydra as a number.
+            read_value = float(value) if re.fullmatch(r"\d+e\d+", value) else yaml.safe_load(value)
+            OmegaConf.update(cfg, key, read_value, merge=False, force_add=True)
+    return cfg
+
+
+@pytest.mark.parametrize(("words", "line"), REFUSED, ids=[words for words, _ in REFUSED])
+def test_what_no_run_can_have_is_refused_in_one_line(words, line, tmp_path):
+    with pytest.raises(ConfigError) as raised:
+        assemble(read(config_of(words)), tmp_path)
+    assert line in str(raised.value) and "\n" not in str(raised.value)
+
+
+def test_the_estimate_of_memory_counts_all_parts_together(monkeypatch, tmp_path):
+    config = read(config_of("low.buffer_size=1000000"))
+    assemble(config, tmp_path)
+    monkeypatch.setattr(assemble_module, "total_memory", lambda device: 100_000_000)
+    line = r"^low.buffer_size=1000000: the run takes at least 0\.3 GB of memory, and there are 0\.1 GB$"
+    with pytest.raises(ConfigError, match=line):
+        assemble(config, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [MemoryError(), RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried to allocate 9")],
+)
+def test_memory_that_does_not_suffice_during_training_is_told_in_one_line(error, monkeypatch, tmp_path):
+    def train(self):
+        raise error
+
+    monkeypatch.setattr("hpamdp.run.train.Trainer.train", train)
+    with pytest.raises(
+        ConfigError, match=r"^num_envs=4, .*eval\.layouts=4, .*: the run takes more memory than there is"
+    ):
+        run(config_of("low=random"), tmp_path)
+
+
+def test_other_errors_are_not_taken_for_missing_memory():
+    assert memory.is_about_memory(RuntimeError("CUDA out of memory. Tried to allocate 20.00 GiB"))
+    assert not memory.is_about_memory(RuntimeError("mat1 and mat2 shapes cannot be multiplied"))
+    assert not memory.is_about_memory(KeyError("out of memory"))
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """Return the folder of a run of H-PPO on Platform."""
+    folder = tmp_path_factory.mktemp("saved") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
+        assert run(config_of("env=platform high=none low=hppo low.minibatch_size=16 env.noise=0.5"), folder) == 0
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("word", "line"),
+    [
+        ("low.clip=-1", "low.clip=-1: resume takes the agent from "),
+        ("low=hyar", "low=hyar: resume takes the agent from "),
+        ("env.nose=1", "env.nose: no such option of PlatformEnv (conf/env/platform.yaml); did you mean noise? It has "),
+        ("env.noise=-1", "env: PlatformEnv: noise=-1.0, but must lie between 0 and 100"),
+        ("data=human", "data=human: low=hppo learns from its own steps only"),
+        ("total_frames=16", "total_frames=16: the run that is continued has 32 already; set more, or leave it out"),
+    ],
+)
+def test_errors_of_a_resumed_run_name_its_own_parts(word, line, saved, command):
+    code, _, err = command(f"resume={saved}", word)
+    assert code == 2 and err.count("\n") == 1 and line in err
+
+
+def test_a_resumed_run_keeps_the_saved_options_of_the_choices_that_it_does_not_change(
+    saved, command, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
+    for number, words in enumerate((["env.max_steps=50"], ["env=platform", "low=hppo"])):
+        assert command(f"resume={saved}", f"hydra.run.dir={number}", *words)[0] == 0
+        config = OmegaConf.load(tmp_path / f"{number}/config.yaml")
+        assert config.env.noise == 0.5 and config.low.name == "hppo"
+        assert config.env.max_steps == (50 if number == 0 else 200)
