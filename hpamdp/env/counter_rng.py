@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 # Separate streams: evaluation never meets a layout of training, and noise changes no layout.
-TRAINING, EVALUATION, NOISE = range(3)
+TRAINING, EVALUATION, NOISE, EVALUATION_NOISE = range(4)
 
 
 def _shift_right(h: Tensor, bits: int) -> Tensor:
