@@ -6,6 +6,7 @@ is the same for all of them: specs, checks of actions, masked steps and resets, 
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Generic, Protocol, TypeVar
@@ -136,6 +137,12 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def state(self) -> EpisodeState:
         """The columns of the state, `[N]` each."""
         return self._state
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[observation_dim]` each."""
+        dim = len(self.observation_names)
+        return [-math.inf] * dim, [math.inf] * dim
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]`."""

@@ -5,7 +5,7 @@ Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644; see `hpamdp.env.plat
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -67,6 +67,11 @@ class PlatformEnv(CounterEnv[PlatformState]):
             first_env=first_env,
         )
         self.noise = noise
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[9]` each."""
+        return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
 
     def start(self, episode: Tensor, rng: Tensor) -> PlatformState:
         """Return the states at the beginning of the course; nothing about them is random."""
