@@ -105,8 +105,8 @@ def act(
     edge = torch.where(state.x < LEFT[2] - _BODY_WIDTH, RIGHT[1], RIGHT[2])
     edge = torch.where(state.x < LEFT[1] - _BODY_WIDTH, RIGHT[0], edge)
     is_jump = (discrete != RUN) & (state.x <= edge)  # an agent beyond the edge falls, whatever it chooses
-    first = state.steps * _NUMBERS_PER_ACTION
-    rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE)
+    first = first_number(state)
+    rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE).to(state.x.dtype)
     push = parameter / (2.0 * rise / _GRAVITY + 1.0) - state.speed
     push = push - noise * _JUMP_NOISE * normal(first).abs()
     rise = rise - noise * _JUMP_NOISE * normal(first + 1).abs()
@@ -139,6 +139,11 @@ def act(
     outcome = torch.where(x >= END, ARRIVED, outcome).to(torch.int32)
     speed = torch.where(is_stopped, 0.0, speed)
     return PlatformState(x, speed, enemy_x, enemy_speed, state.steps + 1, outcome, state.episode)
+
+
+def first_number(state: PlatformState) -> Tensor:
+    """Return the index `[N]` of the first random number of the next action: two for a jump, then two for each tick."""
+    return state.steps * _NUMBERS_PER_ACTION
 
 
 def _move(x: Tensor, speed: Tensor, edge: Tensor, power: Tensor, drag: Tensor) -> tuple[Tensor, Tensor, Tensor]:
