@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.counter_env import CounterEnv
-from hpamdp.env.platform import rules
+from hpamdp.env.platform import rendering, rules
 from hpamdp.env.platform.rules import PlatformState
 
 
@@ -92,6 +92,10 @@ class PlatformEnv(CounterEnv[PlatformState]):
     def observe(self, state: PlatformState) -> Tensor:
         """Return the observations `[N, 9]`."""
         return rules.observe(state)
+
+    def draw(self, track: Sequence[PlatformState]) -> np.ndarray:
+        """Return a picture of the course, uint8 `[480, 480, 3]`."""
+        return rendering.draw(track)
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the best possible return as `ceiling`."""
