@@ -31,6 +31,11 @@ def where(mask: Tensor, new: State, old: State) -> State:
     return type(old)(*(o if n is o else torch.where(mask, n, o) for n, o in zip(new, old, strict=True)))
 
 
+def replaced(state: State, **columns: Tensor) -> State:
+    """Return the state with other columns in the place of those of the same names."""
+    return type(state)(*{**state._asdict(), **columns}.values())
+
+
 def restored(saved: Mapping[str, Tensor], current: State, owner: str) -> State:
     """Return the state that was saved as `_asdict`, with the dtypes and devices of the current one.
 

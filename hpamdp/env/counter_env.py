@@ -1,0 +1,283 @@
+"""A base for problems whose state is a tuple of columns and whose random numbers are functions of counters.
+
+A subclass hands over three pure functions: how an episode starts, what an action does, and what is observed. The rest
+is the same for all of them: specs, checks of actions, masked steps and resets, the time limit, seeds and checkpoints.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Categorical, Composite, Unbounded
+
+from hpamdp import keys
+from hpamdp.env import counter_rng
+from hpamdp.env.actions import invalid_action
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.columns import Columns, replaced, restored, where
+from hpamdp.env.counter_rng import Key
+
+# The first two of a problem's outcomes; the last one is the time limit.
+GOING_ON, SUCCESS = 0, 1
+
+
+class EpisodeColumns(Columns, Protocol):
+    """A `NamedTuple` of columns `[N]`, among them int32 `steps`, `outcome` and `episode`."""
+
+    @property
+    def steps(self) -> Tensor:
+        """Number of actions of the episode so far."""
+
+    @property
+    def outcome(self) -> Tensor:
+        """How the episode ended, or GOING_ON."""
+
+    @property
+    def episode(self) -> Tensor:
+        """Number of the environment's episode."""
+
+
+EpisodeState = TypeVar("EpisodeState", bound=EpisodeColumns)
+
+
+class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
+    """`num_envs` copies of a problem in one batch dimension.
+
+    A subclass sets the class attributes below and defines `start`, `act` and `observe`. The parameters of the chosen
+    action are clipped to their bounds; NaN and infinite ones are refused, and so are unknown actions. The parameters
+    of the other actions are never read.
+
+    Random numbers depend on the seed, the number of the environment and the episode. Training and evaluation draw
+    theirs from separate streams, and so do the starts of episodes and the noise within them.
+
+    Args:
+        num_envs: number of environments.
+        max_steps: actions after which an episode is truncated.
+        parameter_low, parameter_high: bounds of the parameters of all discrete actions, side by side.
+        device: of the tensors.
+        seed: of all random numbers; the global generators are neither read nor moved.
+        first_env: number of the first environment, where other processes have those before it.
+        oracle: also write the action of the hand-written player, `scripted_action`, under `oracle`.
+
+    Raises:
+        ValueError: an argument or an action is invalid; the state is unchanged.
+    """
+
+    outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
+    observation_names: tuple[str, ...]
+    result_keys = (keys.OUTCOME,)
+    num_envs: int
+    _state: EpisodeState
+
+    def __init__(
+        self,
+        num_envs: int,
+        *,
+        max_steps: int,
+        parameter_low: Sequence[float],
+        parameter_high: Sequence[float],
+        device: torch.device | str | None,
+        seed: int,
+        first_env: int,
+        oracle: bool = False,
+    ) -> None:
+        for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
+            if value < 1:
+                raise ValueError(f"{type(self).__name__}: {name}={value}, but must be at least 1")
+        super().__init__(device=device, batch_size=[num_envs])
+        self.num_envs = num_envs
+        self.max_steps = max_steps
+        self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
+        low, high = torch.tensor(parameter_low, device=self.device), torch.tensor(parameter_high, device=self.device)
+        self._has_oracle = oracle
+        self._make_specs(low, high)
+        self._place_parameters(low, high)
+        self._set_seed(seed)
+
+    @abstractmethod
+    def start(self, episode: Tensor, rng: Key) -> EpisodeState:
+        """Return the states in which episodes begin.
+
+        Args:
+            episode: their numbers, int32 `[N]`.
+            rng: keys for `counter_rng.uniform` and `normal`, `[N]`.
+        """
+
+    @abstractmethod
+    def act(
+        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+    ) -> tuple[EpisodeState, Tensor]:
+        """Return the states after one action in every environment, and the rewards `[N]`.
+
+        Args:
+            state: before the action.
+            discrete: the chosen actions, int64 `[N]`.
+            parameters: of the chosen actions, within their bounds, `[N, D]`, where D is the largest number of
+                parameters that an action has; what an action does not have is 0.
+            rng: keys of the episodes' noise, `[N]`.
+            is_idle: bool `[N]`: rows whose result is thrown away, since their episode is over or their step is masked.
+        """
+
+    @abstractmethod
+    def observe(self, state: EpisodeState) -> Tensor:
+        """Return the observations `[N, observation_dim]`."""
+
+    def scripted_action(self, state: EpisodeState) -> tuple[Tensor, Tensor]:
+        """Return the action of a hand-written player and its one parameter, `[N]` each, for comparison with learners.
+
+        A subclass that has one takes the argument `oracle`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no hand-written player")
+
+    def draw(self, track: Sequence[EpisodeState]) -> np.ndarray:
+        """Return a picture of an episode so far, uint8 `[480, 480, 3]`.
+
+        Args:
+            track: the states of one environment from the start on, columns `[1]`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no pictures")
+
+    @property
+    def state(self) -> EpisodeState:
+        """The columns of the state, `[N]` each."""
+        return self._state
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[observation_dim]` each."""
+        dim = len(self.observation_names)
+        return [-math.inf] * dim, [math.inf] * dim
+
+    def results(self, last: TensorDictBase) -> dict[str, Tensor]:
+        """Return `success` bool `[M]`."""
+        return {"success": last.get(keys.OUTCOME) == SUCCESS}
+
+    def env_state(self) -> dict[str, Tensor]:
+        """Return the columns of the state, `[N]` each."""
+        return self._state._asdict()
+
+    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Continue from an `env_state`; an empty one starts new episodes.
+
+        Raises:
+            ValueError: they are not the columns of a state of this many environments.
+        """
+        if not columns:
+            self._reset()
+            return
+        self._state = restored(columns, self._state, type(self).__name__)
+
+    def seed_evaluation(self, seed: int) -> None:
+        """Begin with the episodes of an evaluation, which no training meets, whatever its seed."""
+        self.set_seed(seed)
+        self._streams = (counter_rng.EVALUATION, counter_rng.EVALUATION_NOISE)
+        self._begin()
+
+    def _make_specs(self, low: Tensor, high: Tensor) -> None:
+        n, device = self.num_envs, self.device
+        self.observation_spec = Composite(
+            observation=Unbounded(shape=(n, len(self.observation_names)), device=device),
+            outcome=Categorical(len(self.outcomes), shape=(n,), device=device),
+            shape=(n,),
+        )
+        if self._has_oracle:
+            self.observation_spec["oracle"] = Composite(
+                discrete=Categorical(len(self.parameter_dims), shape=(n, 1), device=device),
+                parameters=Unbounded(shape=(n, 1), device=device),
+                shape=(n,),
+            )
+        self.action_spec = self.make_action_spec(low, high)
+        self.reward_spec = Unbounded(shape=(n, 1), device=device)
+        self.done_spec = self.make_done_spec()
+
+    def _place_parameters(self, low: Tensor, high: Tensor) -> None:
+        """Note where the parameters of each discrete action lie, and their bounds, `[K, D]` each."""
+        dims = torch.tensor(self.parameter_dims, device=self.device).unsqueeze(-1)
+        number = torch.arange(max(self.parameter_dims), device=self.device)
+        self._has_parameter = number < dims
+        place = (dims.cumsum(0) - dims + number).clamp(max=len(low) - 1)
+        self._parameter_place = place
+        self._parameter_low, self._parameter_high = low[place], high[place]
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
+        self._streams = (counter_rng.TRAINING, counter_rng.NOISE)
+        self._begin()
+
+    def _begin(self) -> None:
+        """Put every environment before its first episode."""
+        self._state = self._start(torch.full_like(self._environment, -1))
+
+    def _start(self, episode: Tensor) -> EpisodeState:
+        return self.start(episode, counter_rng.key_for(self._seed, self._streams[0], self._environment, episode))
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        fresh = self._start(self._state.episode + 1)
+        self._state = fresh if mask is None else where(mask.reshape(self.num_envs), fresh, self._state)
+        return self._read()
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        # `_reset` returns the rows that were not reset as they are, so TorchRL's merge by mask would change nothing.
+        if tensordict is None:
+            return tensordict_reset
+        tensordict.pop("_reset", None)
+        return tensordict.update(tensordict_reset)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        discrete, parameters = self._read_action(tensordict)
+        before = self._state
+        is_idle = before.outcome != GOING_ON
+        mask = tensordict.get("_step", None)
+        if mask is not None:
+            is_idle = is_idle | ~mask.reshape(self.num_envs)
+        rng = counter_rng.key_for(self._seed, self._streams[1], self._environment, before.episode)
+        after, reward = self.act(before, discrete, parameters, rng, is_idle)
+        is_out_of_time = (after.steps >= self.max_steps) & (after.outcome == GOING_ON)
+        after = replaced(after, outcome=torch.where(is_out_of_time, len(self.outcomes) - 1, after.outcome))
+        self._state = where(is_idle, before, after)
+        return self._read().set(keys.REWARD, torch.where(is_idle, 0.0, reward).unsqueeze(-1))
+
+    def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Check the action; return its discrete part `[N]` and its own parameters `[N, D]`, clipped, as `act` does."""
+        self.check_action(tensordict)
+        given = tensordict.get(keys.DISCRETE).long()
+        exists = (given >= 0) & (given < len(self.parameter_dims))
+        discrete = torch.where(exists, given, 0)
+        own = tensordict.get(keys.PARAMETERS).to(self._parameter_low.dtype).gather(-1, self._parameter_place[discrete])
+        has_parameter = self._has_parameter[discrete]
+        is_valid = exists & (own.isfinite() | ~has_parameter).all(-1)
+        if not is_valid.all():
+            row = int((~is_valid).nonzero()[0])
+            values: dict[str, tuple[object, str]] = {
+                "discrete": (given[row].item(), f"allowed 0 to {len(self.parameter_dims) - 1}")
+            }
+            if exists[row]:
+                values["parameters"] = (own[row].tolist(), "those of the chosen action must be finite")
+            raise invalid_action(row, values)
+        own = own.clamp(self._parameter_low[discrete], self._parameter_high[discrete])
+        return discrete, torch.where(has_parameter, own, 0.0)
+
+    def _read(self) -> TensorDict:
+        outcome = self._state.outcome.long()
+        done = (outcome != GOING_ON).unsqueeze(-1)
+        truncated = (outcome == len(self.outcomes) - 1).unsqueeze(-1)
+        leaves = {
+            keys.OBSERVATION: self.observe(self._state),
+            keys.OUTCOME: outcome,
+            keys.DONE: done,
+            keys.TERMINATED: done & ~truncated,
+            keys.TRUNCATED: truncated,
+        }
+        seen = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        if self._has_oracle:
+            discrete, parameter = self.scripted_action(self._state)
+            seen.set("oracle", {"discrete": discrete.unsqueeze(-1), "parameters": parameter.unsqueeze(-1)})
+        return seen
