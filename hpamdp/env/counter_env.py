@@ -6,6 +6,7 @@ is the same for all of them: specs, checks of actions, masked steps and resets, 
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Generic, Protocol, TypeVar
@@ -62,13 +63,14 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         device: of the tensors.
         seed: of all random numbers; the global generators are neither read nor moved.
         first_env: number of the first environment, where other processes have those before it.
+        oracle: also write the action of the hand-written player, `scripted_action`, under `oracle`.
 
     Raises:
         ValueError: an argument or an action is invalid; the state is unchanged.
     """
 
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
-    observation_names: ClassVar[tuple[str, ...]]
+    observation_names: tuple[str, ...]
     result_keys = (keys.OUTCOME,)
     num_envs: int
     _state: EpisodeState
@@ -83,6 +85,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         device: torch.device | str | None,
         seed: int,
         first_env: int,
+        oracle: bool = False,
     ) -> None:
         for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
             if value < 1:
@@ -92,6 +95,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         self.max_steps = max_steps
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         low, high = torch.tensor(parameter_low, device=self.device), torch.tensor(parameter_high, device=self.device)
+        self._has_oracle = oracle
         self._make_specs(low, high)
         self._place_parameters(low, high)
         self._set_seed(seed)
@@ -124,6 +128,13 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def observe(self, state: EpisodeState) -> Tensor:
         """Return the observations `[N, observation_dim]`."""
 
+    def scripted_action(self, state: EpisodeState) -> tuple[Tensor, Tensor]:
+        """Return the action of a hand-written player and its one parameter, `[N]` each, for comparison with learners.
+
+        A subclass that has one takes the argument `oracle`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no hand-written player")
+
     def draw(self, track: Sequence[EpisodeState]) -> np.ndarray:
         """Return a picture of an episode so far, uint8 `[480, 480, 3]`.
 
@@ -136,6 +147,12 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def state(self) -> EpisodeState:
         """The columns of the state, `[N]` each."""
         return self._state
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[observation_dim]` each."""
+        dim = len(self.observation_names)
+        return [-math.inf] * dim, [math.inf] * dim
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]`."""
@@ -169,6 +186,12 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             outcome=Categorical(len(self.outcomes), shape=(n,), device=device),
             shape=(n,),
         )
+        if self._has_oracle:
+            self.observation_spec["oracle"] = Composite(
+                discrete=Categorical(len(self.parameter_dims), shape=(n, 1), device=device),
+                parameters=Unbounded(shape=(n, 1), device=device),
+                shape=(n,),
+            )
         self.action_spec = self.make_action_spec(low, high)
         self.reward_spec = Unbounded(shape=(n, 1), device=device)
         self.done_spec = self.make_done_spec()
@@ -252,4 +275,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             keys.TERMINATED: done & ~truncated,
             keys.TRUNCATED: truncated,
         }
-        return TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        seen = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        if self._has_oracle:
+            discrete, parameter = self.scripted_action(self._state)
+            seen.set("oracle", {"discrete": discrete.unsqueeze(-1), "parameters": parameter.unsqueeze(-1)})
+        return seen

@@ -5,6 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import pkgutil
+from typing import Any
+
+import gymnasium
 
 import hpamdp.env
 
@@ -20,3 +23,22 @@ def register() -> None:
         name = f"{problem.name}.registration"
         if problem.ispkg and importlib.util.find_spec(name) is not None:
             importlib.import_module(name).register()
+
+
+def register_counter_env(env_id: str, problem: str, **settings: Any) -> None:
+    """Register an id of a `CounterEnv`, single and vectorised; calling it again changes nothing.
+
+    Args:
+        env_id: such as `hpamdp/Platform-v0`.
+        problem: the environment's class as text, `package.module:Class`.
+        settings: what its constructor takes, where this id fixes it.
+    """
+    if env_id in gymnasium.registry:
+        return
+    # No max_episode_steps: the environment itself truncates after its last step.
+    gymnasium.register(
+        id=env_id,
+        entry_point="hpamdp.env.faces:CounterFace",
+        vector_entry_point="hpamdp.env.faces:CounterVectorFace",
+        kwargs={"problem": problem, **settings},
+    )

@@ -23,7 +23,8 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import OBSERVATION_NAMES, SCALED_NAMES, Rules
+from hpamdp.env.boatdock.episode import OBSERVATION_NAMES, SCALED_NAMES, BoatState, Rules
+from hpamdp.env.faces import NumpyEnv, as_array, describe, to_numpy
 
 ActionFormat = Literal["dict", "tuple"]
 
@@ -70,8 +71,10 @@ def observation_space(rules: Rules) -> spaces.Box:
     return spaces.Box(low, high, dtype=np.float32)
 
 
-class NumpyBoats:
+class NumpyBoats(NumpyEnv):
     """BoatDockEnv with NumPy in and out: one boat (`batch=()`) or many (`batch=(N,)`)."""
+
+    final_infos = ("score",)
 
     def __init__(self, env: BoatDockEnv, batch: tuple[int, ...], action_format: ActionFormat) -> None:
         if action_format not in ("dict", "tuple"):
@@ -83,6 +86,11 @@ class NumpyBoats:
         self._batch = batch
         self._is_tuple = action_format == "tuple"
         self._leaf_names = ("option", "key", "duration") if env.has_choice else ("key", "duration")
+
+    @property
+    def state(self) -> BoatState:
+        """The boats as they are."""
+        return self.env.state
 
     def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
         """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, observation_dim]`."""
@@ -144,46 +152,25 @@ class NumpyBoats:
         names = ", ".join(self._leaf_names)
         if self._is_tuple:
             if not isinstance(action, (tuple, list)) or len(action) != len(self._leaf_names):
-                raise ValueError(f"step: the action must be a tuple ({names}), but is {_describe(action)}")
+                raise ValueError(f"step: the action must be a tuple ({names}), but is {describe(action)}")
             action = dict(zip(self._leaf_names, action, strict=True))
             durations = action["duration"]
             if not isinstance(durations, (tuple, list)) or len(durations) != harbour.NUM_KEYS:
                 allowed = f"a tuple of length {harbour.NUM_KEYS}"
-                raise ValueError(f"step: duration must be {allowed}, but is {_describe(durations)}")
-            action["duration"] = np.concatenate([self._array("step: duration", d, (1,)) for d in durations], axis=-1)
+                raise ValueError(f"step: duration must be {allowed}, but is {describe(durations)}")
+            action["duration"] = np.concatenate(
+                [as_array("step: duration", d, (*self._batch, 1)) for d in durations], axis=-1
+            )
         elif not isinstance(action, Mapping) or set(action) != set(self._leaf_names):
-            raise ValueError(f"step: the action must be a dict with keys {names}, but is {_describe(action)}")
+            raise ValueError(f"step: the action must be a dict with keys {names}, but is {describe(action)}")
         leaves = {"duration": self._tensor("step: duration", action["duration"], (harbour.NUM_KEYS,))}
         for name in self._leaf_names[:-1]:
             leaves[name] = self._tensor(f"step: {name}", action[name], (), is_integer=True)
         return leaves
 
     def _tensor(self, name: str, value: Any, shape: tuple[int, ...], is_integer: bool = False) -> torch.Tensor:
-        array = self._array(name, value, shape, is_integer).astype(np.int64 if is_integer else np.float64)
+        array = as_array(name, value, self._batch + shape, is_integer=is_integer).astype(
+            np.int64 if is_integer else np.float64
+        )
         tensor = torch.from_numpy(array).reshape(self.env.num_envs, *shape)
         return tensor if is_integer else tensor.to(torch.float32)
-
-    def _array(self, name: str, value: Any, shape: tuple[int, ...], is_integer: bool = False) -> np.ndarray:
-        try:
-            array = np.asarray(value)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name} must be an array, but is {_describe(value)}") from None
-        if array.dtype.kind not in ("iu" if is_integer else "iuf"):
-            raise ValueError(f"{name} has type {array.dtype}, but must be {'integer' if is_integer else 'a number'}")
-        if array.shape != self._batch + shape:
-            raise ValueError(f"{name} has shape {list(array.shape)}, but must be {list(self._batch + shape)}")
-        return array
-
-
-def _describe(value: Any) -> str:
-    kind = type(value).__name__
-    if isinstance(value, Mapping):
-        return f"a {kind} with keys {', '.join(map(str, value))}"
-    if isinstance(value, (tuple, list)):
-        return f"a {kind} of length {len(value)}"
-    return f"a {kind}"
-
-
-def to_numpy(tensor: torch.Tensor) -> np.ndarray:
-    """Return a copy of a tensor as an array that shares no memory with it."""
-    return tensor.cpu().numpy().copy()

@@ -8,29 +8,20 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
 
-Point = tuple[float, float]
-
-_BACKGROUND = "#f6f4ef"
 _WATER = "#d6e7ec"
 _RIM = "#a5c2cb"
-_INK = "#2d3e48"
-_FAINT = "#7d8b92"
 _PRESSED = "#2f6690"
 _GLIDE = "#86aecb"
 _HULL = "#1d3f58"
 _DOCK, _DOCK_EDGE = "#f4dfb0", "#c8963e"
-_GOOD, _GOOD_EDGE = "#c3e3c6", "#3c8a55"
-_BAD, _BAD_EDGE = "#f1cbbd", "#b9503a"
 _GAUGE_COLOUR = "#e3e1da"
 _LOW_FUEL = 0.25  # below it the gauge turns red
 
-# Shapes are drawn _SMOOTH times too large and averaged down. Text is written afterwards: Pillow smooths it itself.
-_SMOOTH = 3
-_PAPER = 480.0  # units of paper from edge to edge, whatever the size of the picture
 _SCALE = 1.66  # units of paper for each px of the harbour
 _COMPASS = (54.0, 403.0)  # where the arrows of the keys start
 _ARROW = 26.0  # their length
@@ -74,66 +65,29 @@ class Scene:
     score: float | None = None
 
 
-class _Canvas:
-    """A picture addressed in units of paper, so that the same code draws every size."""
-
-    def __init__(self, image: Image.Image) -> None:
-        self.image = image
-        self._pen = ImageDraw.Draw(image)
-        self._unit = image.width / _PAPER
-
-    def disc(self, centre: Point, radius: float, fill: str, edge: str | None = None, width: float = 0.0) -> None:
-        x, y, r = (self._unit * value for value in (*centre, radius))
-        self._pen.ellipse((x - r, y - r, x + r, y + r), fill, edge, round(width * self._unit))
-
-    def line(self, start: Point, end: Point, colour: str, width: float) -> None:
-        """Draw a line with round ends."""
-        self._pen.line([self._unit * value for value in (*start, *end)], colour, round(width * self._unit))
-        for point in (start, end):
-            self.disc(point, width / 2.0, colour)
-
-    def polygon(self, points: list[Point], fill: str, edge: str | None = None, width: float = 0.0) -> None:
-        scaled = [(self._unit * x, self._unit * y) for x, y in points]
-        self._pen.polygon(scaled, fill, edge, round(width * self._unit))
-
-    def bar(self, box: tuple[float, float, float, float], colour: str) -> None:
-        """Draw a bar with round ends; `box` is left, top, right, bottom."""
-        radius = min(box[2] - box[0], box[3] - box[1]) / 2.0
-        self._pen.rounded_rectangle([self._unit * value for value in box], radius * self._unit, colour)
-
-    def write(self, place: Point, text: str, colour: str = _INK, size: float = 14.0, anchor: str = "lm") -> None:
-        x, y = place
-        self._pen.text((x * self._unit, y * self._unit), text, colour, _font(size * self._unit), anchor)
-
-
 def draw(scene: Scene, size: int = 480) -> np.ndarray:
     """Return a picture of the scene, uint8 `[size, size, 3]`."""
-    canvas = _Canvas(_empty_harbour(size).copy())
+    canvas = Canvas(_empty_harbour(size).copy())
     _draw_places(canvas, scene)
     _draw_track(canvas, scene)
     _draw_boat(canvas, scene)
     _draw_gauge(canvas, scene.fuel)
     _draw_compass(canvas, scene)
-    finished = _Canvas(canvas.image.reduce(_SMOOTH))
+    finished = Canvas(canvas.image.reduce(SMOOTH))
     _write_labels(finished, scene)
     return np.array(finished.image)
 
 
-@lru_cache(maxsize=4)
-def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)
-
-
 @lru_cache(maxsize=2)
 def _empty_harbour(size: int) -> Image.Image:
-    canvas = _Canvas(Image.new("RGB", (size * _SMOOTH, size * _SMOOTH), _BACKGROUND))
+    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
     canvas.disc(_on_paper((0.0, 0.0)), physics.HARBOUR_RADIUS * _SCALE + 1.5, _WATER, _RIM, 3.0)
     return canvas.image
 
 
 def _on_paper(point: Point) -> Point:
     """Map px from the harbour's centre to units of paper."""
-    return _PAPER / 2.0 + point[0] * _SCALE, _PAPER / 2.0 + point[1] * _SCALE
+    return PAPER / 2.0 + point[0] * _SCALE, PAPER / 2.0 + point[1] * _SCALE
 
 
 def _along(start: Point, end: Point, share: float) -> Point:
@@ -143,51 +97,51 @@ def _along(start: Point, end: Point, share: float) -> Point:
 def _colours(scene: Scene) -> tuple[str, str]:
     """Return the fill and edge colours that show the outcome."""
     if scene.outcome == physics.OUTCOMES[physics.SUCCESS]:
-        return _GOOD, _GOOD_EDGE
+        return GOOD, GOOD_EDGE
     if scene.outcome == physics.OUTCOMES[physics.SAILING]:
         return _DOCK, _DOCK_EDGE
-    return _BAD, _BAD_EDGE
+    return BAD, BAD_EDGE
 
 
-def _draw_places(canvas: _Canvas, scene: Scene) -> None:
+def _draw_places(canvas: Canvas, scene: Scene) -> None:
     fill, edge = _colours(scene)
     goal = _on_paper(scene.goal)
     canvas.disc(goal, physics.DOCK_RADIUS * _SCALE, fill, edge, 1.6)
     canvas.disc(goal, 3.0, edge)
 
 
-def _draw_track(canvas: _Canvas, scene: Scene) -> None:
+def _draw_track(canvas: Canvas, scene: Scene) -> None:
     for start, end, pressed in scene.legs:
         release = _on_paper(_along(start, end, pressed))
         canvas.line(release, _on_paper(end), _GLIDE, 2.0)
         canvas.line(_on_paper(start), release, _PRESSED, 3.2)
     for leg in scene.legs[1:]:
-        canvas.disc(_on_paper(leg.start), 3.4, _BACKGROUND, _PRESSED, 1.6)
-    canvas.disc(_on_paper(scene.start), 5.4, _BACKGROUND, _INK, 2.0)
+        canvas.disc(_on_paper(leg.start), 3.4, BACKGROUND, _PRESSED, 1.6)
+    canvas.disc(_on_paper(scene.start), 5.4, BACKGROUND, INK, 2.0)
 
 
-def _draw_boat(canvas: _Canvas, scene: Scene) -> None:
+def _draw_boat(canvas: Canvas, scene: Scene) -> None:
     x, y = _on_paper(scene.boat)
     length = math.hypot(*scene.heading)
     if length == 0.0:
-        canvas.disc((x, y), 7.0, _HULL, _BACKGROUND, 1.6)
+        canvas.disc((x, y), 7.0, _HULL, BACKGROUND, 1.6)
         return
     forward_x = scene.heading[0] / length
     forward_y = scene.heading[1] / length
     # The hull from above, from the bow around: (forward, sideways) in units of paper.
     hull = [(13.0, 0.0), (7.5, 4.6), (0.0, 6.2), (-9.0, 5.0), (-9.0, -5.0), (0.0, -6.2), (7.5, -4.6)]
     turned = [(x + f * forward_x - s * forward_y, y + f * forward_y + s * forward_x) for f, s in hull]
-    canvas.polygon(turned, _HULL, _BACKGROUND, 1.6)
-    canvas.disc((x - 3.0 * forward_x, y - 3.0 * forward_y), 2.4, _BACKGROUND)
+    canvas.polygon(turned, _HULL, BACKGROUND, 1.6)
+    canvas.disc((x - 3.0 * forward_x, y - 3.0 * forward_y), 2.4, BACKGROUND)
 
 
-def _draw_gauge(canvas: _Canvas, fuel: float) -> None:
+def _draw_gauge(canvas: Canvas, fuel: float) -> None:
     left, top, right, bottom = _GAUGE
     canvas.bar(_GAUGE, _GAUGE_COLOUR)
     if fuel > 0.0:
         # At least as wide as high, so that the round ends fit.
         width = max(fuel * (right - left), bottom - top)
-        canvas.bar((left, top, left + width, bottom), _PRESSED if fuel >= _LOW_FUEL else _BAD_EDGE)
+        canvas.bar((left, top, left + width, bottom), _PRESSED if fuel >= _LOW_FUEL else BAD_EDGE)
 
 
 def _directions(scene: Scene) -> tuple[Point, ...]:
@@ -197,28 +151,28 @@ def _directions(scene: Scene) -> tuple[Point, ...]:
     return harbour.DIRECTIONS[2 if scene.controller == harbour.CONGRUENT else scene.keymap - 1]
 
 
-def _draw_compass(canvas: _Canvas, scene: Scene) -> None:
+def _draw_compass(canvas: Canvas, scene: Scene) -> None:
     x, y = _COMPASS
     for dir_x, dir_y in _directions(scene):
         neck = (x + (_ARROW - 6.0) * dir_x, y + (_ARROW - 6.0) * dir_y)
-        canvas.line((x + 5.0 * dir_x, y + 5.0 * dir_y), neck, _INK, 2.4)
+        canvas.line((x + 5.0 * dir_x, y + 5.0 * dir_y), neck, INK, 2.4)
         tip = (x + _ARROW * dir_x, y + _ARROW * dir_y)
         sides = [(neck[0] - s * dir_y, neck[1] + s * dir_x) for s in (-5.0, 5.0)]
-        canvas.polygon([tip, *sides], _INK)
+        canvas.polygon([tip, *sides], INK)
 
 
-def _write_labels(canvas: _Canvas, scene: Scene) -> None:
+def _write_labels(canvas: Canvas, scene: Scene) -> None:
     x, y = _COMPASS
     directions = _directions(scene)
     for number, (dir_x, dir_y) in enumerate(directions, start=1):
         canvas.write((x + (_ARROW + 10.0) * dir_x, y + (_ARROW + 10.0) * dir_y), str(number), size=13.0, anchor="mm")
     name = harbour.CONTROLLERS[scene.controller] if directions else "no boat chosen"
-    canvas.write((18.0, 463.0), name, _INK if directions else _FAINT)
-    canvas.write((_GAUGE[0] - 8.0, 23.0), "fuel", _FAINT, anchor="rm")
-    canvas.write((462.0, 40.0), f"{100.0 * scene.fuel:.0f} %", _FAINT, 12.0, anchor="rm")
-    canvas.write((18.0, 23.0), f"{scene.presses} {'press' if scene.presses == 1 else 'presses'}", _FAINT)
+    canvas.write((18.0, 463.0), name, INK if directions else FAINT)
+    canvas.write((_GAUGE[0] - 8.0, 23.0), "fuel", FAINT, anchor="rm")
+    canvas.write((462.0, 40.0), f"{100.0 * scene.fuel:.0f} %", FAINT, 12.0, anchor="rm")
+    canvas.write((18.0, 23.0), f"{scene.presses} {'press' if scene.presses == 1 else 'presses'}", FAINT)
     if scene.outcome != physics.OUTCOMES[physics.SAILING]:
         colour = _colours(scene)[1]
         canvas.write((462.0, 463.0), scene.outcome.replace("_", " "), colour, 16.0, anchor="rm")
         if scene.score is not None:
-            canvas.write((462.0, 441.0), f"score {scene.score:.2f}", _INK, anchor="rm")
+            canvas.write((462.0, 441.0), f"score {scene.score:.2f}", INK, anchor="rm")

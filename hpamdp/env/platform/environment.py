@@ -5,13 +5,15 @@ Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644; see `hpamdp.env.plat
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hpamdp.env import counter_rng
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.platform import rules
 from hpamdp.env.platform.rules import PlatformState
@@ -42,7 +44,7 @@ class PlatformEnv(CounterEnv[PlatformState]):
 
     discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
-    observation_names: ClassVar[tuple[str, ...]] = rules.OBSERVATION_NAMES
+    observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 1)
 
     def __init__(
@@ -68,6 +70,11 @@ class PlatformEnv(CounterEnv[PlatformState]):
         )
         self.noise = noise
 
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[9]` each."""
+        return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
+
     def start(self, episode: Tensor, rng: Tensor) -> PlatformState:
         """Return the states at the beginning of the course; nothing about them is random."""
         return rules.start(episode)
@@ -78,7 +85,8 @@ class PlatformEnv(CounterEnv[PlatformState]):
         """Return the states after one action, and the distances covered as shares of the course, `[N]`."""
         # Rows that do not move simulate a run, which is shorter than a jump.
         simulated = torch.where(is_idle, rules.RUN, discrete)
-        after = rules.act(state, simulated, parameters.squeeze(-1), rng, self.noise)
+        normal = partial(counter_rng.normal, rng)
+        after = rules.act(state, simulated, parameters.squeeze(-1), normal, self.noise)
         return after, (after.x - state.x) / rules.END
 
     def observe(self, state: PlatformState) -> Tensor:

@@ -8,12 +8,11 @@ many ticks the last action took; the height and the length of a jump have closed
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
-
-from hpamdp.env import counter_rng
 
 RUN, HOP, LEAP = range(3)
 ACTIONS = ("run", "hop", "leap")
@@ -89,7 +88,9 @@ def start(episode: Tensor) -> PlatformState:
     )
 
 
-def act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: Tensor, noise: float) -> PlatformState:
+def act(
+    state: PlatformState, discrete: Tensor, parameter: Tensor, normal: Callable[[Tensor], Tensor], noise: float
+) -> PlatformState:
     """Return the states after one action in every environment.
 
     The action is simulated at full length, `[T, N]`, and then cut off where something ends it.
@@ -98,7 +99,7 @@ def act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: Tensor, 
         state: before the action.
         discrete: RUN, HOP or LEAP, `[N]`.
         parameter: of the chosen action, within its bounds, `[N]`.
-        rng: int32 `[N]` from `counter_rng.key_for`, from which the random numbers come.
+        normal: returns the standard normal numbers with these indices, int32 `[N]` or `[T, N]`, of the episodes.
         noise: factor on the published noise.
     """
     edge = torch.where(state.x < LEFT[2] - _BODY_WIDTH, RIGHT[1], RIGHT[2])
@@ -107,16 +108,16 @@ def act(state: PlatformState, discrete: Tensor, parameter: Tensor, rng: Tensor, 
     first = state.steps * _NUMBERS_PER_ACTION
     rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE)
     push = parameter / (2.0 * rise / _GRAVITY + 1.0) - state.speed
-    push = push - noise * _JUMP_NOISE * counter_rng.normal(rng, first).abs()
-    rise = rise - noise * _JUMP_NOISE * counter_rng.normal(rng, first + 1).abs()
+    push = push - noise * _JUMP_NOISE * normal(first).abs()
+    rise = rise - noise * _JUMP_NOISE * normal(first + 1).abs()
     speed = state.speed + torch.where(is_jump, push.clamp(-_MAX_PUSH, _MAX_PUSH), 0.0)
     # Tick k of a jump, counted from 0, ends at the height (k + 1) (rise - k fall) tick.
     fall = 0.5 * _GRAVITY * _TICK
     length = torch.where(is_jump, (rise / fall).floor().clamp(min=-1.0) + 2.0, _RUN_TICKS)
-    tick = torch.arange(int(length.max()), dtype=torch.int32, device=rng.device).unsqueeze(-1)
+    tick = torch.arange(int(length.max()), dtype=torch.int32, device=state.x.device).unsqueeze(-1)
     index = first + 2 + 2 * tick
-    drag = noise * _TICK_NOISE * counter_rng.normal(rng, index).abs()
-    gust = noise * _TICK_NOISE * counter_rng.normal(rng, index + 1)
+    drag = noise * _TICK_NOISE * normal(index).abs()
+    gust = noise * _TICK_NOISE * normal(index + 1)
 
     before, x, speed = _move(state.x, speed, edge, torch.where(is_jump, 0.0, parameter), drag)
     enemy_x, enemy_speed = _patrol(before, x, state.enemy_x, state.enemy_speed, gust)
@@ -224,5 +225,5 @@ def observe(state: PlatformState) -> Tensor:
         (state.enemy_speed + _ENEMY_SPEED) / (2.0 * _ENEMY_SPEED),
     ]
     platform = (state.x >= LEFT[1]).long() + (state.x >= LEFT[2])
-    features = torch.tensor(_PLATFORM_FEATURES, device=state.x.device)[platform]
+    features = torch.tensor(_PLATFORM_FEATURES, dtype=state.x.dtype, device=state.x.device)[platform]
     return 2.0 * torch.cat([torch.stack(basic, -1), features], -1) - 1.0

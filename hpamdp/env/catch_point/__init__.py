@@ -1,0 +1,1 @@
+"""Catch Point: move to a target and catch it."""

@@ -1,0 +1,136 @@
+"""Catch Point as a batched TorchRL environment: move a point to a target and catch it there.
+
+Source: Fan et al. 2019, arXiv:1903.01344, in the version of Li et al. 2022, arXiv:2109.05490; see
+`hpamdp.env.catch_point.rules`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hpamdp.env import point_agent, point_pictures
+from hpamdp.env.catch_point import rules
+from hpamdp.env.catch_point.rules import CatchPointState
+from hpamdp.env.counter_env import CounterEnv
+
+_CEILING = {25: 0.964, 30: 0.997}  # of success, by the limit of steps: who starts too far away cannot arrive
+
+
+class CatchPointEnv(CounterEnv[CatchPointState]):
+    """Catch the target in `num_envs` planes at once.
+
+    Action leaves: `("action", "discrete")` int64 `[N]`: 0 move, 1 catch; `("action", "parameters")` float32 `[N, 1]`:
+    the direction of a move in [-1, 1], a share of half a turn, clockwise from +y. A move always has full force. Outside
+    its bounds a direction is clipped, NaN and infinity are refused; a catch has no parameter.
+
+    The reward is minus the squared distance after each step, plus 20 for a catch within 0.2 of the target, which ends
+    the episode. A catch elsewhere is a miss.
+
+    Args:
+        num_envs: number of planes.
+        max_steps: actions after which an episode is truncated; HyAR has 25.
+        catches: that an episode allows. The published code has 11, its papers 10.
+        late_end: whether an episode that has no catches left ends a step later, in which it earns 0, as the published
+            code does it.
+        progress: whether misses and time are observed, too, `[N, 6]` instead of `[N, 4]`, as DLPA has it.
+        oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
+        device: of the tensors.
+        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
+        first_env: number of the first plane, where other processes have the planes before it.
+
+    Raises:
+        ValueError: an argument or an action is invalid; the state is unchanged.
+    """
+
+    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
+    parameter_dims = (1, 0)
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_steps: int = 25,
+        catches: int = rules.PUBLISHED_CATCHES,
+        late_end: bool = True,
+        progress: bool = False,
+        oracle: bool = False,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+    ) -> None:
+        if catches < 1:
+            raise ValueError(f"CatchPointEnv: catches={catches}, but must be at least 1")
+        self.observation_names = point_agent.OBSERVATION_NAMES + (rules.PROGRESS_NAMES if progress else ())
+        super().__init__(
+            num_envs,
+            max_steps=max_steps,
+            parameter_low=(-1.0,),
+            parameter_high=(1.0,),
+            device=device,
+            seed=seed,
+            first_env=first_env,
+            oracle=oracle,
+        )
+        self.catches = catches
+        self.late_end = late_end
+        self.progress = progress
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[4]` or `[6]` each."""
+        low, high = point_agent.observation_bounds(self.max_steps)
+        if not self.progress:
+            return low, high
+        return [*low, -1.0, -1.0], [*high, 1.0, self.max_steps / 12.0 - 0.99]
+
+    @property
+    def position(self) -> Tensor:
+        """Where the agents are, `[N, 2]`."""
+        return torch.stack([self.state.x, self.state.y], -1)
+
+    def start(self, episode: Tensor, rng: Tensor) -> CatchPointState:
+        """Return states with agent and target anywhere in the square."""
+        return rules.start(episode, rng)
+
+    def act(
+        self, state: CatchPointState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+    ) -> tuple[CatchPointState, Tensor]:
+        """Return the states after one action and the rewards `[N]`."""
+        return rules.act(state, discrete, parameters.squeeze(-1), catches=self.catches, late_end=self.late_end)
+
+    def observe(self, state: CatchPointState) -> Tensor:
+        """Return the observations `[N, 4]`, or `[N, 6]` with `progress`."""
+        return rules.observe(state, progress=self.progress)
+
+    def scripted_action(self, state: CatchPointState) -> tuple[Tensor, Tensor]:
+        """Return the action of the hand-written player and its parameter, `[N]` each."""
+        return rules.scripted_action(state)
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return the figures of the hand-written player, and the share of starts from which the target is in reach."""
+        ceiling = {"ceiling": {"success": _CEILING[self.max_steps]}} if self.max_steps in _CEILING else {}
+        is_published = (self.max_steps, self.catches, self.late_end) == (25, rules.PUBLISHED_CATCHES, True)
+        return ({"scripted": {"score": 8.5, "success": 0.961}} if is_published else {}) | ceiling
+
+    def draw(self, track: Sequence[CatchPointState]) -> np.ndarray:
+        """Return a picture of the agent's way to the target, uint8 `[480, 480, 3]`."""
+        last = track[-1]
+        misses = int(last.misses)
+        return point_pictures.draw(
+            point_pictures.Scene(
+                path=point_pictures.path_of(track),
+                target=(float(last.target_x), float(last.target_y)),
+                radius=point_agent.HIT_RADIUS,
+                outcome=rules.OUTCOMES[int(last.outcome)],
+                is_over=int(last.outcome) != rules.GOING_ON,
+                is_success=int(last.outcome) == rules.CAUGHT,
+                steps=int(last.steps),
+                note=f"{misses} {'miss' if misses == 1 else 'misses'}",
+            )
+        )

@@ -1,0 +1,12 @@
+"""The Gymnasium id of Catch Point."""
+
+from __future__ import annotations
+
+from hpamdp.env.registration import register_counter_env
+
+CATCH_POINT_ID = "hpamdp/CatchPoint-v0"
+
+
+def register() -> None:
+    """Register the id with Gymnasium; calling it again changes nothing."""
+    register_counter_env(CATCH_POINT_ID, "hpamdp.env.catch_point.environment:CatchPointEnv")

@@ -1,0 +1,95 @@
+"""The rules of Catch Point as pure functions on columns, in the dtype of the state.
+
+Source: Fan et al. 2019, arXiv:1903.01344; constants and rules as in the code of Li et al. 2022 (HyAR),
+arXiv:2109.05490. Differs from the source: an agent that hits the target's centre to the last digit does not lose.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hpamdp.env import point_agent
+
+MOVE, CATCH = range(2)
+ACTIONS = ("move", "catch")
+OUTCOMES = ("going on", "caught", "no catches left", "time limit")
+GOING_ON, CAUGHT, NO_CATCHES_LEFT, TIME_LIMIT = range(4)
+PROGRESS_NAMES = ("misses", "time")
+PUBLISHED_CATCHES = 11
+_FORCE = 2.0
+
+
+class CatchPointState(NamedTuple):
+    """Columns `[N]`: places and speeds of the agent, place of the target, catches that missed; the rest is int32."""
+
+    x: Tensor
+    y: Tensor
+    vx: Tensor
+    vy: Tensor
+    target_x: Tensor
+    target_y: Tensor
+    misses: Tensor
+    steps: Tensor
+    outcome: Tensor
+    episode: Tensor
+
+
+def start(episode: Tensor, rng: Tensor) -> CatchPointState:
+    """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
+    x, y, target_x, target_y = point_agent.start(rng)
+    zeros = torch.zeros_like(x)
+    none = torch.zeros_like(episode)
+    return CatchPointState(x, y, zeros, zeros, target_x, target_y, none, none, none, episode)
+
+
+def act(
+    state: CatchPointState, discrete: Tensor, parameter: Tensor, *, catches: int, late_end: bool
+) -> tuple[CatchPointState, Tensor]:
+    """Return the states after one action in every environment, and the rewards, `[N]`.
+
+    Args:
+        state: before the action.
+        discrete: MOVE or CATCH, `[N]`.
+        parameter: direction of a move as a share of half a turn, clockwise from +y, `[N]`.
+        catches: that an episode allows.
+        late_end: whether an episode without catches ends a step after the last one, as published, in which it earns 0.
+    """
+    is_catch = discrete == CATCH
+    force = torch.where(is_catch, 0.0, _FORCE)
+    angle = math.pi * parameter
+    x, y, vx, vy = point_agent.move(state, force * angle.sin(), force * angle.cos())
+    squared = point_agent.squared_distance(state, x, y)
+    has_catches = state.misses < catches
+    is_hit = is_catch & has_catches & (squared <= point_agent.HIT_RADIUS * point_agent.HIT_RADIUS)
+    misses = state.misses + (is_catch & has_catches & ~is_hit).int()
+    reward = torch.where(has_catches, torch.where(is_hit, point_agent.CATCH_REWARD, 0.0) - squared, 0.0)
+    is_lost = ~has_catches if late_end else misses >= catches
+    outcome = torch.where(is_lost, NO_CATCHES_LEFT, GOING_ON)
+    outcome = torch.where(is_hit, CAUGHT, outcome).int()
+    after = state._replace(x=x, y=y, vx=vx, vy=vy, misses=misses, steps=state.steps + 1, outcome=outcome)
+    return after, reward
+
+
+def observe(state: CatchPointState, *, progress: bool) -> Tensor:
+    """Return the observation `[N, 4]` (speed, and target - agent) and, with `progress`, misses and time `[N, 6]`."""
+    seen = point_agent.observe(state)
+    if not progress:
+        return seen
+    misses = state.misses.clamp(max=PUBLISHED_CATCHES).to(seen.dtype) / 6.0 - 1.0
+    time = state.steps.to(seen.dtype) / 12.0 - 1.0
+    return torch.cat([seen, torch.stack([misses, time], -1)], -1)
+
+
+def scripted_action(state: CatchPointState) -> tuple[Tensor, Tensor]:
+    """Return the action of a hand-written player and its parameter, `[N]` each.
+
+    It catches where that hits, and else pushes towards the target as seen from where the agent would glide to a halt.
+    """
+    miss_x, miss_y = point_agent.rest_offset(state, point_agent.NEXT_GLIDE)
+    can_hit = miss_x.square() + miss_y.square() <= point_agent.HIT_RADIUS * point_agent.HIT_RADIUS
+    to_x, to_y = point_agent.rest_offset(state, point_agent.GLIDE)
+    return torch.where(can_hit, CATCH, MOVE), torch.atan2(to_x, to_y) / math.pi

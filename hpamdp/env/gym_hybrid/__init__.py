@@ -1,0 +1,1 @@
+"""Moving and Sliding: drive to a target and stop there."""

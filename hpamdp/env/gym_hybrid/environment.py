@@ -1,0 +1,138 @@
+"""Moving and Sliding as batched TorchRL environments: drive to a target and stop there.
+
+Source: Xiong et al. 2018, arXiv:1810.06394, in the version of gym-hybrid; see `hpamdp.env.gym_hybrid.rules`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hpamdp.env import point_pictures
+from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.gym_hybrid import rules
+from hpamdp.env.gym_hybrid.rules import VehicleState
+
+
+class _VehicleEnv(CounterEnv[VehicleState]):
+    """What Moving and Sliding have in common; see `MovingEnv`."""
+
+    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
+    observation_names = rules.OBSERVATION_NAMES
+    parameter_dims = (1, 1, 0)
+    slides: ClassVar[bool]
+    scripted_figures: ClassVar[dict[str, float]]  # of the hand-written player
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_steps: int = rules.PUBLISHED_STEPS,
+        oracle: bool = False,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+    ) -> None:
+        super().__init__(
+            num_envs,
+            max_steps=max_steps,
+            parameter_low=rules.PARAMETER_LOW,
+            parameter_high=rules.PARAMETER_HIGH,
+            device=device,
+            seed=seed,
+            first_env=first_env,
+            oracle=oracle,
+        )
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[10]` each."""
+        return rules.observation_bounds(self.max_steps)
+
+    @property
+    def position(self) -> Tensor:
+        """Where the vehicles are, `[N, 2]`."""
+        return torch.stack([self.state.x, self.state.y], -1)
+
+    def start(self, episode: Tensor, rng: Tensor) -> VehicleState:
+        """Return states with vehicle and target anywhere in the field, at rest."""
+        return rules.start(episode, rng)
+
+    def act(
+        self, state: VehicleState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+    ) -> tuple[VehicleState, Tensor]:
+        """Return the states after one action and the rewards `[N]`."""
+        return rules.act(state, discrete, parameters.squeeze(-1), slides=self.slides, max_steps=self.max_steps)
+
+    def observe(self, state: VehicleState) -> Tensor:
+        """Return the observations `[N, 10]`."""
+        return rules.observe(state, self.max_steps)
+
+    def scripted_action(self, state: VehicleState) -> tuple[Tensor, Tensor]:
+        """Return the action of the hand-written player and its parameter, `[N]` each."""
+        return rules.scripted_action(state)
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return the figures of the hand-written player, who nearly always succeeds."""
+        if self.max_steps != rules.PUBLISHED_STEPS:
+            return {}
+        return {"scripted": self.scripted_figures, "ceiling": {"success": 1.0}}
+
+    def draw(self, track: Sequence[VehicleState]) -> np.ndarray:
+        """Return a picture of the vehicle's way to the target, uint8 `[480, 480, 3]`."""
+        last = track[-1]
+        return point_pictures.draw(
+            point_pictures.Scene(
+                path=point_pictures.path_of(track),
+                target=(float(last.target_x), float(last.target_y)),
+                radius=rules.TARGET_RADIUS,
+                outcome=rules.OUTCOMES[int(last.outcome)],
+                is_over=int(last.outcome) != rules.GOING_ON,
+                is_success=int(last.outcome) == rules.STOPPED,
+                steps=int(last.steps),
+                note=f"speed {float(last.speed):.2f}",
+                heading=float(last.heading),
+                has_walls=True,
+            )
+        )
+
+
+class MovingEnv(_VehicleEnv):
+    """Drive to the target and stop there, in `num_envs` fields at once.
+
+    Action leaves: `("action", "discrete")` int64 `[N]`: 0 accelerate, 1 turn, 2 brake; `("action", "parameters")`
+    float32 `[N, 2]`: the acceleration in [0, 1] and the turn in [-1, 1], a share of a right angle. Outside its bounds a
+    parameter is clipped, NaN and infinity are refused; braking has none.
+
+    The reward is the way made towards the target, less 0.001 a step, plus 1 for stopping within 0.1 of it. Who leaves
+    the field or runs out of time gets -1 instead. An episode terminates at rest in the target and outside the field.
+
+    Args:
+        num_envs: number of fields.
+        max_steps: actions after which an episode is truncated; gym-hybrid has 201.
+        oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
+        device: of the tensors.
+        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
+        first_env: number of the first field, where other processes have the fields before it.
+
+    Raises:
+        ValueError: an argument or an action is invalid; the state is unchanged.
+    """
+
+    slides = False
+    scripted_figures: ClassVar[dict[str, float]] = {"score": 1.867, "success": 0.9995, "steps": 96.0}
+
+
+class SlidingEnv(_VehicleEnv):
+    """`MovingEnv` on ice: a turn changes the heading alone, and an acceleration adds to the velocity as a vector.
+
+    The course is not observed. For actions, arguments and errors see `MovingEnv`.
+    """
+
+    slides = True
+    scripted_figures: ClassVar[dict[str, float]] = {"score": 1.856, "success": 0.9985, "steps": 95.0}

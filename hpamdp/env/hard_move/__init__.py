@@ -1,0 +1,1 @@
+"""Hard Move: reach a target with many actuators."""

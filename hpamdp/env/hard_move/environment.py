@@ -1,0 +1,137 @@
+"""Hard Move as a batched TorchRL environment: reach a target by choosing among 2^n sets of actuators.
+
+Source: Li et al. 2022 (HyAR), arXiv:2109.05490; see `hpamdp.env.hard_move.rules`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hpamdp.env import point_agent, point_pictures
+from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.hard_move import rules
+from hpamdp.env.hard_move.rules import HardMoveState
+
+NumActuators = Literal[4, 6, 8, 10]
+
+# Success by the limit of steps and the number of actuators: who starts too far away cannot arrive.
+_CEILING = {
+    30: {4: 0.962, 6: 0.989, 8: 0.993, 10: 0.996},
+    25: {4: 0.852, 6: 0.928, 8: 0.948, 10: 0.956},
+}
+_SCRIPTED = {4: 0.962, 6: 0.990, 8: 0.993, 10: 0.995}  # success of the hand-written player within 30 steps
+
+
+class HardMoveEnv(CounterEnv[HardMoveState]):
+    """Reach the target in `num_envs` planes at once.
+
+    Action leaves: `("action", "discrete")` int64 `[N]`: the set of actuators, a number of n bits whose highest one is
+    actuator 0; `("action", "parameters")` float32 `[N, 2^n]`: how strongly each set pushes, in [-1, 1], backwards below
+    0. Only the parameter of the chosen set counts; outside its bounds it is clipped, NaN and infinity are refused.
+
+    The reward is minus the squared distance after each step, plus 20 within 0.2 of the target, which ends the episode.
+
+    Args:
+        num_envs: number of planes.
+        n: number of actuators.
+        max_steps: actions after which an episode is truncated; HyAR has 30, DLPA 25.
+        rounded_directions: whether the actuators' directions have three decimals, as published.
+        oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
+        device: of the tensors.
+        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
+        first_env: number of the first plane, where other processes have the planes before it.
+
+    Raises:
+        ValueError: an argument or an action is invalid; the state is unchanged.
+    """
+
+    outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
+    observation_names = point_agent.OBSERVATION_NAMES
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        n: NumActuators = 4,
+        max_steps: int = 30,
+        rounded_directions: bool = True,
+        oracle: bool = False,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+    ) -> None:
+        if n not in get_args(NumActuators):
+            raise ValueError(f"HardMoveEnv: n={n}, but must be one of {', '.join(map(str, get_args(NumActuators)))}")
+        self.n = n
+        self.rounded_directions = rounded_directions
+        self.parameter_dims = (1,) * 2**n
+        self.discrete_names = tuple(f"{number:0{n}b}" for number in range(2**n))
+        motions = rules.motions(n, rounded=rounded_directions).to(device, torch.float32)
+        self._motions = motions
+        self._script = rules.Script(motions)
+        super().__init__(
+            num_envs,
+            max_steps=max_steps,
+            parameter_low=(-1.0,) * 2**n,
+            parameter_high=(1.0,) * 2**n,
+            device=device,
+            seed=seed,
+            first_env=first_env,
+            oracle=oracle,
+        )
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[4]` each."""
+        return point_agent.observation_bounds(self.max_steps)
+
+    @property
+    def position(self) -> Tensor:
+        """Where the agents are, `[N, 2]`."""
+        return torch.stack([self.state.x, self.state.y], -1)
+
+    def start(self, episode: Tensor, rng: Tensor) -> HardMoveState:
+        """Return states with agent and target anywhere in the square."""
+        return rules.start(episode, rng)
+
+    def act(
+        self, state: HardMoveState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+    ) -> tuple[HardMoveState, Tensor]:
+        """Return the states after one action and the rewards `[N]`."""
+        return rules.act(state, discrete, parameters.squeeze(-1), self._motions)
+
+    def observe(self, state: HardMoveState) -> Tensor:
+        """Return the observations `[N, 4]`."""
+        return rules.observe(state)
+
+    def scripted_action(self, state: HardMoveState) -> tuple[Tensor, Tensor]:
+        """Return the action of the hand-written player and its parameter, `[N]` each."""
+        return self._script(state)
+
+    def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
+        """Return the success of the hand-written player, and the share of starts from which the target is in reach."""
+        if self.max_steps not in _CEILING:
+            return {}
+        scripted = {"scripted": {"success": _SCRIPTED[self.n]}} if self.max_steps == 30 else {}
+        return scripted | {"ceiling": {"success": _CEILING[self.max_steps][self.n]}}
+
+    def draw(self, track: Sequence[HardMoveState]) -> np.ndarray:
+        """Return a picture of the agent's way to the target, uint8 `[480, 480, 3]`."""
+        last = track[-1]
+        return point_pictures.draw(
+            point_pictures.Scene(
+                path=point_pictures.path_of(track),
+                target=(float(last.target_x), float(last.target_y)),
+                radius=point_agent.HIT_RADIUS,
+                outcome=rules.OUTCOMES[int(last.outcome)],
+                is_over=int(last.outcome) != rules.GOING_ON,
+                is_success=int(last.outcome) == rules.REACHED,
+                steps=int(last.steps),
+                note=f"{self.n} actuators",
+            )
+        )

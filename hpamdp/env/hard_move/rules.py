@@ -1,0 +1,110 @@
+"""The rules of Hard Move as pure functions on columns, in the dtype of the state.
+
+Source: Li et al. 2022 (HyAR), arXiv:2109.05490, after Chandak et al. 2019, arXiv:1902.00183; as in HyAR's code.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hpamdp.env import point_agent
+
+OUTCOMES = ("going on", "reached", "time limit")
+GOING_ON, REACHED, TIME_LIMIT = range(3)
+_FORCE = 2.0
+
+
+class HardMoveState(NamedTuple):
+    """Columns `[N]`: places and speeds of the agent, place of the target; the rest is int32."""
+
+    x: Tensor
+    y: Tensor
+    vx: Tensor
+    vy: Tensor
+    target_x: Tensor
+    target_y: Tensor
+    steps: Tensor
+    outcome: Tensor
+    episode: Tensor
+
+
+def motions(n: int, *, rounded: bool) -> Tensor:
+    """Return the motion of every set of actuators, float64 `[2^n, 2]`.
+
+    Set k holds actuator i if bit n - 1 - i of k is set. Its motion is the sum of its actuators' directions, which
+    divide the full turn, in units of the largest such sum.
+
+    Args:
+        n: number of actuators.
+        rounded: whether the directions have three decimals, as published.
+    """
+    angles = [2.0 * math.pi * i / n for i in range(n)]
+    directions = [(math.cos(angle), math.sin(angle)) for angle in angles]
+    if rounded:
+        directions = [(round(x, 3), round(y, 3)) for x, y in directions]
+    sets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=n)), dtype=torch.float64)
+    sums = sets @ torch.tensor(directions, dtype=torch.float64)
+    return sums / sums.norm(dim=-1).max()
+
+
+def start(episode: Tensor, rng: Tensor) -> HardMoveState:
+    """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
+    x, y, target_x, target_y = point_agent.start(rng)
+    zeros = torch.zeros_like(x)
+    none = torch.zeros_like(episode)
+    return HardMoveState(x, y, zeros, zeros, target_x, target_y, none, none, episode)
+
+
+def act(state: HardMoveState, discrete: Tensor, parameter: Tensor, motions: Tensor) -> tuple[HardMoveState, Tensor]:
+    """Return the states after one action in every environment, and the rewards, `[N]`.
+
+    Args:
+        state: before the action.
+        discrete: sets of actuators, int64 `[N]`.
+        parameter: how strongly they push, backwards below 0, `[N]`.
+        motions: of the sets, `[2^n, 2]`.
+    """
+    force_x, force_y = (_FORCE * parameter.unsqueeze(-1) * motions[discrete]).unbind(-1)
+    x, y, vx, vy = point_agent.move(state, force_x, force_y)
+    squared = point_agent.squared_distance(state, x, y)
+    is_hit = squared <= point_agent.HIT_RADIUS * point_agent.HIT_RADIUS
+    reward = torch.where(is_hit, point_agent.CATCH_REWARD, 0.0) - squared
+    outcome = torch.where(is_hit, REACHED, GOING_ON).int()
+    return state._replace(x=x, y=y, vx=vx, vy=vy, steps=state.steps + 1, outcome=outcome), reward
+
+
+def observe(state: HardMoveState) -> Tensor:
+    """Return the observation `[N, 4]`: speed, and target - agent."""
+    return point_agent.observe(state)
+
+
+class Script:
+    """A hand-written player: the push after which the agent would come to rest nearest to the target.
+
+    Args:
+        motions: of the sets, `[2^n, 2]`.
+    """
+
+    def __init__(self, motions: Tensor) -> None:
+        # Many sets have the same motion, and some none at all.
+        different, number = motions.round(decimals=6).unique(dim=0, return_inverse=True)
+        first = torch.full((len(different),), len(motions), device=motions.device)
+        sets = torch.arange(len(motions), device=motions.device)
+        first = first.scatter_reduce(0, number, sets, "amin")
+        self._sets = first[motions[first].norm(dim=-1) > 1e-3]
+        self._reach = _FORCE * point_agent.REACH * motions[self._sets]
+
+    def __call__(self, state: HardMoveState) -> tuple[Tensor, Tensor]:
+        """Return the set and its parameter, `[N]` each."""
+        offset = torch.stack(point_agent.rest_offset(state, point_agent.GLIDE), -1)
+        length = self._reach.norm(dim=-1)
+        strength = ((offset @ self._reach.T) / length.square()).clamp(-1.0, 1.0)
+        # The squared distance that is left, less that of the offset itself.
+        left = strength * (strength * length.square() - 2.0 * (offset @ self._reach.T))
+        best = left.argmin(-1)
+        return self._sets[best], strength.gather(-1, best.unsqueeze(-1)).squeeze(-1)

@@ -1,0 +1,94 @@
+"""A point agent in the plane and a fixed target: what Catch Point and Hard Move have in common.
+
+Source: the code of Li et al. 2022 (HyAR), arXiv:2109.05490.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from hpamdp.env import counter_rng
+
+OBSERVATION_NAMES = ("vx", "vy", "target_dx", "target_dy")
+HIT_RADIUS = 0.2
+CATCH_REWARD = 20.0
+TOP_SPEED = 0.8  # full force against the drag, in lengths a unit of time
+_DRAG, _GAIN, _TICK = 0.75, 0.1, 0.1
+# An agent that is let go covers this many times its speed.
+GLIDE = _DRAG * _TICK / (1.0 - _DRAG)
+# In the next step alone it covers this many times its speed.
+NEXT_GLIDE = _DRAG * _TICK
+# What a unit of force adds to the place where the agent comes to rest.
+REACH = _GAIN * _TICK / (1.0 - _DRAG)
+
+
+class Located(Protocol):
+    """Columns `[N]`, among them the places of the agents."""
+
+    @property
+    def x(self) -> Tensor:
+        """Of the agent."""
+
+    @property
+    def y(self) -> Tensor:
+        """Of the agent."""
+
+
+class PointState(Located, Protocol):
+    """Columns `[N]`, among them places and velocities of the agents, and the places of their targets."""
+
+    @property
+    def vx(self) -> Tensor:
+        """Of the agent."""
+
+    @property
+    def vy(self) -> Tensor:
+        """Of the agent."""
+
+    @property
+    def target_x(self) -> Tensor:
+        """Of the target."""
+
+    @property
+    def target_y(self) -> Tensor:
+        """Of the target."""
+
+
+def start(rng: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return x and y of the agent and of the target, uniform in (-1, 1), `[N]` each; `rng` is int32 `[N]`."""
+    x, y, target_x, target_y = (2.0 * counter_rng.uniform(rng, index) - 1.0 for index in range(4))
+    return x, y, target_x, target_y
+
+
+def move(state: PointState, force_x: Tensor, force_y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return x, y, vx and vy after one step with the force, `[N]` each."""
+    vx = _DRAG * state.vx + _GAIN * force_x
+    vy = _DRAG * state.vy + _GAIN * force_y
+    return state.x + _TICK * vx, state.y + _TICK * vy, vx, vy
+
+
+def squared_distance(state: PointState, x: Tensor, y: Tensor) -> Tensor:
+    """Return the squared distance `[N]` of the target from an agent at (x, y)."""
+    return (state.target_x - x).square() + (state.target_y - y).square()
+
+
+def observe(state: PointState) -> Tensor:
+    """Return the observation `[N, 4]`, whose entries are OBSERVATION_NAMES."""
+    return torch.stack([state.vx, state.vy, state.target_x - state.x, state.target_y - state.y], -1)
+
+
+def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:
+    """Return the lowest and the highest observation that can come up within this many steps."""
+    # A little more than what full force reaches, for rounding.
+    speed = 1.001 * TOP_SPEED
+    offset = 2.0 + speed * _TICK * max_steps
+    high = [speed, speed, offset, offset]
+    return [-bound for bound in high], high
+
+
+def rest_offset(state: PointState, glide: float) -> tuple[Tensor, Tensor]:
+    """Return where the target lies from the place that the agent reaches by `glide` times its speed, `[N]` each."""
+    return state.target_x - state.x - glide * state.vx, state.target_y - state.y - glide * state.vy

@@ -1,0 +1,101 @@
+"""Pictures of a point's way to a target in the square [-1, 1]^2."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
+from hpamdp.env.point_agent import Located
+
+_FIELD, _RIM = "#ffffff", "#c9c5ba"
+_PATH, _BODY = "#2f6690", "#1d3f58"
+_TARGET, _TARGET_EDGE = "#f4dfb0", "#c8963e"
+_MARGIN = 44.0  # units of paper around the square
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a picture shows, y up.
+
+    Attributes:
+        path: the agent's positions so far, at least one.
+        target, radius: the target's centre and the distance that counts as a hit.
+        outcome: its name, written once the episode is over.
+        is_over, is_success: whether the episode has ended, and well.
+        steps: number of actions so far.
+        note: written beside it.
+        heading: where the agent looks, rad; None where it has no front.
+        has_walls: whether the agent must stay within the square.
+    """
+
+    path: Sequence[Point]
+    target: Point
+    radius: float
+    outcome: str
+    is_over: bool
+    is_success: bool
+    steps: int
+    note: str = ""
+    heading: float | None = None
+    has_walls: bool = False
+
+
+def path_of(track: Sequence[Located]) -> list[Point]:
+    """Return the positions of one environment's states, columns `[1]`."""
+    return [(float(state.x), float(state.y)) for state in track]
+
+
+def draw(scene: Scene, size: int = 480) -> np.ndarray:
+    """Return a picture of the scene, uint8 `[size, size, 3]`."""
+    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+    corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
+    canvas.polygon([_on_paper(corner) for corner in corners], _FIELD, _RIM, 3.0 if scene.has_walls else 1.0)
+    fill, edge = _colours(scene)
+    canvas.disc(_on_paper(scene.target), scene.radius * _SCALE, fill, edge, 1.6)
+    canvas.disc(_on_paper(scene.target), 2.5, edge)
+    for start, end in itertools.pairwise(scene.path):
+        canvas.line(_on_paper(start), _on_paper(end), _PATH, 2.0)
+    for point in scene.path[1:-1]:
+        canvas.disc(_on_paper(point), 2.0, _PATH)
+    canvas.disc(_on_paper(scene.path[0]), 5.0, BACKGROUND, INK, 2.0)
+    _draw_agent(canvas, scene)
+    finished = Canvas(canvas.image.reduce(SMOOTH))
+    _write(finished, scene)
+    return np.array(finished.image)
+
+
+_SCALE = PAPER / 2.0 - _MARGIN  # units of paper for each unit of length
+
+
+def _on_paper(point: Point) -> Point:
+    return PAPER / 2.0 + point[0] * _SCALE, PAPER / 2.0 - point[1] * _SCALE
+
+
+def _colours(scene: Scene) -> tuple[str, str]:
+    if not scene.is_over:
+        return _TARGET, _TARGET_EDGE
+    return (GOOD, GOOD_EDGE) if scene.is_success else (BAD, BAD_EDGE)
+
+
+def _draw_agent(canvas: Canvas, scene: Scene) -> None:
+    x, y = _on_paper(scene.path[-1])
+    if scene.heading is None:
+        canvas.disc((x, y), 7.0, _BODY, BACKGROUND, 1.6)
+        return
+    forward_x, forward_y = math.cos(scene.heading), -math.sin(scene.heading)
+    shape = [(12.0, 0.0), (-8.0, 7.0), (-4.0, 0.0), (-8.0, -7.0)]
+    turned = [(x + f * forward_x - s * forward_y, y + f * forward_y + s * forward_x) for f, s in shape]
+    canvas.polygon(turned, _BODY, BACKGROUND, 1.6)
+
+
+def _write(canvas: Canvas, scene: Scene) -> None:
+    canvas.write((18.0, 22.0), f"{scene.steps} {'step' if scene.steps == 1 else 'steps'}", FAINT)
+    canvas.write((PAPER - 18.0, 22.0), scene.note, FAINT, anchor="rm")
+    if scene.is_over:
+        canvas.write((PAPER - 18.0, PAPER - 20.0), scene.outcome, _colours(scene)[1], 16.0, anchor="rm")
