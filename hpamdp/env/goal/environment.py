@@ -18,7 +18,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.counter_env import CounterEnv
-from hpamdp.env.goal import rules
+from hpamdp.env.goal import rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
 
 GoalSlip = Literal["kick_to", "goal_distance", "keeper_projection"]
@@ -175,6 +175,10 @@ class GoalEnv(CounterEnv[GoalState]):
             "out": outcome == rules.OUT,
             "time_limit": outcome == rules.TIME_LIMIT,
         }
+
+    def draw(self, track: Sequence[GoalState]) -> np.ndarray:
+        """Return a picture of the pitch and the way of the ball, uint8 `[480, 480, 3]`."""
+        return rendering.draw(track)
 
     def _aim(self, discrete: Tensor, parameters: Tensor) -> Aim:
         return rules.goal_aim(discrete, parameters, kicks_to_point="kick_to" in self.repaired)
