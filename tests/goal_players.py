@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import torch
@@ -55,18 +55,8 @@ def trained_player(env: GoalEnv) -> Callable[[TensorDictBase], TensorDictBase]:
     return play
 
 
-class RecordedStep(NamedTuple):
-    """A step of a trace, with what is set before it and what has to come out."""
-
-    label: str
-    before: list[float]
-    aim: rules.Aim
-    draws: Tensor
-    expected: dict[str, Any]
-
-
 class Trace:
-    """The recorded episodes of Goal or Hard Goal.
+    """The recorded episodes of Goal or Hard Goal, all of them side by side.
 
     Args:
         domain: `goal` or `hard_goal`.
@@ -78,46 +68,59 @@ class Trace:
         file = Path(folder or ".", "domains", f"{domain}.json")
         if folder is None or not file.exists():
             pytest.skip("HPAMDP_TRACES names no folder with domains/")
-        self.recorded = json.loads(file.read_text())
-        self.domain = domain
+        self._recorded = json.loads(file.read_text())
+        self._aim = AIMS[domain]
         self.dtype = dtype
+        self.episodes = self._recorded["episodes"]
 
-    def state(self, values: list[float]) -> GoalState:
-        """Return the state of one environment."""
-        named = dict(zip(self.recorded["state_names"], values, strict=True))
-        columns = [torch.tensor([named[name]], dtype=self.dtype) for name in rules.COLUMNS]
-        counters = torch.zeros(1, dtype=torch.int32)
-        return GoalState(*columns, counters + int(named["time"]), counters, counters)
+    def bodies(self, states: Sequence[Sequence[float]]) -> list[Tensor]:
+        """Return the COLUMNS of recorded states, `[M]` each."""
+        columns = dict(zip(self._recorded["state_names"], zip(*states, strict=False), strict=False))
+        return [torch.tensor(columns[name], dtype=self.dtype) for name in rules.COLUMNS]
 
-    def bodies(self, values: list[float]) -> Tensor:
-        """Return the COLUMNS `[14]` of a recorded state."""
-        named = dict(zip(self.recorded["state_names"], values, strict=False))
-        return torch.tensor([named[name] for name in rules.COLUMNS], dtype=self.dtype)
+    def state(self, states: Sequence[Sequence[float]]) -> GoalState:
+        """Return recorded states as those of `[M]` environments."""
+        steps = torch.tensor([state[-1] for state in states], dtype=torch.int32)
+        return GoalState(*self.bodies(states), steps, torch.zeros_like(steps), torch.zeros_like(steps))
 
-    def episodes(self) -> Iterator[tuple[dict[str, Any], list[RecordedStep]]]:
-        """Yield the starts of the episodes with their steps."""
-        for episode in self.recorded["episodes"]:
-            before = episode["initial"]["state"]
-            steps = []
-            for number, step in enumerate(episode["steps"]):
-                own = torch.zeros(1, 2, dtype=self.dtype)
-                own[0, : len(step["parameters"])] = torch.tensor(step["parameters"], dtype=self.dtype)
-                aim = AIMS[self.domain](torch.tensor([step["action"]]), own)
-                draws = torch.tensor(step["draws"], dtype=self.dtype).reshape(-1, rules.NUMBERS_PER_TICK)
-                label = f"{episode['policy']}, seed {episode['seed']}, step {number}"
-                steps.append(RecordedStep(label, before, aim, draws, step))
-                before = step["state"]
-            yield episode["initial"], steps
+    def tensor(self, values: Sequence[Any]) -> Tensor:
+        return torch.tensor(values, dtype=self.dtype)
 
+    def aim(self, steps: Sequence[Mapping[str, Any]]) -> rules.Aim:
+        """Return what is aimed at in recorded steps, `[M]`."""
+        own = self.tensor([(*step["parameters"], 0.0)[:2] for step in steps])
+        return self._aim(torch.tensor([step["action"] for step in steps]), own)
 
-def replay(state: GoalState, step: RecordedStep) -> tuple[GoalState, Tensor, Tensor]:
-    """Return the state after a recorded action, its reward and its ticks, `[1]` each."""
-    drawn = torch.cat([step.draws, torch.zeros(64, rules.NUMBERS_PER_TICK, dtype=step.draws.dtype)])
+    def play(self, state: GoalState, steps: Sequence[Mapping[str, Any]]) -> tuple[GoalState, Tensor, Tensor]:
+        """Return the states after recorded actions, the rewards and the ticks, `[M]` each."""
+        draws = [self.tensor(step["draws"]).reshape(-1, rules.NUMBERS_PER_TICK) for step in steps]
+        drawn = torch.nn.utils.rnn.pad_sequence(draws)
+        drawn = torch.cat([drawn, drawn.new_zeros(16, *drawn.shape[1:])]).transpose(1, 2)  # [T, 6, M]
+        after, ticks = rules.act(
+            state,
+            self.aim(steps),
+            torch.ones(len(steps), dtype=torch.bool),
+            lambda ticks, rows: drawn[ticks.long()][:, :, rows],
+        )
+        return after, rules.reward(state, after), ticks
 
-    def numbers(ticks: Tensor, rows: Tensor) -> Tensor:
-        return drawn[ticks.long()].unsqueeze(-1).expand(-1, -1, len(rows))
-
-    after, ticks = rules.act(state, step.aim, torch.tensor([True]), numbers)
-    return after, rules.reward(state, after), ticks
-
-
+    def check(
+        self, steps: Sequence[Mapping[str, Any]], played: tuple[GoalState, Tensor, Tensor], tolerance: float
+    ) -> None:
+        """Assert that the recorded steps ended as these did."""
+        after, reward, ticks = played
+        bodies = torch.stack(after[: len(rules.COLUMNS)])
+        expected = torch.stack(self.bodies([step["state"] for step in steps]))
+        for name, got, recorded in (
+            ("state", bodies, expected),
+            ("observation", rules.observe(after, is_scaled=False), self.tensor([s["observation"] for s in steps])),
+            ("reward", reward, self.tensor([step["reward"] for step in steps])),
+        ):
+            torch.testing.assert_close(got, recorded, rtol=0.0, atol=tolerance, msg=lambda text, n=name: f"{n}: {text}")
+        assert ticks.tolist() == [step["ticks"] for step in steps]
+        assert after.steps.tolist() == [step["state"][-1] for step in steps]
+        assert after.outcome.tolist() == [OUTCOME_CODES[step["outcome"]] for step in steps]
+        flags = [(step["terminated"], step["truncated"]) for step in steps]
+        is_late = after.outcome == rules.TIME_LIMIT
+        is_over = after.outcome != rules.PLAYING
+        assert list(zip((is_over & ~is_late).tolist(), is_late.tolist(), strict=True)) == flags

@@ -91,11 +91,10 @@ def test_initial_parameters_kick_the_ball_on_and_shoot_beside_the_posts():
 def test_a_goal_pays_fifty_and_every_other_end_costs_the_balls_distance():
     env = GoalEnv(3, noise=0.0)
     env.reset()
-    # In front of the open goal; the keeper at the ball; and a shot that leaves the pitch through the keeper's side.
-    place(env, player_x=17.0, player_y=0.0, ball_x=18.0, ball_y=0.0, keeper_x=2.0, keeper_y=12.0, player_angle=0.0)
+    # Before the open goal; with the keeper in the way; a ball that rolls off behind the player.
+    place(env, ball_x=torch.tensor([18.0, 15.0, 1.0]), ball_y=0.0, ball_vx=torch.tensor([0.0, 0.0, -2.7]))
+    place(env, player_x=torch.tensor([17.0, 14.0, 10.0]), player_y=0.0, player_angle=0.0)
     place(env, keeper_x=torch.tensor([2.0, 16.5, 2.0]), keeper_y=torch.tensor([12.0, 1.0, 12.0]))
-    place(env, ball_x=torch.tensor([18.0, 18.0, 1.0]), ball_vx=torch.tensor([0.0, 0.0, -2.7]))
-    place(env, player_x=torch.tensor([17.0, 17.0, 10.0]))
     reading = act(env, [1, 1, 1], [[0.0], [0.0], [0.0]])
     assert reading[keys.OUTCOME].tolist() == [rules.GOAL, rules.CAUGHT, rules.OUT]
     state = env.state
@@ -126,7 +125,7 @@ def test_the_last_action_is_not_played_and_truncates():
 
 
 @BOTH
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=3, deadline=None)
 @given(num=st.integers(1, 9), seed=st.integers(0, 2**40), first=st.integers(0, 1000))
 def test_an_episode_does_not_depend_on_the_batch(domain, num, seed, first):
     row = seed % num
@@ -134,7 +133,7 @@ def test_an_episode_does_not_depend_on_the_batch(domain, num, seed, first):
     readings = [many.reset(), one.reset()]
     generator = torch.Generator().manual_seed(seed % 2**31)
     specs = PAMDPSpecs.from_env(many)
-    for _ in range(4):
+    for _ in range(2):
         discrete = torch.randint(2, (num,), generator=generator)
         unit = 2.0 * torch.rand(num, specs.num_parameters, generator=generator) - 1.0
         unit[:, 0] = -0.7  # short kicks, so that episodes go on

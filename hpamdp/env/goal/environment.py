@@ -105,9 +105,9 @@ class GoalEnv(CounterEnv[GoalState]):
         self.noise = noise
         self.repaired = tuple(repaired)
         self._is_scaled = observation == "scaled"
-        self._advance, self._random_numbers = rules.advance, rules.random_numbers
+        self._tick, self._random_numbers = rules.masked_tick, rules.random_numbers
         if compile_physics:
-            self._advance = torch.compile(rules.advance, **rules.COMPILE_ARGUMENTS)
+            self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
             self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
 
     def start(self, episode: Tensor, rng: Tensor) -> GoalState:
@@ -129,7 +129,7 @@ class GoalEnv(CounterEnv[GoalState]):
             numbers,
             noise=self.noise,
             max_steps=self.max_steps,
-            advance=self._advance,
+            tick=self._tick,
         )
         return after, rules.reward(state, after, repairs_distance="goal_distance" in self.repaired)
 

@@ -10,7 +10,7 @@ every fifth ball out of reach in float32; where two bodies are in the same place
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -99,11 +99,17 @@ NUMBERS_PER_TICK = 6
 _NUMBERS_PER_ACTION = 1 << 13
 # Ticks that are simulated before it is looked up which actions are over. More: fewer look-ups, more idle ticks.
 _TICKS_AT_ONCE = 8
+_FEW_ROWS = 64  # of so few, leaving out those that are over saves nothing
 
+# How to compile `masked_tick` and `random_numbers`. They work on columns throughout, so that the compiler makes one
+# vectorised loop of a tick; with vectors `[2, M]` it makes many, and takes three times as long.
 COMPILE_ARGUMENTS: dict[str, Any] = {"dynamic": True, "fullgraph": True}
 
+Vector = tuple[Tensor, Tensor]  # x and y, `[M]` each
+Bodies = tuple[Tensor, ...]  # the COLUMNS, `[M]` each
 # Returns the numbers in (-1, 1) `[K, 6, M]` of the ticks `[K]` of the actions in the rows `[M]`.
 Numbers = Callable[[Tensor, Tensor], Tensor]
+_GOING = -1  # the end of an action that is not over
 
 
 class GoalState(NamedTuple):
@@ -137,6 +143,36 @@ class Aim(NamedTuple):
     x: Tensor
     y: Tensor
     is_kick: Tensor
+
+
+class Motion(NamedTuple):
+    """Actions in progress, columns `[M]`: the bodies, what the players do, the outcome so far, and the ticks.
+
+    `end` is -1 while the action goes on, and else an outcome: PLAYING where only the action is over.
+    """
+
+    player_x: Tensor
+    player_y: Tensor
+    keeper_x: Tensor
+    keeper_y: Tensor
+    ball_x: Tensor
+    ball_y: Tensor
+    player_vx: Tensor
+    player_vy: Tensor
+    keeper_vx: Tensor
+    keeper_vy: Tensor
+    ball_vx: Tensor
+    ball_vy: Tensor
+    player_angle: Tensor
+    keeper_angle: Tensor
+    aim_x: Tensor
+    aim_y: Tensor
+    is_kick: Tensor
+    end: Tensor
+    ticks: Tensor
+
+
+Tick = Callable[[Motion, Tensor, float], Motion]  # as `masked_tick`
 
 
 def start(episode: Tensor, rng: Tensor, dtype: torch.dtype = torch.float32) -> GoalState:
@@ -241,11 +277,11 @@ def act(
     *,
     noise: float = 1.0,
     max_steps: int = 100,
-    advance: Callable[..., tuple[Tensor, Tensor, Tensor]] | None = None,
+    tick: Tick | None = None,
 ) -> tuple[GoalState, Tensor]:
     """Return the states after one action, and how many ticks it took, int32 `[N]`.
 
-    The ticks of all environments run side by side; those whose action is over are left out of the later ones.
+    The ticks of all environments run side by side; most rows whose action is over are left out of the later ones.
 
     Args:
         state: before the action.
@@ -254,203 +290,221 @@ def act(
         numbers: the random numbers.
         noise: factor on the published noise.
         max_steps: the action with this number is not played: it ends the episode at once, as in the published code.
-        advance: the function `advance`, or a compiled one.
+        tick: the function `masked_tick`, or a compiled one.
     """
-    advance = advance or globals()["advance"]
     steps = torch.where(moves, state.steps + 1, state.steps)
     is_late = moves & (steps >= max_steps)
+    is_played = moves & ~is_late
     outcome = torch.where(is_late, TIME_LIMIT, state.outcome)
-    ticks = torch.zeros_like(steps)
-    bodies = torch.stack(state[: len(COLUMNS)])
-    aims = torch.stack((aim.x, aim.y)).to(bodies)
-    rows = (moves & ~is_late).nonzero().squeeze(-1)
-    moving, is_kick, aims = bodies[:, rows], aim.is_kick[rows], aims[:, rows]
-    tick = torch.arange(_TICKS_AT_ONCE, dtype=torch.int32, device=steps.device)
-    while len(rows):
-        moving, end, length = advance(moving, aims, is_kick, numbers(tick, rows).to(bodies.dtype), noise)
-        bodies[:, rows] = moving
-        outcome[rows] = end.clamp(min=PLAYING)
-        ticks[rows] += length
-        going = (end == _GOING).nonzero().squeeze(-1)
-        rows, moving, is_kick, aims = rows[going], moving[:, going], is_kick[going], aims[:, going]
-        tick = tick + _TICKS_AT_ONCE
-    return GoalState(*bodies.unbind(), steps, outcome, state.episode), ticks
+    motion = Motion(
+        *state[: len(COLUMNS)],
+        aim_x=aim.x,
+        aim_y=aim.y,
+        is_kick=aim.is_kick,
+        end=torch.where(is_played, _GOING, outcome),
+        ticks=torch.zeros_like(steps),
+    )
+    rows = torch.arange(len(steps), device=steps.device)
+    motion = _run(motion, rows, 0, numbers, noise, tick or masked_tick)
+    return GoalState(*motion[: len(COLUMNS)], steps, motion.end, state.episode), motion.ticks
 
 
-_GOING = -1  # an action that is not over
+def _run(motion: Motion, rows: Tensor, first: int, numbers: Numbers, noise: float, tick: Tick) -> Motion:
+    """Return the motion in these rows `[M]` at the end of its actions, whose next tick is number `first`."""
+    while True:
+        going = (motion.end == _GOING).nonzero().squeeze(-1)
+        if not len(going):
+            return motion
+        # Not down to one row, for which a compiled tick would be compiled anew.
+        if len(rows) > _FEW_ROWS and 1 < len(going) <= len(rows) // 2:
+            rest = Motion(*(column[going] for column in motion))
+            rest = _run(rest, rows[going], first, numbers, noise, tick)
+            return Motion(*(old.index_copy(0, going, new) for old, new in zip(motion, rest, strict=True)))
+        ticks = torch.arange(first, first + _TICKS_AT_ONCE, dtype=torch.int32, device=rows.device)
+        for drawn in numbers(ticks, rows).to(motion.ball_x.dtype).unbind():
+            motion = Motion(*tick(motion, drawn, noise))
+        first += _TICKS_AT_ONCE
 
 
-def advance(
-    bodies: Tensor, aims: Tensor, is_kick: Tensor, numbers: Tensor, noise: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the bodies after some more ticks or the end of their action, its outcome or -1, and how many ticks.
+def masked_tick(motion: Motion, numbers: Tensor, noise: float) -> Motion:
+    """Return the motion after one tick of the actions that are not over.
 
     Args:
-        bodies: the COLUMNS, `[14, M]`.
-        aims: x and y, `[2, M]`.
-        is_kick: bool `[M]`.
-        numbers: in (-1, 1), `[K, 6, M]`.
+        motion: before it.
+        numbers: in (-1, 1), `[6, M]`.
         noise: factor on the published noise.
     """
-    trace = []
-    for drawn in numbers.unbind():
-        bodies = tick(bodies, aims, drawn, noise)
-        trace.append(bodies)
-    path = torch.stack(trace)
-    outcome = _outcomes(path, is_kick)
-    num_ticks = len(trace)
-    count = torch.arange(num_ticks, dtype=torch.int32, device=bodies.device).unsqueeze(-1)
-    first = torch.where(outcome != _GOING, count, num_ticks - 1).amin(0)
-    last = first.long()
-    bodies = path.gather(0, last.expand(1, *bodies.shape)).squeeze(0)
-    return bodies, outcome.gather(0, last.unsqueeze(0)).squeeze(0), first + 1
+    bodies = tick(motion[: len(COLUMNS)], motion.aim_x, motion.aim_y, numbers, noise)
+    is_going = motion.end == _GOING
+    end = torch.where(is_going, _end(bodies, motion.is_kick), motion.end)
+    kept = (torch.where(is_going, new, old) for new, old in zip(bodies, motion, strict=False))
+    return Motion(*kept, motion.aim_x, motion.aim_y, motion.is_kick, end, motion.ticks + is_going.to(torch.int32))
 
 
-def _outcomes(path: Tensor, is_kick: Tensor) -> Tensor:
-    """Return the outcome after each tick, int32 `[K, M]`: PLAYING where only the action is over, -1 where it goes on."""
-    player_x, player_y, keeper_x, keeper_y, ball_x, ball_y = path[:, :6].unbind(1)
-    is_still = torch.hypot(path[:, 10], path[:, 11]) <= _STILL
-    in_reach = torch.hypot(player_x - ball_x, player_y - ball_y) <= REACH + _REACH_SLACK
-    outcome = torch.where(is_kick & is_still & in_reach, PLAYING, _GOING)
-    ball_height = ball_y.abs()
-    # So that a position that is not finite ends the episode.
-    is_inside = (ball_x >= 0.0) & (ball_x <= LENGTH) & (ball_height <= HALF_WIDTH)
-    outcome = torch.where(is_inside, outcome, OUT)
-    outcome = torch.where(torch.hypot(keeper_x - ball_x, keeper_y - ball_y) < CATCH, CAUGHT, outcome)
-    is_goal = (ball_x >= LENGTH) & (ball_x <= LENGTH + GOAL_DEPTH) & (ball_height <= GOAL_HALF_WIDTH)
-    return torch.where(is_goal, GOAL, outcome).to(torch.int32)
+def _end(bodies: Bodies, is_kick: Tensor) -> Tensor:
+    """Return the outcome after a tick, int32 `[M]`: PLAYING where only the action is over, _GOING where it goes on."""
+    player_x, player_y, keeper_x, keeper_y, ball_x, ball_y, _, _, _, _, ball_vx, ball_vy, _, _ = bodies
+    is_still = _length(ball_vx, ball_vy) <= _STILL
+    in_reach = _length(player_x - ball_x, player_y - ball_y) <= REACH + _REACH_SLACK
+    end = torch.where(is_kick & is_still & in_reach, PLAYING, _GOING)
+    beside = ball_y.abs()
+    # Asked this way round, a position that is not finite ends the episode.
+    is_inside = (ball_x >= 0.0) & (ball_x <= LENGTH) & (beside <= HALF_WIDTH)
+    end = torch.where(is_inside, end, OUT)
+    end = torch.where(_length(keeper_x - ball_x, keeper_y - ball_y) < CATCH, CAUGHT, end)
+    is_goal = (ball_x >= LENGTH) & (ball_x <= LENGTH + GOAL_DEPTH) & (beside <= GOAL_HALF_WIDTH)
+    return torch.where(is_goal, GOAL, end).to(torch.int32)
 
 
-def tick(bodies: Tensor, aims: Tensor, numbers: Tensor, noise: float = 1.0) -> Tensor:
-    """Return the bodies `[14, M]` after one tick of their actions.
+def tick(bodies: Bodies, aim_x: Tensor, aim_y: Tensor, numbers: Tensor, noise: float = 1.0) -> Bodies:
+    """Return the bodies after one tick of their actions.
 
     Args:
-        bodies: the COLUMNS, `[14, M]`.
-        aims: x and y, `[2, M]`.
+        bodies: the COLUMNS, `[M]` each.
+        aim_x, aim_y: where the players kick to, `[M]`.
         numbers: in (-1, 1), `[6, M]`: for angle and push in x and y, of the player or the ball, then of the keeper.
         noise: factor on the published noise.
     """
-    player, keeper, ball, player_v, keeper_v, ball_v = bodies[:12].unflatten(0, (6, 2)).unbind()
-    player_v, ball_v, player_angle = _play(player, ball, player_v, ball_v, bodies[12], aims, numbers[:3], noise)
-    keeper_v, keeper_angle = _keep(keeper, ball, keeper_v, ball_v, numbers[3:], noise)
-    player, keeper, ball = player + player_v, keeper + keeper_v, ball + ball_v
-    player_v, keeper_v, ball_v = player_v * _PLAYER_DECAY, keeper_v * _PLAYER_DECAY, ball_v * _BALL_DECAY
+    player_x, player_y, keeper_x, keeper_y, ball_x, ball_y, *velocities, player_angle, keeper_angle = bodies
+    player, keeper, ball = (player_x, player_y), (keeper_x, keeper_y), (ball_x, ball_y)
+    player_v, keeper_v, ball_v = ((velocities[i], velocities[i + 1]) for i in (0, 2, 4))
+    of_player, of_keeper = numbers[:3].unbind(), numbers[3:].unbind()
+    player_v, ball_v, player_angle = _play(
+        player, ball, player_v, ball_v, player_angle, (aim_x, aim_y), of_player, noise
+    )
+    keeper_v, keeper_angle = _keep(keeper, ball, keeper_v, ball_v, of_keeper, noise)
+    player, player_v = _roll(player, player_v, _PLAYER_DECAY)
+    keeper, keeper_v = _roll(keeper, keeper_v, _PLAYER_DECAY)
+    ball, ball_v = _roll(ball, ball_v, _BALL_DECAY)
     player, keeper, player_v, keeper_v = _collide(player, keeper, player_v, keeper_v, PLAYER_SIZE + KEEPER_SIZE)
     player, ball, player_v, ball_v = _collide(player, ball, player_v, ball_v, PLAYER_SIZE + BALL_SIZE)
     keeper, ball, keeper_v, ball_v = _collide(keeper, ball, keeper_v, ball_v, KEEPER_SIZE + BALL_SIZE)
-    angles = torch.stack((player_angle, keeper_angle))
-    return torch.cat((player, keeper, ball, player_v, keeper_v, ball_v, angles))
+    return (*player, *keeper, *ball, *player_v, *keeper_v, *ball_v, player_angle, keeper_angle)
 
 
 def _play(
-    player: Tensor,
-    ball: Tensor,
-    player_v: Tensor,
-    ball_v: Tensor,
+    player: Vector,
+    ball: Vector,
+    player_v: Vector,
+    ball_v: Vector,
     angle: Tensor,
-    aims: Tensor,
-    numbers: Tensor,
+    aim: Vector,
+    numbers: Sequence[Tensor],
     noise: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the velocities of player and ball, `[2, M]` each, and the player's orientation `[M]` after the player's move.
+) -> tuple[Vector, Vector, Tensor]:
+    """Return the velocities of player and ball and the player's orientation after the player's move.
 
     With the ball in reach, the player kicks it; else it turns towards the ball or, when it faces it, dashes.
     """
-    to_ball = ball - player
-    distance = _length(to_ball)
-    turn = torch.atan2(to_ball[1], to_ball[0]) - angle
+    to_ball_x, to_ball_y = ball[0] - player[0], ball[1] - player[1]
+    distance = _length(to_ball_x, to_ball_y)
+    turn = torch.atan2(to_ball_y, to_ball_x) - angle
     turn = turn - 2.0 * math.pi * (turn / (2.0 * math.pi)).round()
+    off = turn.abs()
     in_reach = distance <= REACH + _REACH_SLACK
-    is_facing = turn.abs() < _FACING
-    wish = _COAST * (aims - player) - ball_v
+    is_facing = off < _FACING
+    is_dash = is_facing & ~in_reach
+    wish_x = _COAST * (aim[0] - player[0]) - ball_v[0]
+    wish_y = _COAST * (aim[1] - player[1]) - ball_v[1]
     # Power is lost by kicking sideways or from afar.
-    share = 1.0 - 0.25 / math.pi * turn.abs() - 0.25 / REACH * distance
-    kick = _length(wish).minimum(_MAX_POWER * _BALL_RATE * share)
+    share = 1.0 - 0.25 / math.pi * off - 0.25 / REACH * distance
+    kick = _length(wish_x, wish_y).minimum(_MAX_POWER * _BALL_RATE * share)
     # Not by `torch.where` between two numbers, which gives float32.
     of_ball = in_reach.to(angle.dtype)
-    pushed = _accelerate(
-        torch.where(in_reach, ball_v, player_v),
+    pushed_x, pushed_y = _accelerate(
+        (torch.where(in_reach, ball_v[0], player_v[0]), torch.where(in_reach, ball_v[1], player_v[1])),
         torch.where(in_reach, kick, _DASH),
-        torch.where(in_reach, torch.atan2(wish[1], wish[0]), angle),
+        torch.where(in_reach, torch.atan2(wish_y, wish_x), angle),
         numbers,
         of_ball * (noise * (_BALL_NOISE - _PLAYER_NOISE)) + noise * _PLAYER_NOISE,
         of_ball * (_BALL_SPEED - _PLAYER_SPEED) + _PLAYER_SPEED,
     )
-    turned = angle + turn / (1.0 + 5.0 * _length(player_v))
+    turned = angle + turn / (1.0 + 5.0 * _length(*player_v))
     return (
-        torch.where(~in_reach & is_facing, pushed, player_v),
-        torch.where(in_reach, pushed, ball_v),
+        (torch.where(is_dash, pushed_x, player_v[0]), torch.where(is_dash, pushed_y, player_v[1])),
+        (torch.where(in_reach, pushed_x, ball_v[0]), torch.where(in_reach, pushed_y, ball_v[1])),
         torch.where(in_reach | is_facing, angle, turned),
     )
 
 
 def _keep(
-    keeper: Tensor, ball: Tensor, keeper_v: Tensor, ball_v: Tensor, numbers: Tensor, noise: float
-) -> tuple[Tensor, Tensor]:
-    """Return the velocity `[2, M]` and the orientation `[M]` of the keeper after its move.
+    keeper: Vector, ball: Vector, keeper_v: Vector, ball_v: Vector, numbers: Sequence[Tensor], noise: float
+) -> tuple[Vector, Tensor]:
+    """Return the velocity and the orientation of the keeper after its move.
 
     It goes to where the ball will lie still or, when the ball will come near the goal, quickly into its way.
     """
-    roll = ball_v / _COAST
-    end = ball + roll
-    slope = torch.where(roll[0] == 0.0, 0.0, roll[1] / roll[0])
+    roll_x, roll_y = ball_v[0] / _COAST, ball_v[1] / _COAST
+    end_x, end_y = ball[0] + roll_x, ball[1] + roll_y
+    slope = torch.where(roll_x == 0.0, 0.0, roll_y / roll_x)
     height = ball[1] + slope * (LENGTH - ball[0])
-    is_shot = (end[0] > LENGTH) & (height.abs() <= GOAL_HALF_WIDTH + _KEEPER_MARGIN) & (slope != 0.0)
+    is_shot = (end_x > LENGTH) & (height.abs() <= GOAL_HALF_WIDTH + _KEEPER_MARGIN) & (slope != 0.0)
     # The way to the ball's line is across it; only the direction matters.
-    to_ball = ball - keeper
-    side = roll[0] * to_ball[1] - roll[1] * to_ball[0]
-    angle = torch.atan2(
-        torch.where(is_shot, side * roll[0], end[1] - keeper[1]),
-        torch.where(is_shot, -side * roll[1], end[0] - keeper[0]),
-    )
+    side = roll_x * (ball[1] - keeper[1]) - roll_y * (ball[0] - keeper[0])
+    way_x = torch.where(is_shot, -side * roll_y, end_x - keeper[0])
+    way_y = torch.where(is_shot, side * roll_x, end_y - keeper[1])
+    angle = torch.atan2(way_y, way_x)
     effort = is_shot.to(angle.dtype) * (_SAVE - _FOLLOW) + _FOLLOW
     return _accelerate(keeper_v, effort, angle, numbers, noise * _PLAYER_NOISE, _PLAYER_SPEED), angle
 
 
 def _accelerate(
-    velocity: Tensor,
+    velocity: Vector,
     effort: Tensor,
     angle: Tensor,
-    numbers: Tensor,
+    numbers: Sequence[Tensor],
     noise: Tensor | float,
-    limit: Tensor | float,
-) -> Tensor:
-    """Return the velocities `[2, M]` after a push.
+    limit: Any,
+) -> Vector:
+    """Return the velocities after a push.
 
     Args:
-        velocity: before it, `[2, M]`.
+        velocity: before it.
         effort: the change of velocity it is meant to make, `[M]`.
         angle: in which direction, `[M]`; noise multiplies it.
-        numbers: in (-1, 1), `[3, M]`: for the angle and the push in x and in y.
-        noise: share of the angle and of the speed that the noise takes at most, `[M]`.
-        limit: of the change of each velocity and of itself, `[M]`.
+        numbers: in (-1, 1), three of `[M]`: for the angle and the push in x and in y.
+        noise: share of the angle and of the speed that the noise takes at most, a number or `[M]`.
+        limit: of the change of each velocity and of itself, a number or `[M]`.
     """
-    angle = angle * (1.0 + noise * numbers[0])
-    push = effort * torch.stack((angle.cos(), angle.sin())) + noise * _length(velocity) * numbers[1:]
-    return (velocity + push.clamp(-limit, limit)).clamp(-limit, limit)
+    angle = angle + angle * noise * numbers[0]
+    jolt = noise * _length(*velocity)
+    push_x = (effort * angle.cos() + jolt * numbers[1]).clamp(-limit, limit)
+    push_y = (effort * angle.sin() + jolt * numbers[2]).clamp(-limit, limit)
+    return (velocity[0] + push_x).clamp(-limit, limit), (velocity[1] + push_y).clamp(-limit, limit)
+
+
+def _roll(place: Vector, velocity: Vector, decay: float) -> tuple[Vector, Vector]:
+    """Return where a body is after a tick, and its velocity then."""
+    return (place[0] + velocity[0], place[1] + velocity[1]), (velocity[0] * decay, velocity[1] * decay)
 
 
 def _collide(
-    one: Tensor, other: Tensor, one_v: Tensor, other_v: Tensor, touch: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return positions and velocities `[2, M]` of two bodies after they have bounced off each other.
+    one: Vector, other: Vector, one_v: Vector, other_v: Vector, touch: float
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Return positions and velocities of two bodies after they have bounced off each other, if they overlap.
 
     Args:
-        one, other: positions, `[2, M]`.
-        one_v, other_v: velocities, `[2, M]`.
+        one, other: positions.
+        one_v, other_v: velocities.
         touch: distance below which they overlap.
     """
-    apart = one - other
-    distance = _length(apart)
-    half_overlap = 0.5 * (touch - distance).clamp(min=0.0)
-    shift = apart * (half_overlap / distance.clamp(min=1e-12))
-    sign = 1.0 - 2.0 * (distance < touch).to(one.dtype)
-    return one + shift, other - shift, one_v * sign, other_v * sign
+    apart_x, apart_y = one[0] - other[0], one[1] - other[1]
+    distance = _length(apart_x, apart_y)
+    share = (0.5 * (touch - distance)).clamp(min=0.0) / distance.clamp(min=1e-12)
+    shift_x, shift_y = apart_x * share, apart_y * share
+    sign = 1.0 - 2.0 * (distance < touch).to(distance.dtype)
+    return (
+        (one[0] + shift_x, one[1] + shift_y),
+        (other[0] - shift_x, other[1] - shift_y),
+        (one_v[0] * sign, one_v[1] * sign),
+        (other_v[0] * sign, other_v[1] * sign),
+    )
 
 
-def _length(vector: Tensor) -> Tensor:
-    """Return the lengths `[M]` of vectors `[2, M]`."""
-    return torch.hypot(vector[0], vector[1])
+def _length(x: Tensor, y: Tensor) -> Tensor:
+    """Return the lengths of vectors, `[M]`."""
+    # The compiler does not vectorise `hypot`; uncompiled, it is one operation instead of four.
+    return (x * x + y * y).sqrt() if torch.compiler.is_compiling() else torch.hypot(x, y)
 
 
 def goal_distance(state: GoalState, *, is_repaired: bool = False) -> Tensor:
@@ -494,7 +548,7 @@ def observe(state: GoalState, *, is_scaled: bool = True, repairs_projection: boo
     distance = torch.hypot(along, across).clamp(min=1e-12)
     shadow = state.ball_y + across / along * (LENGTH - state.ball_x)
     shadow = shadow.clamp(-GOAL_HALF_WIDTH, (1.0 if repairs_projection else 2.0) * GOAL_HALF_WIDTH)
-    level = torch.where(across > 0.0, -GOAL_HALF_WIDTH, GOAL_HALF_WIDTH)
+    level = GOAL_HALF_WIDTH * (1.0 - 2.0 * (across > 0.0).to(across.dtype))
     named = state._asdict() | {
         "keeper_to_ball_x": along / distance,
         "keeper_to_ball_y": across / distance,
