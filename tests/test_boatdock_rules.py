@@ -67,7 +67,7 @@ def test_durations_are_clipped_before_noise_too(motor_noise):
 
 
 def test_paper_rewards_sum_to_the_progress_plus_the_final_term():
-    env, sparse = (BoatDockEnv(512, controller="congruent", reward=reward) for reward in ("paper", "sparse"))
+    env, sparse = (BoatDockEnv(2048, controller="congruent", reward=reward) for reward in ("paper", "sparse"))
     total, sparse_total = (torch.stack([r[keys.REWARD] for r in play(e, 25)]).sum(0)[:, 0] for e in (env, sparse))
     state = env.state
     outcomes = {name: (state.outcome == number) for number, name in enumerate(physics.OUTCOMES)}
@@ -142,6 +142,32 @@ def test_sensor_noise_is_independent_at_every_observation_and_moves_no_boat():
     assert (errors.std(0) - 4.0).abs().max() < 0.1
     assert (errors.T.corrcoef() - torch.eye(12)).abs().max() < 0.03
     assert errors.abs().max() < 24.0
+
+
+def test_evaluation_has_other_noise_than_training_with_the_same_seed():
+    env = BoatDockEnv(100, controller="congruent", motor_noise=0.5, sensor_noise=5.0)
+    layouts = env.fixed_episodes(0)
+
+    def observed() -> torch.Tensor:
+        seen = env.reset(layouts.copy())["observation"]
+        return torch.stack([seen, press(env, [0] * 100, [0.2] * 100)["observation"]])
+
+    env.seed_evaluation(0)
+    evaluation = observed()
+    env.set_seed(0)
+    training = observed()
+    env.seed_evaluation(0)
+    assert torch.equal(observed(), evaluation)
+    start_x, boat_x = (OBSERVATION_NAMES.index(name) for name in ("start_x", "boat_x"))
+    assert (evaluation[0, :, start_x] != training[0, :, start_x]).all()
+    assert (evaluation[1, :, boat_x] != training[1, :, boat_x]).all()
+
+
+def test_the_first_episodes_of_an_evaluation_are_its_fixed_layouts():
+    env = BoatDockEnv(50)
+    env.seed_evaluation(4)
+    env.reset()
+    assert torch.equal(torch.stack(env.state[:4]), torch.stack(harbour.fixed_layouts(50, 4)))
 
 
 def test_slip_presses_a_uniformly_random_key():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -19,7 +20,7 @@ def counter(num: int) -> torch.Tensor:
     return torch.arange(num, dtype=torch.int32)
 
 
-def keys_for(num: int, stream: int = counter_rng.TRAINING, seed: int = 0, episode: int = 0) -> torch.Tensor:
+def keys_for(num: int, stream: int = counter_rng.TRAINING, seed: int = 0, episode: int = 0) -> counter_rng.Key:
     """Return the random keys of the environments 0 to num - 1, `[num]`."""
     episodes = torch.full_like(counter(num), episode)
     return counter_rng.key_for(counter_rng.seed_tensor(seed), stream, counter(num), episodes)
@@ -125,6 +126,34 @@ def test_evaluation_layouts_are_fixed_by_their_seed_and_absent_from_training_wit
     assert not training & {tuple(row) for row in evaluation.tolist()}
 
 
+def test_the_published_evaluation_layouts_stay_as_they_are():
+    layouts = torch.stack(harbour.fixed_layouts(1000, seed=0), -1).double()
+    assert layouts[999].tolist() == pytest.approx([18.513914, -41.269749, -35.586502, 69.864418], abs=1e-4)
+    assert layouts.mean(0).tolist() == pytest.approx([-0.772767, 1.584678, 0.730998, -1.543051], abs=1e-5)
+
+
+@pytest.mark.parametrize("stream", [counter_rng.TRAINING, counter_rng.NOISE, counter_rng.EVALUATION_NOISE])
+def test_no_seed_makes_another_stream_repeat_the_numbers_of_evaluation(stream):
+    num, indices = 1000, torch.arange(16, dtype=torch.int32)
+    evaluation = keys_for(num, counter_rng.EVALUATION)
+    # The seed whose hash equals that of evaluation with seed 0: the stream is mixed in by an exclusive or.
+    twin = keys_for(num, stream, seed=(0x2545F491 + 0x01234567) ^ (0x2545F491 + 0x01234567 * stream))
+    assert torch.equal(evaluation.bits, twin.bits)
+    numbers, twins = (counter_rng.uniform(k._replace(bits=k.bits.unsqueeze(-1)), indices) for k in (evaluation, twin))
+    assert ((numbers == twins).sum(-1) <= 1).all()
+    assert torch.stack([numbers[:, 1:].flatten(), twins[:, 1:].flatten()]).corrcoef()[0, 1].abs() < 0.03
+    evaluation_layouts, twin_layouts = harbour.sample_layout(evaluation), harbour.sample_layout(twin)
+    for ours, theirs in zip(evaluation_layouts, twin_layouts, strict=True):
+        assert (ours != theirs).float().mean() > 0.99
+    assert (torch.stack(evaluation_layouts) != torch.stack(twin_layouts)).any(0).all()
+
+
+def test_the_steps_of_two_streams_meet_at_most_once_in_two_to_the_thirty():
+    for one, other in itertools.combinations(counter_rng._STEPS, 2):
+        assert one % 2 == other % 2 == 1
+        assert (one - other) % 8 != 0
+
+
 def test_random_controllers_and_key_maps_are_uniform_and_independent_of_the_layout():
     rules = episode.Rules(controller="random", keymap="random")
     num = 100_000
@@ -150,15 +179,15 @@ def test_uniform_numbers_are_uniform_and_independent_of_every_counter():
         assert distance_between_distributions(number.numpy(), (np.arange(NUM) + 0.5) / NUM) < 0.006
     between = torch.stack([*numbers, numbers[0].roll(1)]).corrcoef() - torch.eye(len(numbers) + 1)
     assert between.abs().max() < 0.012
-    per_row = counter_rng.uniform(key, torch.full_like(key, 15))
+    per_row = counter_rng.uniform(key, torch.full_like(key.bits, 15))
     assert torch.equal(per_row, numbers[3])
 
 
 @pytest.mark.parametrize("bits", [0, -1])
 def test_uniform_numbers_lie_inside_the_open_interval_even_for_extreme_bits(bits, monkeypatch):
     monkeypatch.setattr(counter_rng, "_mix", lambda h: torch.full_like(h, bits))
-    assert 0.0 < counter_rng.uniform(counter(1), 0).item() < 1.0
-    assert abs(counter_rng.normal(counter(1), 0).item()) < 5.8
+    assert 0.0 < counter_rng.uniform(keys_for(1), 0).item() < 1.0
+    assert abs(counter_rng.normal(keys_for(1), 0).item()) < 5.8
 
 
 def test_normal_numbers_have_the_moments_of_the_normal_distribution():

@@ -154,6 +154,19 @@ def test_a_seed_fixes_the_noise(seed):
         assert (first[keys.OBSERVATION] != later[keys.OBSERVATION]).any(-1).all()
 
 
+def test_evaluation_has_other_noise_than_training_with_the_same_seed():
+    env = PlatformEnv(20, seed=3)
+    training, _ = play(env, rule, 3)
+    env.seed_evaluation(3)
+    evaluation, _ = play(env, rule, 3)
+    env.seed_evaluation(3)
+    again, _ = play(env, rule, 3)
+    env.set_seed(3)
+    assert (play(env, rule, 3)[0] == training).all()
+    assert (again == evaluation).all()
+    assert (training[keys.OBSERVATION] != evaluation[keys.OBSERVATION]).any(-1).all()
+
+
 def test_without_noise_the_seed_makes_no_difference():
     readings = [play(PlatformEnv(2, noise=0.0, seed=seed), rule, 4)[0] for seed in (0, 1)]
     assert (readings[0] == readings[1]).all()

@@ -107,7 +107,7 @@ def numbers_of_next_action(env: PlatformEnv, seed: int) -> list[list[float]]:
     environment = torch.arange(env.num_envs, dtype=torch.int32)
     rng = counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.NOISE, environment, state["episode"])
     index = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
-    return counter_rng.normal(rng.unsqueeze(-1), index).tolist()
+    return counter_rng.normal(rng._replace(bits=rng.bits.unsqueeze(-1)), index).tolist()
 
 
 def compare(

@@ -18,6 +18,9 @@ from hpamdp import keys
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Separates the seeds of an evaluation from the small ones that people give to training.
+_EVALUATION = 0x5EED0000
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -91,9 +94,17 @@ class PAMDPEnv(EnvBase):
     def fixed_episodes(self, seed: int) -> TensorDict | None:
         """Return what to `reset` with for the evaluation episodes of a seed, one for each environment.
 
-        None: `set_seed(seed)` and a reset without arguments fix them.
+        None: `seed_evaluation(seed)` and a reset without arguments fix them.
         """
         return None
+
+    def seed_evaluation(self, seed: int) -> None:
+        """Seed the episodes and the noise of an evaluation, which should not be those of training with any seed.
+
+        The default is `set_seed` with another seed. An environment whose random numbers come from `counter_rng` does
+        better to draw them from the streams EVALUATION and EVALUATION_NOISE until the next `set_seed`.
+        """
+        self.set_seed(seed ^ _EVALUATION)
 
     def describe(self) -> dict[str, Tensor]:
         """Return what is known of the episodes that were just reset, first dimension `N`; computed once a run."""

@@ -56,6 +56,10 @@ class OptionChoiceEnv(PAMDPEnv):
         """Return the fixed episodes of the wrapped environment."""
         return self._inner_env.fixed_episodes(seed)
 
+    def seed_evaluation(self, seed: int) -> None:
+        """Seed the evaluation episodes of the wrapped environment."""
+        self._inner_env.seed_evaluation(seed)
+
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return the results of the wrapped environment."""
         return self._inner_env.results(last)

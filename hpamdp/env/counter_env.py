@@ -22,6 +22,7 @@ from hpamdp.env import counter_rng
 from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.columns import Columns, replaced, restored, where
+from hpamdp.env.counter_rng import Key
 
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
@@ -101,17 +102,17 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         self._set_seed(seed)
 
     @abstractmethod
-    def start(self, episode: Tensor, rng: Tensor) -> EpisodeState:
+    def start(self, episode: Tensor, rng: Key) -> EpisodeState:
         """Return the states in which episodes begin.
 
         Args:
             episode: their numbers, int32 `[N]`.
-            rng: keys for `counter_rng.uniform` and `normal`, int32 `[N]`.
+            rng: keys for `counter_rng.uniform` and `normal`, `[N]`.
         """
 
     @abstractmethod
     def act(
-        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
     ) -> tuple[EpisodeState, Tensor]:
         """Return the states after one action in every environment, and the rewards `[N]`.
 
@@ -120,7 +121,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             discrete: the chosen actions, int64 `[N]`.
             parameters: of the chosen actions, within their bounds, `[N, D]`, where D is the largest number of
                 parameters that an action has; what an action does not have is 0.
-            rng: keys of the episodes' noise, int32 `[N]`.
+            rng: keys of the episodes' noise, `[N]`.
             is_idle: bool `[N]`: rows whose result is thrown away, since their episode is over or their step is masked.
         """
 

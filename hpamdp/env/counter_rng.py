@@ -8,12 +8,31 @@ index): the episodes of an environment do not depend on the batch, and no global
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-# Separate streams: evaluation never meets a layout of training, and noise changes no layout.
+# What a stream is for: the episodes of training and of evaluation, and the noise in either.
 TRAINING, EVALUATION, NOISE, EVALUATION_NOISE = range(4)
+
+# Number `index` of a key is the hash of `bits + index * step`. An odd step visits all 2^32 values before it repeats one
+# (a Weyl sequence). Each stream has its own, and no difference of two is a multiple of 8, so the sequences of two
+# streams, shifted or not, have at most one value in common in 2^30 indices. Whatever the seeds, no stream repeats the
+# numbers of another.
+_STEPS = (-0x7A143595, -0x61C88647, 0x27D4EB2F, 0x165667BD)
+
+
+class Key(NamedTuple):
+    """What all random numbers of an episode derive from.
+
+    Attributes:
+        bits: int32 `[*B]`, the hash of the seed, the environment and the episode.
+        step: of the stream.
+    """
+
+    bits: Tensor
+    step: int
 
 
 def _shift_right(h: Tensor, bits: int) -> Tensor:
@@ -28,22 +47,28 @@ def _mix(h: Tensor) -> Tensor:
     return h ^ _shift_right(h, 16)
 
 
-def key_for(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> Tensor:
-    """Return the int32 `[*B]` random key of an episode, from which all its numbers derive; all inputs are int32."""
+def key_for(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> Key:
+    """Return the key `[*B]` of an episode.
+
+    Args:
+        seed: int32 scalar, from `seed_tensor`.
+        stream: TRAINING, EVALUATION, NOISE or EVALUATION_NOISE.
+        environment: int32 `[*B]`, the numbers of the environments.
+        episode: int32 `[*B]`, the numbers of their episodes.
+    """
     h = _mix(seed ^ (0x2545F491 + 0x01234567 * stream))
     h = _mix(h ^ environment)
-    return _mix(h ^ episode)
+    return Key(_mix(h ^ episode), _STEPS[stream])
 
 
-def uniform(key: Tensor, index: int | Tensor) -> Tensor:
-    """Return float32 `[*B]` in (0, 1): number `index` of each key; `index` may be an int32 tensor."""
-    # An odd step visits all 2^32 states before it repeats one (a Weyl sequence); `_mix` hides its regularity.
+def uniform(key: Key, index: int | Tensor) -> Tensor:
+    """Return float32 in (0, 1): number `index` of each key; an `index` that is an int32 tensor broadcasts with them."""
     # 23 bits: with 24, adding a half would round up to 1 in the upper half of the interval.
-    bits = _shift_right(_mix(key + index * -0x61C88647), 9)
+    bits = _shift_right(_mix(key.bits + index * key.step), 9)
     return (bits.to(torch.float32) + 0.5) * 2.0**-23
 
 
-def normal(key: Tensor, index: int | Tensor) -> Tensor:
+def normal(key: Key, index: int | Tensor) -> Tensor:
     """Return standard normal float32 `[*B]` (Box-Muller), from the uniform numbers `2 index` and `2 index + 1`."""
     radius = (-2.0 * uniform(key, 2 * index).log()).sqrt()
     return radius * (2.0 * math.pi * uniform(key, 2 * index + 1)).cos()

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
+from hpamdp.env.counter_rng import Key
 
 OBSERVATION_NAMES = ("vx", "vy", "target_dx", "target_dy")
 HIT_RADIUS = 0.2
@@ -57,8 +58,8 @@ class PointState(Located, Protocol):
         """Of the target."""
 
 
-def start(rng: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return x and y of the agent and of the target, uniform in (-1, 1), `[N]` each; `rng` is int32 `[N]`."""
+def start(rng: Key) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return x and y of the agent and of the target, uniform in (-1, 1), `[N]` each."""
     x, y, target_x, target_y = (2.0 * counter_rng.uniform(rng, index) - 1.0 for index in range(4))
     return x, y, target_x, target_y
 

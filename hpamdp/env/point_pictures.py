@@ -61,7 +61,8 @@ def draw(scene: Scene, size: int = 480) -> np.ndarray:
     canvas.disc(_on_paper(scene.target), 2.5, edge)
     for start, end in itertools.pairwise(scene.path):
         canvas.line(_on_paper(start), _on_paper(end), _PATH, 2.0)
-    for point in scene.path[1:-1]:
+    # Of a long way, single steps cannot be told apart.
+    for point in scene.path[1:-1] if len(scene.path) < 60 else ():
         canvas.disc(_on_paper(point), 2.0, _PATH)
     canvas.disc(_on_paper(scene.path[0]), 5.0, BACKGROUND, INK, 2.0)
     _draw_agent(canvas, scene)

@@ -16,9 +16,6 @@ from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.policies.agent import HierarchicalAgent
 
-# Separates the noise of the evaluation from that of a training run with the same seed.
-_APART = 0x5EED0000
-
 
 class Evaluation:
     """A fixed set of episodes on which agents are scored.
@@ -41,7 +38,7 @@ class Evaluation:
         return self.env.base_env
 
     def _reset(self) -> TensorDictBase:
-        self.env.set_seed(self.seed ^ _APART)  # the noise, too, is the same at every evaluation
+        self.problem.seed_evaluation(self.seed)  # the noise, too, is the same at every evaluation
         return self.env.reset(None if self.episodes is None else self.episodes.copy())
 
     def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:

@@ -170,6 +170,11 @@ class BoatDockEnv(PAMDPEnv):
         points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
         return TensorDict(points, batch_size=self.batch_size, device=self.device)
 
+    def seed_evaluation(self, seed: int) -> None:
+        """Seed episodes and noise as `set_seed` does, but from streams that training never meets, whatever its seed."""
+        self.set_seed(seed)
+        self.rules = self.rules._replace(is_evaluation=True)
+
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `outcome`, `fuel` (fraction), `score` and `success` `[M]` of finished (or abandoned) episodes."""
         outcome, fuel = last.get(keys.OUTCOME), last.get(episode.FUEL).squeeze(-1)
@@ -247,6 +252,7 @@ class BoatDockEnv(PAMDPEnv):
         self.done_spec = self.make_done_spec()
 
     def _set_seed(self, seed: int | None) -> None:
+        self.rules = self.rules._replace(is_evaluation=False)
         self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
         floats = torch.zeros(self.num_envs, device=self.device)
         integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)

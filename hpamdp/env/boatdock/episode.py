@@ -70,6 +70,7 @@ class Rules(NamedTuple):
     motor_noise: tuple[float, float] = (0.0, 0.0)  # of the incongruent and of the congruent boat
     sensor_noise: float = 0.0
     slip: float = 0.0
+    is_evaluation: bool = False  # whether episodes and noise come from the streams of evaluation
 
 
 class BoatState(NamedTuple):
@@ -133,7 +134,7 @@ def step(
     is_valid = (key == allowed_key) & duration.isfinite()
     if rules.controller == "choose":
         is_valid = is_valid & (option >= 0) & (option < len(harbour.CONTROLLERS))
-    noise_key = counter_rng.key_for(seed, counter_rng.NOISE, environment, state.episode)
+    noise_key = _noise_key(state, seed, environment, rules)
     moved = _press(state, option.to(torch.int32), allowed_key.to(torch.int32), duration, noise_key, rules)
     over = state.outcome != physics.SAILING
     reward = torch.where(over, 0.0, reward_of(state, moved, rules))
@@ -143,7 +144,8 @@ def step(
 def reset(state: BoatState, mask: Tensor, seed: Tensor, environment: Tensor, rules: Rules) -> BoatState:
     """Start a new episode in the rows of `mask` `[N]`; its layout is a function of (seed, environment, episode)."""
     episode = state.episode + 1
-    key = counter_rng.key_for(seed, counter_rng.TRAINING, environment, episode)
+    stream = counter_rng.EVALUATION if rules.is_evaluation else counter_rng.TRAINING
+    key = counter_rng.key_for(seed, stream, environment, episode)
     layout = harbour.sample_layout(key)
     zeros = torch.zeros_like(layout.start_x)
     integer_zeros = torch.zeros_like(episode)
@@ -173,8 +175,13 @@ def reset(state: BoatState, mask: Tensor, seed: Tensor, environment: Tensor, rul
     return where(mask, fresh, state)
 
 
+def _noise_key(state: BoatState, seed: Tensor, environment: Tensor, rules: Rules) -> counter_rng.Key:
+    stream = counter_rng.EVALUATION_NOISE if rules.is_evaluation else counter_rng.NOISE
+    return counter_rng.key_for(seed, stream, environment, state.episode)
+
+
 def _press(
-    state: BoatState, option: Tensor, key: Tensor, duration: Tensor, noise_key: Tensor, rules: Rules
+    state: BoatState, option: Tensor, key: Tensor, duration: Tensor, noise_key: counter_rng.Key, rules: Rules
 ) -> BoatState:
     """Return the states after a press of allowed keys with finite durations, as if no episode were over."""
     first = state.presses * _NUMBERS_PER_PRESS
@@ -226,7 +233,7 @@ def read(state: BoatState, seed: Tensor, environment: Tensor, rules: Rules) -> R
     """Return what the environments observe in this state."""
     points = [state.start_x, state.start_y, state.goal_x, state.goal_y, state.x, state.y]
     if rules.sensor_noise > 0.0:
-        noise_key = counter_rng.key_for(seed, counter_rng.NOISE, environment, state.episode)
+        noise_key = _noise_key(state, seed, environment, rules)
         first = state.presses * (_NUMBERS_PER_PRESS // 2) + _SENSOR
         points = [p + rules.sensor_noise * counter_rng.normal(noise_key, first + i) for i, p in enumerate(points)]
     start_x, start_y, goal_x, goal_y, x, y = points

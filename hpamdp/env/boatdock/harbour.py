@@ -63,7 +63,7 @@ INDEX_CONTROLLER = 3 * _TRIES + 1
 INDEX_KEYMAP = 3 * _TRIES + 2
 
 
-def sample_layout(key: Tensor) -> Layout:
+def sample_layout(key: counter_rng.Key) -> Layout:
     """Sample start and goal uniformly in the disc, again while they are less than MIN_SEPARATION apart.
 
     A try samples the two squared radii and the angle between the points: the distance depends on nothing else. The
@@ -71,7 +71,7 @@ def sample_layout(key: Tensor) -> Layout:
     their goal on the far side of the centre, which avoids a loop that depends on the data.
 
     Args:
-        key: int32 `[*B]` from `counter_rng.key_for`.
+        key: `[*B]` from `counter_rng.key_for`.
     """
 
     def attempt(first_index: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -211,13 +211,13 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         self._state = where(mask, fresh, before)
         return self._read()
 
-    def _sampled_layout(self, rng: Tensor, mask: Tensor) -> dict[str, Tensor]:
+    def _sampled_layout(self, rng: counter_rng.Key, mask: Tensor) -> dict[str, Tensor]:
         """Return the layout columns of the state, with new layouts in those rows of `mask` `[N]` that need one."""
         is_due = mask & (self._state.episode < 0) if self.frozen_layouts else mask
         state = self._state
         points = torch.stack([state.start_x, state.start_y, state.goal_x, state.goal_y], -1)
         if is_due.any():
-            points[is_due] = released.sample_layouts(rng[is_due], self.test_mode).to(points)
+            points[is_due] = released.sample_layouts(rng._replace(bits=rng.bits[is_due]), self.test_mode).to(points)
         start_x, start_y, goal_x, goal_y = points.unbind(-1)
         return {"start_x": start_x, "start_y": start_y, "goal_x": goal_x, "goal_y": goal_y}
 

@@ -88,20 +88,21 @@ class ReleasedState(NamedTuple):
     episode: Tensor
 
 
-def sample_layouts(rng: Tensor, test_mode: int | None) -> Tensor:
+def sample_layouts(rng: counter_rng.Key, test_mode: int | None) -> Tensor:
     """Sample starts and goals `[M, 4]` (screen px, float64) that are far enough apart and of the test mode.
 
     Args:
-        rng: int32 `[M]` from `counter_rng.key_for`.
+        rng: `[M]` from `counter_rng.key_for`.
         test_mode: see `ReleasedBoatDockEnv`.
     """
-    low = torch.tensor([*LOW, *LOW], dtype=torch.float64, device=rng.device)
-    layout = low.repeat(len(rng), 1)
-    missing = torch.arange(len(rng), device=rng.device)
+    low = torch.tensor([*LOW, *LOW], dtype=torch.float64, device=rng.bits.device)
+    layout = low.repeat(len(rng.bits), 1)
+    missing = torch.arange(len(rng.bits), device=rng.bits.device)
     first = _INDEX_LAYOUT
     while len(missing):
-        index = first + torch.arange(4 * _TRIES, dtype=torch.int32, device=rng.device)
-        numbers = counter_rng.uniform(rng[missing].unsqueeze(-1), index).double()
+        index = first + torch.arange(4 * _TRIES, dtype=torch.int32, device=rng.bits.device)
+        keys = rng._replace(bits=rng.bits[missing].unsqueeze(-1))
+        numbers = counter_rng.uniform(keys, index).double()
         points = low + (SIZE * numbers).floor().unflatten(-1, (_TRIES, 4))
         is_good = (points[..., :2] - points[..., 2:]).norm(dim=-1) >= MIN_SEPARATION
         if test_mode is not None:

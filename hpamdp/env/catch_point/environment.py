@@ -17,6 +17,7 @@ from hpamdp.env import point_agent, point_pictures
 from hpamdp.env.catch_point import rules
 from hpamdp.env.catch_point.rules import CatchPointState
 from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_rng import Key
 
 _CEILING = {25: 0.964, 30: 0.997}  # of success, by the limit of steps: who starts too far away cannot arrive
 
@@ -94,12 +95,12 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
         """Where the agents are, `[N, 2]`."""
         return torch.stack([self.state.x, self.state.y], -1)
 
-    def start(self, episode: Tensor, rng: Tensor) -> CatchPointState:
+    def start(self, episode: Tensor, rng: Key) -> CatchPointState:
         """Return states with agent and target anywhere in the square."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: CatchPointState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+        self, state: CatchPointState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
     ) -> tuple[CatchPointState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
         return rules.act(state, discrete, parameters.squeeze(-1), catches=self.catches, late_end=self.late_end)

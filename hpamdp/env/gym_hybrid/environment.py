@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hpamdp.env import point_pictures
 from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_rng import Key
 from hpamdp.env.gym_hybrid import rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
 
@@ -59,12 +60,12 @@ class _VehicleEnv(CounterEnv[VehicleState]):
         """Where the vehicles are, `[N, 2]`."""
         return torch.stack([self.state.x, self.state.y], -1)
 
-    def start(self, episode: Tensor, rng: Tensor) -> VehicleState:
+    def start(self, episode: Tensor, rng: Key) -> VehicleState:
         """Return states with vehicle and target anywhere in the field, at rest."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: VehicleState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+        self, state: VehicleState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
     ) -> tuple[VehicleState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
         return rules.act(state, discrete, parameters.squeeze(-1), slides=self.slides, max_steps=self.max_steps)

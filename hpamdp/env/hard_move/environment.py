@@ -14,6 +14,7 @@ from torch import Tensor
 
 from hpamdp.env import point_agent, point_pictures
 from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_rng import Key
 from hpamdp.env.hard_move import rules
 from hpamdp.env.hard_move.rules import HardMoveState
 
@@ -95,12 +96,12 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
         """Where the agents are, `[N, 2]`."""
         return torch.stack([self.state.x, self.state.y], -1)
 
-    def start(self, episode: Tensor, rng: Tensor) -> HardMoveState:
+    def start(self, episode: Tensor, rng: Key) -> HardMoveState:
         """Return states with agent and target anywhere in the square."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: HardMoveState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+        self, state: HardMoveState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
     ) -> tuple[HardMoveState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
         return rules.act(state, discrete, parameters.squeeze(-1), self._motions)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
+from hpamdp.env.counter_rng import Key
 
 OUTCOMES = ("going on", "reached", "time limit")
 GOING_ON, REACHED, TIME_LIMIT = range(3)
@@ -52,7 +53,7 @@ def motions(n: int, *, rounded: bool) -> Tensor:
     return sums / sums.norm(dim=-1).max()
 
 
-def start(episode: Tensor, rng: Tensor) -> HardMoveState:
+def start(episode: Tensor, rng: Key) -> HardMoveState:
     """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
     x, y, target_x, target_y = point_agent.start(rng)
     zeros = torch.zeros_like(x)

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.counter_env import CounterEnv
-from hpamdp.env.platform import rules
+from hpamdp.env.counter_rng import Key
+from hpamdp.env.platform import rendering, rules
 from hpamdp.env.platform.rules import PlatformState
 
 
@@ -75,12 +76,12 @@ class PlatformEnv(CounterEnv[PlatformState]):
         """The lowest and the highest observation, `[9]` each."""
         return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
 
-    def start(self, episode: Tensor, rng: Tensor) -> PlatformState:
+    def start(self, episode: Tensor, rng: Key) -> PlatformState:
         """Return the states at the beginning of the course; nothing about them is random."""
         return rules.start(episode)
 
     def act(
-        self, state: PlatformState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+        self, state: PlatformState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
     ) -> tuple[PlatformState, Tensor]:
         """Return the states after one action, and the distances covered as shares of the course, `[N]`."""
         # Rows that do not move simulate a run, which is shorter than a jump.
@@ -92,6 +93,10 @@ class PlatformEnv(CounterEnv[PlatformState]):
     def observe(self, state: PlatformState) -> Tensor:
         """Return the observations `[N, 9]`."""
         return rules.observe(state)
+
+    def draw(self, track: Sequence[PlatformState]) -> np.ndarray:
+        """Return a picture of the course, uint8 `[480, 480, 3]`."""
+        return rendering.draw(track)
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the best possible return as `ceiling`."""

@@ -35,7 +35,7 @@ OBSERVATION_NAMES = (
 # its left foot.
 LEFT, RIGHT = (0.0, 475.0, 985.0), (250.0, 750.0, 1035.0)
 END = RIGHT[2]
-_BODY_WIDTH, _BODY_HEIGHT = 20.0, 30.0
+BODY_WIDTH, BODY_HEIGHT = 20.0, 30.0
 _TICK = 0.05
 _GRAVITY = 9.8
 _MAX_SPEED = 70.0  # px/s
@@ -44,7 +44,7 @@ _DECAY = 0.99  # of the speed, a tick
 _RUN_TICKS = 20.0
 _HOP_RISE, _LEAP_RISE = 35.0, 25.0  # vertical speed at the start of a jump, px/s
 _ENEMY_SPEED = 30.0
-_FIRST_START, _SECOND_START = RIGHT[0] - _BODY_WIDTH, RIGHT[1] - _BODY_WIDTH  # where the enemies start and turn
+_FIRST_START, _SECOND_START = RIGHT[0] - BODY_WIDTH, RIGHT[1] - BODY_WIDTH  # where the enemies start and turn
 _JUMP_NOISE = 1.0  # standard deviation of the speeds at the start of a jump, px/s
 _TICK_NOISE = 0.5 * _TICK  # standard deviation of the change of speed in a tick, px/s
 # Each action has this many normal random numbers of its episode: two for a jump, then two a tick. A hop has 144 ticks.
@@ -102,11 +102,11 @@ def act(
         normal: returns the standard normal numbers with these indices, int32 `[N]` or `[T, N]`, of the episodes.
         noise: factor on the published noise.
     """
-    edge = torch.where(state.x < LEFT[2] - _BODY_WIDTH, RIGHT[1], RIGHT[2])
-    edge = torch.where(state.x < LEFT[1] - _BODY_WIDTH, RIGHT[0], edge)
+    edge = torch.where(state.x < LEFT[2] - BODY_WIDTH, RIGHT[1], RIGHT[2])
+    edge = torch.where(state.x < LEFT[1] - BODY_WIDTH, RIGHT[0], edge)
     is_jump = (discrete != RUN) & (state.x <= edge)  # an agent beyond the edge falls, whatever it chooses
-    first = state.steps * _NUMBERS_PER_ACTION
-    rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE)
+    first = first_number(state)
+    rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE).to(state.x.dtype)
     push = parameter / (2.0 * rise / _GRAVITY + 1.0) - state.speed
     push = push - noise * _JUMP_NOISE * normal(first).abs()
     rise = rise - noise * _JUMP_NOISE * normal(first + 1).abs()
@@ -122,7 +122,7 @@ def act(
     before, x, speed = _move(state.x, speed, edge, torch.where(is_jump, 0.0, parameter), drag)
     enemy_x, enemy_speed = _patrol(before, x, state.enemy_x, state.enemy_speed, gust)
     height = torch.where(is_jump, (tick + 1) * (rise - tick * fall) * _TICK, 0.0)
-    has_met = ((x - enemy_x).abs() < _BODY_WIDTH) & (height < _BODY_HEIGHT)
+    has_met = ((x - enemy_x).abs() < BODY_WIDTH) & (height < BODY_HEIGHT)
     is_off = ~is_jump & (before > edge)
     is_end = has_met | is_off | (x >= END) | (tick == length - 1.0)
     end = torch.where(is_end, tick, len(tick)).amin(0, keepdim=True).long()
@@ -139,6 +139,11 @@ def act(
     outcome = torch.where(x >= END, ARRIVED, outcome).to(torch.int32)
     speed = torch.where(is_stopped, 0.0, speed)
     return PlatformState(x, speed, enemy_x, enemy_speed, state.steps + 1, outcome, state.episode)
+
+
+def first_number(state: PlatformState) -> Tensor:
+    """Return the index `[N]` of the first random number of the next action: two for a jump, then two for each tick."""
+    return state.steps * _NUMBERS_PER_ACTION
 
 
 def _move(x: Tensor, speed: Tensor, edge: Tensor, power: Tensor, drag: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -207,11 +212,11 @@ def _land(x: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
     landed = x
     stands = torch.zeros_like(x, dtype=torch.bool)
     for left, right in zip(LEFT, RIGHT, strict=True):
-        from_left = x - (left - _BODY_WIDTH)
+        from_left = x - (left - BODY_WIDTH)
         from_right = right - x
         inside = torch.minimum(from_left, from_right)
         stands = stands | (inside >= depth)
-        aside = torch.where(from_left < from_right, left - _BODY_WIDTH, right)
+        aside = torch.where(from_left < from_right, left - BODY_WIDTH, right)
         landed = torch.where((inside > 0.0) & (inside < depth), aside, landed)
     return landed, stands
 
@@ -219,7 +224,7 @@ def _land(x: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
 def observe(state: PlatformState) -> Tensor:
     """Return the observation `[N, 9]`, whose entries are OBSERVATION_NAMES, scaled to [-1, 1]."""
     basic = [
-        (state.x + _BODY_WIDTH) / (END + _BODY_WIDTH),
+        (state.x + BODY_WIDTH) / (END + BODY_WIDTH),
         state.speed / 100.0,
         state.enemy_x / END,
         (state.enemy_speed + _ENEMY_SPEED) / (2.0 * _ENEMY_SPEED),

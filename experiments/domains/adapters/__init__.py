@@ -1,0 +1,111 @@
+"""What a replay needs of each domain: a module here with its names, `DOMAINS`, and a class `DomainAdapter`."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+
+class Adapter(Protocol):
+    """A domain's rules, as a replay calls them. N is the number of rows, each of another episode or step.
+
+    Attributes:
+        outcomes: what the recordings call each of our outcomes, "" while an episode goes on.
+        angles: columns that count modulo 2 pi.
+        float32_tolerance: the largest difference of a single step in float32 that is rounding alone.
+    """
+
+    outcomes: tuple[str, ...]
+    angles: tuple[str, ...]
+    float32_tolerance: float
+
+    def __init__(self, recording: dict[str, Any]) -> None: ...
+
+    def states(self, rows: Sequence[Sequence[float]], taken: Sequence[int], dtype: torch.dtype) -> Any:
+        """Return our states from recorded ones, as `state_names` orders them, after so many actions each."""
+
+    def act(self, state: Any, steps: Sequence[dict[str, Any]]) -> tuple[Any, Tensor]:
+        """Return the states after the recorded steps, with the recorded random numbers, and the rewards `[N]`."""
+
+    def observe(self, state: Any) -> Tensor:
+        """Return the observations `[N, observation_dim]`, as they are recorded."""
+
+    def named(self, state: Any) -> dict[str, Tensor]:
+        """Return the columns `[N]` that are to be compared."""
+
+    def columns(self, rows: Sequence[Sequence[float]]) -> dict[str, Tensor]:
+        """Return the same columns of recorded states, float64 `[N]`."""
+
+
+class DirectAdapter:
+    """The parts of an adapter whose recorded columns are ours, one by one.
+
+    A subclass gives `state_type` and the names that our columns have in the recordings, where they differ.
+    """
+
+    angles: tuple[str, ...] = ()
+    float32_tolerance = 2e-6
+    state_type: type[Any]
+    recorded_names: dict[str, str]  # by our own; columns that are not recorded are left out
+    integers: tuple[str, ...] = ("misses", "steps", "outcome", "episode")
+
+    def __init__(self, recording: dict[str, Any]) -> None:
+        self.state_names: list[str] = recording["state_names"]
+
+    def columns(self, rows: Sequence[Sequence[float]]) -> dict[str, Tensor]:
+        """Return our columns that are recorded, float64 `[N]`."""
+        table = torch.tensor(rows, dtype=torch.float64)
+        return {ours: table[:, self.state_names.index(name)] for ours, name in self.recorded_names.items()}
+
+    def states(self, rows: Sequence[Sequence[float]], taken: Sequence[int], dtype: torch.dtype) -> Any:
+        """Return our states; what is not recorded is 0."""
+        recorded = self.columns(rows)
+        zeros = torch.zeros(len(rows), dtype=torch.float64)
+        columns = {name: recorded.get(name, zeros) for name in self.state_type._fields}
+        types = {name: torch.int32 if name in self.integers else dtype for name in columns}
+        return self.state_type(*(column.to(types[name]) for name, column in columns.items()))
+
+    def named(self, state: Any) -> dict[str, Tensor]:
+        """Return the columns that are recorded."""
+        return {name: getattr(state, name) for name in self.recorded_names}
+
+
+def chosen(steps: Sequence[dict[str, Any]], like: Tensor, size: int = 1) -> tuple[Tensor, Tensor]:
+    """Return the discrete actions int64 `[N]` and their parameters `[N, size]` of steps; 0 for what an action has not.
+
+    Args:
+        steps: as recorded.
+        like: a tensor of the state's dtype.
+        size: the largest number of parameters of an action.
+    """
+    rows = [[*step["parameters"], *[0.0] * (size - len(step["parameters"]))] for step in steps]
+    parameters = torch.tensor(rows, dtype=torch.float64).to(like.dtype)
+    return torch.tensor([step["action"] for step in steps]), parameters
+
+
+def limited(state: Any, max_steps: int, limit: int) -> Any:
+    """Return the states with the outcome `limit` where an episode that goes on has had its last step."""
+    is_late = (state.outcome == 0) & (state.steps >= max_steps)
+    return state._replace(outcome=torch.where(is_late, limit, state.outcome))
+
+
+def load(recording: dict[str, Any]) -> Adapter:
+    """Return the adapter of a recording.
+
+    Raises:
+        ValueError: it is no recording, or of a domain without an adapter.
+    """
+    if not isinstance(recording, dict) or "domain" not in recording or "episodes" not in recording:
+        raise ValueError("not a recording: it has no domain and episodes")
+    known: dict[str, type[Any]] = {}
+    for found in pkgutil.iter_modules(__path__, "adapters."):
+        module = importlib.import_module(found.name)
+        known |= dict.fromkeys(module.DOMAINS, module.DomainAdapter)
+    if recording["domain"] not in known:
+        raise ValueError(f"domain {recording['domain']!r}, but must be one of {', '.join(known)}")
+    return known[recording["domain"]](recording)

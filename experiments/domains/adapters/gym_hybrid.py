@@ -1,0 +1,42 @@
+"""Moving and Sliding."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from adapters import DirectAdapter, chosen
+from hpamdp.env.gym_hybrid import rules
+
+DOMAINS = ("moving", "sliding")
+
+
+class DomainAdapter(DirectAdapter):
+    """Moving and Sliding by their rules; parameters are clipped as the reference does it."""
+
+    outcomes = ("", "stopped at the target", "left the field", "limit")
+    angles = ("heading", "course")
+    state_type = rules.VehicleState
+
+    def __init__(self, recording: dict[str, Any]) -> None:
+        super().__init__(recording)
+        self.slides = recording["domain"] == "sliding"
+        self.recorded_names = {
+            **{name: name for name in ("x", "y", "speed", "target_x", "target_y")},
+            "heading": "theta",
+            "course": "phi" if self.slides else "theta",
+            "steps": "time",
+        }
+
+    def act(self, state: rules.VehicleState, steps: Sequence[dict[str, Any]]) -> tuple[rules.VehicleState, Tensor]:
+        discrete, parameters = chosen(steps, state.x)
+        parameter = parameters.squeeze(-1)
+        low, high = (torch.tensor([*side, 0.0]).to(parameter) for side in (rules.PARAMETER_LOW, rules.PARAMETER_HIGH))
+        parameter = parameter.clamp(low[discrete], high[discrete])
+        return rules.act(state, discrete, parameter, slides=self.slides, max_steps=rules.PUBLISHED_STEPS)
+
+    def observe(self, state: rules.VehicleState) -> Tensor:
+        return rules.observe(state, rules.PUBLISHED_STEPS)

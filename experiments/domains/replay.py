@@ -1,0 +1,159 @@
+"""Replay recorded episodes of the field's domains in our rules, and print the largest differences.
+
+Run: python experiments/domains/replay.py FILE.json [--dtype float32] [--step-by-step] [--tolerance 1e-6]
+
+A file holds episodes that the reference code of a domain played, with every random number that it drew. They run
+through from their first state, or, step by step, each step starts from the recorded state before it. float32 goes step
+by step, since small differences grow. The exit code is 1 if a number differs by more than the tolerance, or an outcome,
+termination or truncation at all, and 2 if the file is no such recording.
+
+`README.md` beside this file describes the files and how to add a domain.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).parent))
+from adapters import Adapter, load
+
+FLOAT64_TOLERANCE = 1e-9
+
+
+@dataclass
+class Report:
+    """What a replay found.
+
+    Attributes:
+        steps: how many were compared.
+        largest: the largest difference by what differs: the columns of the state, `observation` and `reward`.
+        mismatches: steps whose outcome or flags differ, in words.
+    """
+
+    steps: int = 0
+    largest: dict[str, float] = field(default_factory=dict)
+    mismatches: list[str] = field(default_factory=list)
+
+    @property
+    def worst(self) -> float:
+        """The largest difference of all."""
+        return max(self.largest.values(), default=0.0)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One recorded step: where it stands in the file, the state before it, and what was recorded."""
+
+    episode: int
+    number: int
+    before: list[float]
+    recorded: dict[str, Any]
+
+
+def replay(recording: dict[str, Any], dtype: torch.dtype = torch.float64, *, step_by_step: bool = False) -> Report:
+    """Compare a recording with our rules.
+
+    Raises:
+        ValueError: there is no adapter for its domain.
+    """
+    adapter = load(recording)
+    episodes = recording["episodes"]
+    report = Report()
+    starts = [episode["initial"] for episode in episodes]
+    state = adapter.states([start["state"] for start in starts], [0] * len(starts), dtype)
+    _note(report, "observation", adapter.observe(state), [start["observation"] for start in starts])
+    if step_by_step:
+        steps = [step for number, episode in enumerate(episodes) for step in _steps(number, episode)]
+        before = adapter.states([step.before for step in steps], [step.number for step in steps], dtype)
+        _compare(report, adapter, before, steps)
+        return report
+    running = list(range(len(episodes)))
+    number = 0
+    while running:
+        going_on = [row for row, episode in enumerate(running) if number < len(episodes[episode]["steps"])]
+        state = type(state)(*(column[going_on] for column in state))
+        running = [running[row] for row in going_on]
+        if running:
+            steps = [_Step(episode, number, [], episodes[episode]["steps"][number]) for episode in running]
+            state = _compare(report, adapter, state, steps)
+        number += 1
+    return report
+
+
+def _steps(number: int, episode: dict[str, Any]) -> list[_Step]:
+    before = [episode["initial"]["state"], *(step["state"] for step in episode["steps"])]
+    return [_Step(number, at, before[at], step) for at, step in enumerate(episode["steps"])]
+
+
+def _compare(report: Report, adapter: Adapter, state: Any, steps: list[_Step]) -> Any:
+    """Take the steps `[N]` from the states, note what differs, and return the states after them."""
+    recorded = [step.recorded for step in steps]
+    after, reward = adapter.act(state, recorded)
+    report.steps += len(steps)
+    columns = adapter.columns([step["state"] for step in recorded])
+    for name, values in adapter.named(after).items():
+        _note(report, name, values, columns[name], is_angle=name in adapter.angles)
+    _note(report, "observation", adapter.observe(after), [step["observation"] for step in recorded])
+    _note(report, "reward", reward, [step["reward"] for step in recorded])
+    for step, code in zip(steps, after.outcome.tolist(), strict=True):
+        outcome = adapter.outcomes[code]
+        ours = (outcome, outcome not in ("", "limit"), outcome == "limit")
+        theirs = (step.recorded["outcome"], step.recorded["terminated"], step.recorded["truncated"])
+        if ours != theirs:
+            report.mismatches.append(
+                f"episode {step.episode}, step {step.number}: {ours}, but recorded (outcome, terminated, truncated) "
+                f"is {theirs}"
+            )
+    return after
+
+
+def _note(report: Report, name: str, ours: Tensor, theirs: Any, *, is_angle: bool = False) -> None:
+    difference = (ours.double() - torch.as_tensor(theirs, dtype=torch.float64)).abs()
+    if is_angle:
+        difference = (difference + math.pi).remainder(2.0 * math.pi).sub(math.pi).abs()
+    # A difference from NaN is infinite.
+    largest = difference.nan_to_num(nan=math.inf).max().item() if difference.numel() else 0.0
+    report.largest[name] = max(report.largest.get(name, 0.0), largest)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--dtype", choices=("float32", "float64"), default="float64")
+    parser.add_argument("--step-by-step", action="store_true", help="start each step from the recorded state before it")
+    parser.add_argument("--tolerance", type=float, help="largest difference allowed; the default depends on the dtype")
+    options = parser.parse_args(arguments)
+    step_by_step = options.step_by_step or options.dtype == "float32"
+    try:
+        recording = json.loads(options.file.read_text())
+        adapter = load(recording)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        print(f"{options.file}: {error}", file=sys.stderr)
+        return 2
+    tolerance = options.tolerance
+    if tolerance is None:
+        tolerance = FLOAT64_TOLERANCE if options.dtype == "float64" else adapter.float32_tolerance
+    report = replay(recording, getattr(torch, options.dtype), step_by_step=step_by_step)
+    how = "step by step" if step_by_step else "run through"
+    print(
+        f"{recording['domain']}: {report.steps} steps of {len(recording['episodes'])} episodes, {options.dtype}, {how}"
+    )
+    for name, largest in report.largest.items():
+        print(f"  {name:24} {largest:.1e}{'' if largest <= tolerance else f'  more than {tolerance:g}'}")
+    for mismatch in report.mismatches[:20]:
+        print(f"  {mismatch}")
+    print(f"  outcomes and flags: {len(report.mismatches) or 'no'} differences")
+    return 0 if report.worst <= tolerance and not report.mismatches else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

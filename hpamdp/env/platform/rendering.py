@@ -1,0 +1,58 @@
+"""Pictures of the course: its platforms, the agent with the way it made, and the active enemy."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image
+
+from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas
+from hpamdp.env.platform import rules
+from hpamdp.env.platform.rules import PlatformState
+
+_GROUND, _AGENT, _ENEMY, _PATH = "#8a9a7b", "#2f6690", "#b9503a", "#86aecb"
+_SCALE = (PAPER - 40.0) / (rules.END + rules.BODY_WIDTH)  # units of paper for each px
+_LEFT, _TOP = 20.0, 270.0  # where the course begins, and the height of the platforms' tops
+_DEPTH = 16.0  # of the platforms
+
+
+def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
+    """Return a picture of an episode, uint8 `[size, size, 3]`.
+
+    Args:
+        track: the states of one environment after each action, columns `[1]`.
+        size: of the picture.
+    """
+    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+    for left, right in zip(rules.LEFT, rules.RIGHT, strict=True):
+        corners = [(left, 0.0), (right, 0.0), (right, -_DEPTH / _SCALE), (left, -_DEPTH / _SCALE)]
+        canvas.polygon([_on_paper(x, y) for x, y in corners], _GROUND)
+    last = track[-1]
+    middles = [float(state.x) + rules.BODY_WIDTH / 2.0 for state in track]
+    for start, end in itertools.pairwise(middles):
+        canvas.line(_on_paper(start, 60.0), _on_paper(end, 60.0), _PATH, 2.0)
+    for middle in middles:
+        canvas.disc(_on_paper(middle, 60.0), 2.6, _PATH)
+    _draw_body(canvas, float(last.enemy_x), _ENEMY, 0.0)
+    has_fallen = int(last.outcome) == rules.FELL
+    _draw_body(canvas, float(last.x), _AGENT, -rules.BODY_HEIGHT if has_fallen else 0.0)
+    finished = Canvas(canvas.image.reduce(SMOOTH))
+    steps, outcome = int(last.steps), int(last.outcome)
+    finished.write((18.0, 22.0), f"{steps} {'action' if steps == 1 else 'actions'}", FAINT)
+    finished.write((PAPER - 18.0, 22.0), f"{100.0 * float(last.x) / rules.END:.0f} % of the course", INK, anchor="rm")
+    if outcome != rules.ON_THE_WAY:
+        colour = GOOD_EDGE if outcome == rules.ARRIVED else BAD_EDGE
+        finished.write((PAPER - 18.0, PAPER - 20.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
+    return np.array(finished.image)
+
+
+def _on_paper(x: float, y: float) -> tuple[float, float]:
+    """Map px of the course, y up from the platforms' tops, to units of paper."""
+    return _LEFT + x * _SCALE, _TOP - y * _SCALE
+
+
+def _draw_body(canvas: Canvas, x: float, colour: str, y: float) -> None:
+    right, top = x + rules.BODY_WIDTH, y + rules.BODY_HEIGHT
+    canvas.polygon([_on_paper(*corner) for corner in ((x, y), (right, y), (right, top), (x, top))], colour)

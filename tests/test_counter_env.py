@@ -1,0 +1,388 @@
+"""Environments over columns and counters keep the framework's contract, and so do their Gymnasium faces."""
+
+from __future__ import annotations
+
+import math
+import random
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from conftest import global_generators_unmoved
+from counter_players import action, is_unchanged, play, random_player, restart, snapshot
+from gymnasium.utils.env_checker import check_env
+from tensordict import TensorDictBase
+from torchrl.envs.utils import check_env_specs
+
+from hpamdp import keys
+from hpamdp.env import counter_rng
+from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.counter_env import GOING_ON, CounterEnv
+from hpamdp.env.faces import CounterFace
+from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
+from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.env.platform.environment import PlatformEnv
+from hpamdp.specs import PAMDPSpecs
+
+POINTS = [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv]
+PROBLEMS = [PlatformEnv, *POINTS]
+IDS = {
+    "hpamdp/Platform-v0": PlatformEnv,
+    "hpamdp/CatchPoint-v0": CatchPointEnv,
+    **{f"hpamdp/HardMove{n}-v0": HardMoveEnv for n in (4, 6, 8)},
+    "hpamdp/Moving-v0": MovingEnv,
+    "hpamdp/Sliding-v0": SlidingEnv,
+}
+# Gymnasium recommends actions scaled to [-1, 1]; the field's own bounds are others.
+RECOMMENDATION = "we recommend using a symmetric and normalized space"
+
+each_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda problem: problem.__name__)
+
+
+@pytest.mark.parametrize("problem", POINTS)
+def test_specs_hold(problem):
+    check_env_specs(problem(3, max_steps=4, oracle=True), return_contiguous=True)
+
+
+@pytest.mark.parametrize(
+    ("problem", "dims", "low", "high"),
+    [
+        (CatchPointEnv, (1, 0), (-1.0,), (1.0,)),
+        (HardMoveEnv, (1,) * 16, (-1.0,) * 16, (1.0,) * 16),
+        (MovingEnv, (1, 1, 0), (0.0, -1.0), (1.0, 1.0)),
+        (SlidingEnv, (1, 1, 0), (0.0, -1.0), (1.0, 1.0)),
+    ],
+)
+def test_learners_see_the_domains_own_actions_and_bounds(problem, dims, low, high):
+    env = problem(2)
+    dim = len(env.observation_names)
+    assert PAMDPSpecs.from_env(env) == PAMDPSpecs(dim, (), dims, low, high)
+    assert dim == (10 if problem in (MovingEnv, SlidingEnv) else 4)
+    assert len(env.discrete_names) == len(dims)
+
+
+@each_problem
+def test_the_episodes_of_an_environment_do_not_depend_on_the_others(problem):
+    few, many = problem(3, seed=11), problem(8, seed=11)
+    player = random_player()
+    readings = few.reset(), many.reset()
+    assert (readings[0] == readings[1][:3]).all()
+    for _ in range(8):
+        actions = player(many)
+        readings = few.step(actions[:3].clone())["next"], many.step(actions)["next"]
+        assert (readings[0] == readings[1][:3]).all()
+        # Start new episodes in some of the others alone.
+        restart(many, readings[1], torch.arange(8) > 4)
+
+
+@each_problem
+def test_environments_of_several_processes_continue_the_numbering(problem):
+    whole, part = problem(5, seed=3), problem(2, seed=3, first_env=3)
+    actions = random_player()(whole)
+    assert (whole.reset()[3:] == part.reset()).all()
+    assert (whole.step(actions.clone())["next"][3:] == part.step(actions[3:].clone())["next"]).all()
+
+
+@each_problem
+def test_a_masked_step_changes_the_other_environments_alone(problem):
+    masked, free = problem(6), problem(6)
+    actions = random_player()(free)
+    masked.reset()
+    free.reset()
+    before = snapshot(masked)
+    mask = torch.tensor([True, False] * 3)
+    reading = masked._step(actions.clone().set("_step", mask))
+    expected = free._step(actions)
+    assert is_unchanged(masked, before, ~mask)
+    assert (reading[mask] == expected[mask]).all()
+    assert (reading[keys.REWARD][~mask] == 0.0).all()
+
+
+@each_problem
+def test_a_partial_reset_leaves_the_other_environments_alone(problem):
+    env = problem(4)
+    env.reset()
+    reading = env.step(random_player()(env))["next"]
+    before = snapshot(env)
+    mask = torch.tensor([False, True, False, True])
+    fresh = restart(env, reading, mask)
+    assert is_unchanged(env, before, ~mask)
+    assert (fresh[keys.OBSERVATION][~mask] == reading[keys.OBSERVATION][~mask]).all()
+    assert env.env_state()["episode"].tolist() == [0, 1, 0, 1]
+    assert env.env_state()["steps"][mask].tolist() == [0, 0]
+    assert not fresh[keys.DONE][mask].any()
+
+
+@each_problem
+def test_a_finished_episode_stays_finished_and_earns_nothing(problem):
+    env = problem(32, max_steps=3)
+    player = random_player()
+    play(env, player, 3)
+    before = snapshot(env)
+    assert (before["outcome"] != GOING_ON).all()
+    after = env.step(player(env))["next"]
+    assert is_unchanged(env, before)
+    assert after[keys.DONE].all()
+    assert (after[keys.REWARD] == 0.0).all()
+
+
+@each_problem
+def test_the_time_limit_truncates(problem):
+    env = problem(64, max_steps=2)
+    last, _ = play(env, random_player(), 2)
+    truncated = last[keys.TRUNCATED].squeeze(-1)
+    assert truncated.any()
+    assert (last[keys.TERMINATED].squeeze(-1) == ~truncated).all()
+    assert (last[keys.OUTCOME][truncated] == len(env.outcomes) - 1).all()
+    assert not env.results(last)["success"][truncated].any()
+
+
+@each_problem
+def test_a_restored_state_continues_as_the_original(problem):
+    env, copy = problem(8, seed=2), problem(8, seed=2)
+    player = random_player()
+    play(env, player, 2)
+    copy.set_env_state(snapshot(env))
+    for _ in range(3):
+        actions = player(env)
+        assert (env.step(actions.clone())["next"] == copy.step(actions.clone())["next"]).all()
+
+
+@each_problem
+def test_a_state_of_other_environments_is_refused_and_an_empty_one_starts_new_episodes(problem):
+    env = problem(3)
+    env.reset()
+    before = snapshot(env)
+    with pytest.raises(ValueError, match=rf"{problem.__name__}: the state's x is \[2\], but must be \[3\]"):
+        env.set_env_state(problem(2).env_state())
+    assert is_unchanged(env, before)
+    env.set_env_state({})
+    assert env.env_state()["episode"].tolist() == [1, 1, 1]
+
+
+@each_problem
+@pytest.mark.parametrize("value", [math.nan, math.inf], ids=str)
+def test_a_parameter_that_is_no_number_is_refused_and_changes_nothing(problem, value):
+    env = problem(2)
+    env.reset()
+    before = snapshot(env)
+    parameters = torch.zeros(2, sum(env.parameter_dims))
+    parameters[1, 0] = value
+    with pytest.raises(
+        ValueError, match=r"step: environment 1 got discrete=0 .*those of the chosen action must be finite"
+    ):
+        env.step(action(torch.tensor([0, 0]), parameters))
+    assert is_unchanged(env, before)
+    env.step(action(torch.tensor([0, 1]), parameters))  # another action's parameter is never read
+    assert env.env_state()["x"].isfinite().all()
+
+
+@each_problem
+@pytest.mark.parametrize("discrete", [-1, 10**6])
+def test_an_unknown_action_is_refused(problem, discrete):
+    env = problem(2)
+    env.reset()
+    with pytest.raises(ValueError, match=f"environment 0 got discrete={discrete} .allowed 0 to"):
+        env.step(action(torch.tensor([discrete, 0]), torch.zeros(2, sum(env.parameter_dims))))
+
+
+@each_problem
+def test_parameters_outside_their_bounds_are_clipped(problem):
+    outside, inside = problem(4), problem(4)
+    low, high = (
+        getattr(outside.full_action_spec_unbatched[keys.PARAMETERS].space, side).expand(4, -1)
+        for side in ("low", "high")
+    )
+    discrete = torch.zeros(4, dtype=torch.long)
+    for beyond, bound in ((low - 3.0, low), (high + 3.0, high)):
+        outside.reset()
+        inside.reset()
+        readings = outside.step(action(discrete, beyond))["next"], inside.step(action(discrete, bound))["next"]
+        assert (readings[0] == readings[1]).all()
+
+
+@each_problem
+def test_global_generators_are_neither_moved_nor_read(problem):
+    env = problem(8)
+    actions = random_player()(env)
+
+    def run() -> TensorDictBase:
+        env.set_seed(5)
+        env.reset()
+        return env.step(actions.clone())["next"]
+
+    with global_generators_unmoved():
+        once = run()
+    torch.rand(3)
+    np.random.rand()
+    random.random()
+    assert (run() == once).all()
+
+
+@pytest.mark.parametrize("problem", POINTS)
+def test_a_seed_fixes_the_starts(problem):
+    env = problem(20, seed=1)
+    first, second = env.reset()[keys.OBSERVATION], env.reset()[keys.OBSERVATION]
+    env.set_seed(1)
+    assert (env.reset()[keys.OBSERVATION] == first).all()
+    others = (second, problem(20, seed=2).reset()[keys.OBSERVATION])
+    for other in others:
+        assert (other != first).any(-1).all()
+
+
+@each_problem
+def test_evaluation_draws_starts_and_noise_from_streams_of_its_own_until_the_next_seed(problem):
+    env = problem(4)
+    streams = []
+
+    drawn = counter_rng.key_for
+
+    def key_for(seed, stream, environment, episode):
+        streams.append(stream)
+        return drawn(seed, stream, environment, episode)
+
+    actions = random_player()(env)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(counter_rng, "key_for", key_for)
+        for seed_it, expected in (
+            (env.set_seed, {counter_rng.TRAINING, counter_rng.NOISE}),
+            (env.seed_evaluation, {counter_rng.EVALUATION, counter_rng.EVALUATION_NOISE}),
+            (env.set_seed, {counter_rng.TRAINING, counter_rng.NOISE}),
+        ):
+            seed_it(3)
+            streams.clear()
+            env.reset()
+            env.step(actions.clone())
+            assert set(streams) == expected
+
+
+@pytest.mark.parametrize("problem", POINTS)
+def test_evaluation_meets_no_start_of_training(problem):
+    training, evaluation = problem(50, seed=7), problem(50)
+    evaluation.seed_evaluation(7)
+    first = {tuple(row) for _ in range(20) for row in training.reset()[keys.OBSERVATION].tolist()}
+    second = {tuple(row) for _ in range(20) for row in evaluation.reset()[keys.OBSERVATION].tolist()}
+    assert len(first) == len(second) == 1000
+    assert not first & second
+
+
+@pytest.mark.parametrize("problem", POINTS)
+def test_an_invalid_argument_is_refused_by_name(problem):
+    for name in ("num_envs", "max_steps"):
+        with pytest.raises(ValueError, match=f"{problem.__name__}: {name}=0, but must be at least 1"):
+            problem(**{name: 0})
+
+
+@pytest.mark.parametrize("problem", POINTS)
+def test_the_oracle_writes_the_scripted_players_action(problem):
+    env = problem(5, oracle=True)
+    reading = env.reset()
+    discrete, parameter = env.scripted_action(env.state)
+    assert torch.equal(reading[keys.ORACLE_DISCRETE].squeeze(-1), discrete)
+    assert torch.equal(reading[keys.ORACLE_PARAMETERS].squeeze(-1), parameter)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_gymnasiums_checker_finds_nothing(env_id):
+    env = gymnasium.make(env_id, render_mode="rgb_array")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped)
+    assert [str(w.message) for w in caught if RECOMMENDATION not in str(w.message)] == []
+
+
+@pytest.mark.parametrize("env_id", ["hpamdp/CatchPoint-v0", "hpamdp/Moving-v0", "hpamdp/Platform-v0"])
+def test_a_face_plays_as_the_environment_does(env_id):
+    face, env = gymnasium.make(env_id), IDS[env_id](1)
+    env.set_seed(4, static_seed=True)
+    observation, info = face.reset(seed=4)
+    reading = env.reset()
+    player = random_player(1)
+    for _ in range(10):
+        np.testing.assert_array_equal(observation, reading[keys.OBSERVATION][0].numpy())
+        actions = player(env)
+        parts = actions[keys.PARAMETERS][0].split(list(env.parameter_dims))
+        taken = int(actions[keys.DISCRETE][0]), tuple(part.numpy() for part in parts)
+        observation, reward, terminated, truncated, info = face.step(taken)
+        reading = env.step(actions)["next"]
+        assert (reward, terminated, truncated) == tuple(
+            reading[name].item() for name in (keys.REWARD, keys.TERMINATED, keys.TRUNCATED)
+        )
+        assert info["outcome"] == env.outcomes[int(reading[keys.OUTCOME])]
+        assert info.get("is_success") is (info["outcome"] == env.outcomes[1] if terminated or truncated else None)
+        if terminated or truncated:
+            break
+
+
+def test_a_vector_starts_its_finished_episodes_again():
+    face = gymnasium.make_vec("hpamdp/CatchPoint-v0", num_envs=16, vectorization_mode="vector_entry_point", max_steps=3)
+    face.reset(seed=0)
+    moves = (np.zeros(16, np.int64), (np.zeros((16, 1)), np.zeros((16, 0))))
+    for _ in range(3):
+        observations, _, terminations, truncations, infos = face.step(moves)
+    assert truncations.all() and not terminations.any()
+    assert infos["_is_success"].all() and not infos["is_success"].any()
+    fresh, rewards, terminations, truncations, infos = face.step(moves)
+    assert (fresh[:, :2] == 0.0).all() and not (terminations | truncations).any()
+    assert (rewards == 0.0).all() and (infos["steps"] == 0).all() and "is_success" not in infos
+    assert observations in face.observation_space and fresh in face.observation_space
+
+
+@each_problem
+def test_observations_stay_in_their_bounds(problem):
+    env = problem(200)
+    low, high = (torch.tensor(side) for side in env.observation_bounds)
+    player = random_player()
+    reading = env.reset()
+    for step in range(50):
+        observation = reading[keys.OBSERVATION]
+        assert ((observation >= low) & (observation <= high)).all(), step
+        reading = env.step(player(env))["next"]
+
+
+def test_bad_actions_and_options_of_a_face_are_refused_in_one_line():
+    face = gymnasium.make("hpamdp/CatchPoint-v0").unwrapped
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        face.step((0, (np.zeros(1), np.zeros(0))))
+    with pytest.raises(ValueError, match=r"unknown options .'start'.; there are none"):
+        face.reset(options={"start": 1})
+    face.reset(seed=0)
+    for bad, message in (
+        (0, r"the action must be a tuple \(discrete, parameters\), but is a int"),
+        ((0, np.zeros(1)), "parameters must be a tuple of length 2, but is a ndarray"),
+        ((0, (np.zeros(2), np.zeros(0))), r"parameters of action 0 has shape \[2\], but must be \[1\]"),
+        ((0.5, (np.zeros(1), np.zeros(0))), "discrete has type float64, but must be integer"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            face.step(bad)
+    with pytest.raises(ValueError, match="render_mode='human', but must be None or rgb_array"):
+        CounterFace("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
+
+
+@pytest.mark.parametrize(
+    "env_id", ["hpamdp/Platform-v0", "hpamdp/CatchPoint-v0", "hpamdp/HardMove4-v0", "hpamdp/Sliding-v0"]
+)
+def test_a_picture_shows_the_progress_of_the_episode(env_id):
+    face = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)
+    face.action_space.seed(3)
+    face.reset(seed=0)
+    before = face.render()
+    face.step(face.action_space.sample())
+    after = face.render()
+    assert before.shape == after.shape == (480, 480, 3)
+    assert before.dtype == np.uint8
+    assert (before != after).any()
+
+
+def test_a_problem_without_pictures_or_player_says_so():
+    class Bare(CatchPointEnv):
+        draw = CounterEnv.draw
+        scripted_action = CounterEnv.scripted_action
+
+    env = Bare()
+    with pytest.raises(NotImplementedError, match="Bare has no pictures"):
+        env.draw([env.state])
+    with pytest.raises(NotImplementedError, match="Bare has no hand-written player"):
+        env.scripted_action(env.state)
