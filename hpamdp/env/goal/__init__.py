@@ -1,0 +1,1 @@
+"""The Robot Soccer Goal domain and Hard Goal."""

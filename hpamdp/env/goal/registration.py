@@ -1,0 +1,14 @@
+"""The Gymnasium ids of Goal and Hard Goal."""
+
+from __future__ import annotations
+
+from hpamdp.env.registration import register_counter_env
+
+GOAL_ID = "hpamdp/Goal-v0"
+HARD_GOAL_ID = "hpamdp/HardGoal-v0"
+
+
+def register() -> None:
+    """Register the ids with Gymnasium; calling it again changes nothing."""
+    register_counter_env(GOAL_ID, "hpamdp.env.goal.environment:GoalEnv")
+    register_counter_env(HARD_GOAL_ID, "hpamdp.env.goal.environment:HardGoalEnv")

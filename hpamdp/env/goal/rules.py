@@ -1,0 +1,561 @@
+"""The rules of the Robot Soccer Goal domain as pure functions on columns: a player, a keeper and a ball.
+
+Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644, section on the Robot Soccer Goal domain. Constants, bounds and
+rules as in gym-goal, the version of Bester, James & Konidaris 2019, arXiv:1905.04388, with the three observations that
+their learners add; the shots of Hard Goal as in HyAR, Li et al. 2022, arXiv:2109.05490.
+Differs from the source: the reach has a slack, since at the start the ball lies on its rim, where rounding would put
+every fifth ball out of reach in float32; where two bodies are in the same place, none is pushed away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from hpamdp.env import counter_rng
+
+KICK_TO, SHOOT_LEFT, SHOOT_RIGHT = range(3)
+ACTIONS = ("kick to", "shoot left", "shoot right")
+PARAMETER_DIMS = (2, 1, 1)
+OUTCOMES = ("playing", "goal", "caught", "out", "time limit")
+PLAYING, GOAL, CAUGHT, OUT, TIME_LIMIT = range(5)
+GOAL_REWARD = 50.0
+
+# Half a pitch, its goal at the far end. Velocities are per tick.
+LENGTH, HALF_WIDTH = 20.0, 15.0
+GOAL_HALF_WIDTH, GOAL_DEPTH = 7.01, 2.44
+_FLOAT32_GOAL = 7.010000228881836  # the bound of the published action and observation spaces
+PARAMETER_LOW = (0.0, -HALF_WIDTH, -_FLOAT32_GOAL, -_FLOAT32_GOAL)
+PARAMETER_HIGH = (2.0 * LENGTH, HALF_WIDTH, _FLOAT32_GOAL, _FLOAT32_GOAL)
+PLAYER_SIZE, KEEPER_SIZE, BALL_SIZE = 0.9, 0.9, 0.4
+REACH = 1.6
+CATCH = 2.0  # distance at which the keeper has the ball
+_REACH_SLACK = 1e-5
+_PLAYER_DECAY, _BALL_DECAY = 0.4, 0.94  # of the velocities, a tick
+_PLAYER_NOISE, _BALL_NOISE = 0.1, 0.05
+_PLAYER_SPEED, _BALL_SPEED = 1.0, 2.7  # limits of velocities and of their change in a tick, in x and in y
+_PLAYER_RATE, _BALL_RATE = 0.006, 0.027  # change of velocity for each unit of power
+_MAX_POWER = 100.0
+_DASH, _SAVE, _FOLLOW = 10.0 * _PLAYER_RATE, 20.0 * _PLAYER_RATE, 8.0 * _PLAYER_RATE
+_FACING = math.pi / 8
+_SHOT_DEPTH = 0.4  # how far behind the line shots are aimed
+_KEEPER_START = 14.5
+_KEEPER_MARGIN = 2.0  # how far beside the goal the keeper still goes for a shot
+_STILL = 0.1  # speed of the ball at which a kick is over
+_COAST = 1.0 - _BALL_DECAY  # a rolling ball still covers velocity / _COAST
+
+COLUMNS = (
+    "player_x",
+    "player_y",
+    "keeper_x",
+    "keeper_y",
+    "ball_x",
+    "ball_y",
+    "player_vx",
+    "player_vy",
+    "keeper_vx",
+    "keeper_vy",
+    "ball_vx",
+    "ball_vy",
+    "player_angle",
+    "keeper_angle",
+)
+OBSERVATION_NAMES = (
+    "player_x",
+    "player_y",
+    "player_vx",
+    "player_vy",
+    "player_angle",
+    "keeper_x",
+    "keeper_y",
+    "keeper_vx",
+    "keeper_vy",
+    "keeper_angle",
+    "ball_x",
+    "ball_y",
+    "ball_vx",
+    "ball_vy",
+    "keeper_to_ball_x",
+    "keeper_to_ball_y",
+    "keeper_projection",
+)
+_FLOAT32_PI = 3.1415927410125732
+_BODY_LOW, _BODY_HIGH = (0.0, -HALF_WIDTH, -1.0, -1.0, -_FLOAT32_PI), (LENGTH, HALF_WIDTH, 1.0, 1.0, _FLOAT32_PI)
+OBSERVATION_LOW = (*_BODY_LOW, *_BODY_LOW, 0.0, -HALF_WIDTH, -3.0, -3.0, -1.0, -1.0, -_FLOAT32_GOAL)
+OBSERVATION_HIGH = (*_BODY_HIGH, *_BODY_HIGH, LENGTH, HALF_WIDTH, 3.0, 3.0, 1.0, 1.0, 2.0 * _FLOAT32_GOAL)
+
+# The shots of Hard Goal: stretches of the goal line, from -1 to 1, once for each foot.
+STRETCHES = ((-1.0, -0.6), (-0.6, -0.2), (0.2, 0.2), (0.2, 0.6), (0.6, 1.0))
+HARD_GOAL_ACTIONS = ("kick to", *(f"shoot {side} {stretch}" for side in ("left", "right") for stretch in range(1, 6)))
+_MIDDLE = 2
+REPAIRED_MIDDLE = (-0.2, 0.2)
+
+# Random numbers of an action, six a tick: it has less than 400 ticks.
+NUMBERS_PER_TICK = 6
+_NUMBERS_PER_ACTION = 1 << 13
+# Ticks that are simulated before it is looked up which actions are over. More: fewer look-ups, more idle ticks.
+_TICKS_AT_ONCE = 8
+_FEW_ROWS = 64  # of so few, leaving out those that are over saves nothing
+
+# How to compile `masked_tick` and `random_numbers`. They work on columns throughout, so that the compiler makes one
+# vectorised loop of a tick; with vectors `[2, M]` it makes many, and takes three times as long.
+COMPILE_ARGUMENTS: dict[str, Any] = {"dynamic": True, "fullgraph": True}
+
+Vector = tuple[Tensor, Tensor]  # x and y, `[M]` each
+Bodies = tuple[Tensor, ...]  # the COLUMNS, `[M]` each
+# Returns the numbers in (-1, 1) `[K, 6, M]` of the ticks `[K]` of the actions in the rows `[M]`.
+Numbers = Callable[[Tensor, Tensor], Tensor]
+_GOING = -1  # the end of an action that is not over
+
+
+class GoalState(NamedTuple):
+    """Columns `[N]`: positions, velocities and orientations (radians), float32 or float64; then int32.
+
+    The player's orientation is not wrapped: it may leave [-pi, pi].
+    """
+
+    player_x: Tensor
+    player_y: Tensor
+    keeper_x: Tensor
+    keeper_y: Tensor
+    ball_x: Tensor
+    ball_y: Tensor
+    player_vx: Tensor
+    player_vy: Tensor
+    keeper_vx: Tensor
+    keeper_vy: Tensor
+    ball_vx: Tensor
+    ball_vy: Tensor
+    player_angle: Tensor
+    keeper_angle: Tensor
+    steps: Tensor
+    outcome: Tensor
+    episode: Tensor
+
+
+class Aim(NamedTuple):
+    """What the players do: where to, `[N]` each, and whether it is a kick, which ends when the ball lies still."""
+
+    x: Tensor
+    y: Tensor
+    is_kick: Tensor
+
+
+class Motion(NamedTuple):
+    """Actions in progress, columns `[M]`: the bodies, what the players do, the outcome so far, and the ticks.
+
+    `end` is -1 while the action goes on, and else an outcome: PLAYING where only the action is over.
+    """
+
+    player_x: Tensor
+    player_y: Tensor
+    keeper_x: Tensor
+    keeper_y: Tensor
+    ball_x: Tensor
+    ball_y: Tensor
+    player_vx: Tensor
+    player_vy: Tensor
+    keeper_vx: Tensor
+    keeper_vy: Tensor
+    ball_vx: Tensor
+    ball_vy: Tensor
+    player_angle: Tensor
+    keeper_angle: Tensor
+    aim_x: Tensor
+    aim_y: Tensor
+    is_kick: Tensor
+    end: Tensor
+    ticks: Tensor
+
+
+Tick = Callable[[Motion, Tensor, float], Motion]  # as `masked_tick`
+
+
+def start(episode: Tensor, rng: Tensor, dtype: torch.dtype = torch.float32) -> GoalState:
+    """Return the states in which the episodes with these numbers, int32 `[N]`, begin.
+
+    Args:
+        episode: numbers of the episodes, int32 `[N]`.
+        rng: their int32 `[N]` keys from `counter_rng.key_for`.
+        dtype: of the positions.
+    """
+    zeros = torch.zeros_like(episode, dtype=dtype)
+    integer_zeros = torch.zeros_like(episode)
+    player_y = HALF_WIDTH * (2.0 * counter_rng.uniform(rng, 0).to(dtype) - 1.0)
+    player_angle = torch.atan2(-player_y, zeros + LENGTH)
+    ball_x = REACH * player_angle.cos()
+    ball_y = player_y + REACH * player_angle.sin()
+    keeper_x = zeros + _KEEPER_START
+    keeper_y = ball_y * (LENGTH - _KEEPER_START) / (LENGTH - ball_x)
+    return GoalState(
+        player_x=zeros,
+        player_y=player_y,
+        keeper_x=keeper_x,
+        keeper_y=keeper_y,
+        ball_x=ball_x,
+        ball_y=ball_y,
+        player_vx=zeros,
+        player_vy=zeros,
+        keeper_vx=zeros,
+        keeper_vy=zeros,
+        ball_vx=zeros,
+        ball_vy=zeros,
+        player_angle=player_angle,
+        keeper_angle=torch.atan2(ball_y - keeper_y, ball_x - keeper_x),
+        steps=integer_zeros,
+        outcome=integer_zeros + PLAYING,
+        episode=episode,
+    )
+
+
+def goal_aim(discrete: Tensor, parameters: Tensor, *, kicks_to_point: bool = False) -> Aim:
+    """Return the aims of Goal's actions.
+
+    Args:
+        discrete: KICK_TO, SHOOT_LEFT or SHOOT_RIGHT, `[N]`.
+        parameters: of the chosen action, `[N, 2]`: the point to kick to, or y on the goal line and a number that is
+            not read; clipped to their bounds.
+        kicks_to_point: kick to (x, y); the published code kicks to (x, x) and reads no y.
+    """
+    return _aim(discrete == KICK_TO, parameters[:, 0], parameters[:, 1], parameters[:, 0], kicks_to_point)
+
+
+def hard_goal_aim(
+    discrete: Tensor, parameters: Tensor, *, kicks_to_point: bool = False, has_middle: bool = False
+) -> Aim:
+    """Return the aims of Hard Goal's actions.
+
+    Args:
+        discrete: 0 to kick, 1 to 5 and 6 to 10 to shoot at the STRETCHES of the goal line, `[N]`.
+        parameters: of the chosen action, `[N, 2]` in [-1, 1]: two of a kick; one of a shot, whose sign is reversed
+            (1 is the stretch's lower end), and a number that is not read.
+        kicks_to_point: as for `goal_aim`.
+        has_middle: shoot at all of the middle stretch; in the published code that is one point beside the middle.
+    """
+    stretches = list(STRETCHES)
+    if has_middle:
+        stretches[_MIDDLE] = REPAIRED_MIDDLE
+    low, high = parameters.new_tensor(stretches).unbind(-1)
+    stretch = (discrete - 1).clamp(min=0).remainder(len(stretches))
+    first, second = parameters.unbind(-1)
+    share = 0.5 * (low + high)[stretch] - first * (0.5 * (high - low))[stretch]
+    return _aim(discrete == 0, LENGTH * (first + 1.0), HALF_WIDTH * second, _FLOAT32_GOAL * share, kicks_to_point)
+
+
+def _aim(is_kick: Tensor, kick_x: Tensor, kick_y: Tensor, shot: Tensor, kicks_to_point: bool) -> Aim:
+    kick_x = kick_x.clamp(0.0, 2.0 * LENGTH)
+    kick_y = kick_y.clamp(-HALF_WIDTH, HALF_WIDTH) if kicks_to_point else kick_x
+    return Aim(
+        x=torch.where(is_kick, kick_x, LENGTH + _SHOT_DEPTH),
+        y=torch.where(is_kick, kick_y, shot.clamp(-GOAL_HALF_WIDTH, GOAL_HALF_WIDTH)),
+        is_kick=is_kick,
+    )
+
+
+def random_numbers(rng: Tensor, steps: Tensor, ticks: Tensor) -> Tensor:
+    """Return the numbers in (-1, 1), float32 `[K, 6, M]`, of ticks of the next action.
+
+    Args:
+        rng: int32 `[M]` from `counter_rng.key_for`.
+        steps: how many actions the episode has had, int32 `[M]`.
+        ticks: int32 `[K]`.
+    """
+    place = torch.arange(NUMBERS_PER_TICK, dtype=torch.int32, device=rng.device)
+    index = (ticks.unsqueeze(-1) * NUMBERS_PER_TICK + place).unsqueeze(-1) + steps * _NUMBERS_PER_ACTION
+    return 2.0 * counter_rng.uniform(rng, index) - 1.0
+
+
+def act(
+    state: GoalState,
+    aim: Aim,
+    moves: Tensor,
+    numbers: Numbers,
+    *,
+    noise: float = 1.0,
+    max_steps: int = 100,
+    tick: Tick | None = None,
+) -> tuple[GoalState, Tensor]:
+    """Return the states after one action, and how many ticks it took, int32 `[N]`.
+
+    The ticks of all environments run side by side; most rows whose action is over are left out of the later ones.
+
+    Args:
+        state: before the action.
+        aim: what the players do.
+        moves: bool `[N]`; the other rows stay as they are.
+        numbers: the random numbers.
+        noise: factor on the published noise.
+        max_steps: the action with this number is not played: it ends the episode at once, as in the published code.
+        tick: the function `masked_tick`, or a compiled one.
+    """
+    steps = torch.where(moves, state.steps + 1, state.steps)
+    is_late = moves & (steps >= max_steps)
+    is_played = moves & ~is_late
+    outcome = torch.where(is_late, TIME_LIMIT, state.outcome)
+    motion = Motion(
+        *state[: len(COLUMNS)],
+        aim_x=aim.x,
+        aim_y=aim.y,
+        is_kick=aim.is_kick,
+        end=torch.where(is_played, _GOING, outcome),
+        ticks=torch.zeros_like(steps),
+    )
+    rows = torch.arange(len(steps), device=steps.device)
+    motion = _run(motion, rows, 0, numbers, noise, tick or masked_tick)
+    return GoalState(*motion[: len(COLUMNS)], steps, motion.end, state.episode), motion.ticks
+
+
+def _run(motion: Motion, rows: Tensor, first: int, numbers: Numbers, noise: float, tick: Tick) -> Motion:
+    """Return the motion in these rows `[M]` at the end of its actions, whose next tick is number `first`."""
+    while True:
+        going = (motion.end == _GOING).nonzero().squeeze(-1)
+        if not len(going):
+            return motion
+        # Not down to one row, for which a compiled tick would be compiled anew.
+        if len(rows) > _FEW_ROWS and 1 < len(going) <= len(rows) // 2:
+            rest = Motion(*(column[going] for column in motion))
+            rest = _run(rest, rows[going], first, numbers, noise, tick)
+            return Motion(*(old.index_copy(0, going, new) for old, new in zip(motion, rest, strict=True)))
+        ticks = torch.arange(first, first + _TICKS_AT_ONCE, dtype=torch.int32, device=rows.device)
+        for drawn in numbers(ticks, rows).to(motion.ball_x.dtype).unbind():
+            motion = Motion(*tick(motion, drawn, noise))
+        first += _TICKS_AT_ONCE
+
+
+def masked_tick(motion: Motion, numbers: Tensor, noise: float) -> Motion:
+    """Return the motion after one tick of the actions that are not over.
+
+    Args:
+        motion: before it.
+        numbers: in (-1, 1), `[6, M]`.
+        noise: factor on the published noise.
+    """
+    bodies = tick(motion[: len(COLUMNS)], motion.aim_x, motion.aim_y, numbers, noise)
+    is_going = motion.end == _GOING
+    end = torch.where(is_going, _end(bodies, motion.is_kick), motion.end)
+    kept = (torch.where(is_going, new, old) for new, old in zip(bodies, motion, strict=False))
+    return Motion(*kept, motion.aim_x, motion.aim_y, motion.is_kick, end, motion.ticks + is_going.to(torch.int32))
+
+
+def _end(bodies: Bodies, is_kick: Tensor) -> Tensor:
+    """Return the outcome after a tick, int32 `[M]`: PLAYING where only the action is over, _GOING where it goes on."""
+    player_x, player_y, keeper_x, keeper_y, ball_x, ball_y, _, _, _, _, ball_vx, ball_vy, _, _ = bodies
+    is_still = _length(ball_vx, ball_vy) <= _STILL
+    in_reach = _length(player_x - ball_x, player_y - ball_y) <= REACH + _REACH_SLACK
+    end = torch.where(is_kick & is_still & in_reach, PLAYING, _GOING)
+    beside = ball_y.abs()
+    # Asked this way round, a position that is not finite ends the episode.
+    is_inside = (ball_x >= 0.0) & (ball_x <= LENGTH) & (beside <= HALF_WIDTH)
+    end = torch.where(is_inside, end, OUT)
+    end = torch.where(_length(keeper_x - ball_x, keeper_y - ball_y) < CATCH, CAUGHT, end)
+    is_goal = (ball_x >= LENGTH) & (ball_x <= LENGTH + GOAL_DEPTH) & (beside <= GOAL_HALF_WIDTH)
+    return torch.where(is_goal, GOAL, end).to(torch.int32)
+
+
+def tick(bodies: Bodies, aim_x: Tensor, aim_y: Tensor, numbers: Tensor, noise: float = 1.0) -> Bodies:
+    """Return the bodies after one tick of their actions.
+
+    Args:
+        bodies: the COLUMNS, `[M]` each.
+        aim_x, aim_y: where the players kick to, `[M]`.
+        numbers: in (-1, 1), `[6, M]`: for angle and push in x and y, of the player or the ball, then of the keeper.
+        noise: factor on the published noise.
+    """
+    player_x, player_y, keeper_x, keeper_y, ball_x, ball_y, *velocities, player_angle, keeper_angle = bodies
+    player, keeper, ball = (player_x, player_y), (keeper_x, keeper_y), (ball_x, ball_y)
+    player_v, keeper_v, ball_v = ((velocities[i], velocities[i + 1]) for i in (0, 2, 4))
+    of_player, of_keeper = numbers[:3].unbind(), numbers[3:].unbind()
+    player_v, ball_v, player_angle = _play(
+        player, ball, player_v, ball_v, player_angle, (aim_x, aim_y), of_player, noise
+    )
+    keeper_v, keeper_angle = _keep(keeper, ball, keeper_v, ball_v, of_keeper, noise)
+    player, player_v = _roll(player, player_v, _PLAYER_DECAY)
+    keeper, keeper_v = _roll(keeper, keeper_v, _PLAYER_DECAY)
+    ball, ball_v = _roll(ball, ball_v, _BALL_DECAY)
+    player, keeper, player_v, keeper_v = _collide(player, keeper, player_v, keeper_v, PLAYER_SIZE + KEEPER_SIZE)
+    player, ball, player_v, ball_v = _collide(player, ball, player_v, ball_v, PLAYER_SIZE + BALL_SIZE)
+    keeper, ball, keeper_v, ball_v = _collide(keeper, ball, keeper_v, ball_v, KEEPER_SIZE + BALL_SIZE)
+    return (*player, *keeper, *ball, *player_v, *keeper_v, *ball_v, player_angle, keeper_angle)
+
+
+def _play(
+    player: Vector,
+    ball: Vector,
+    player_v: Vector,
+    ball_v: Vector,
+    angle: Tensor,
+    aim: Vector,
+    numbers: Sequence[Tensor],
+    noise: float,
+) -> tuple[Vector, Vector, Tensor]:
+    """Return the velocities of player and ball and the player's orientation after the player's move.
+
+    With the ball in reach, the player kicks it; else it turns towards the ball or, when it faces it, dashes.
+    """
+    to_ball_x, to_ball_y = ball[0] - player[0], ball[1] - player[1]
+    distance = _length(to_ball_x, to_ball_y)
+    turn = torch.atan2(to_ball_y, to_ball_x) - angle
+    turn = turn - 2.0 * math.pi * (turn / (2.0 * math.pi)).round()
+    off = turn.abs()
+    in_reach = distance <= REACH + _REACH_SLACK
+    is_facing = off < _FACING
+    is_dash = is_facing & ~in_reach
+    wish_x = _COAST * (aim[0] - player[0]) - ball_v[0]
+    wish_y = _COAST * (aim[1] - player[1]) - ball_v[1]
+    # Power is lost by kicking sideways or from afar.
+    share = 1.0 - 0.25 / math.pi * off - 0.25 / REACH * distance
+    kick = _length(wish_x, wish_y).minimum(_MAX_POWER * _BALL_RATE * share)
+    # Not by `torch.where` between two numbers, which gives float32.
+    of_ball = in_reach.to(angle.dtype)
+    pushed_x, pushed_y = _accelerate(
+        (torch.where(in_reach, ball_v[0], player_v[0]), torch.where(in_reach, ball_v[1], player_v[1])),
+        torch.where(in_reach, kick, _DASH),
+        torch.where(in_reach, torch.atan2(wish_y, wish_x), angle),
+        numbers,
+        of_ball * (noise * (_BALL_NOISE - _PLAYER_NOISE)) + noise * _PLAYER_NOISE,
+        of_ball * (_BALL_SPEED - _PLAYER_SPEED) + _PLAYER_SPEED,
+    )
+    turned = angle + turn / (1.0 + 5.0 * _length(*player_v))
+    return (
+        (torch.where(is_dash, pushed_x, player_v[0]), torch.where(is_dash, pushed_y, player_v[1])),
+        (torch.where(in_reach, pushed_x, ball_v[0]), torch.where(in_reach, pushed_y, ball_v[1])),
+        torch.where(in_reach | is_facing, angle, turned),
+    )
+
+
+def _keep(
+    keeper: Vector, ball: Vector, keeper_v: Vector, ball_v: Vector, numbers: Sequence[Tensor], noise: float
+) -> tuple[Vector, Tensor]:
+    """Return the velocity and the orientation of the keeper after its move.
+
+    It goes to where the ball will lie still or, when the ball will come near the goal, quickly into its way.
+    """
+    roll_x, roll_y = ball_v[0] / _COAST, ball_v[1] / _COAST
+    end_x, end_y = ball[0] + roll_x, ball[1] + roll_y
+    slope = torch.where(roll_x == 0.0, 0.0, roll_y / roll_x)
+    height = ball[1] + slope * (LENGTH - ball[0])
+    is_shot = (end_x > LENGTH) & (height.abs() <= GOAL_HALF_WIDTH + _KEEPER_MARGIN) & (slope != 0.0)
+    # The way to the ball's line is across it; only the direction matters.
+    side = roll_x * (ball[1] - keeper[1]) - roll_y * (ball[0] - keeper[0])
+    way_x = torch.where(is_shot, -side * roll_y, end_x - keeper[0])
+    way_y = torch.where(is_shot, side * roll_x, end_y - keeper[1])
+    angle = torch.atan2(way_y, way_x)
+    effort = is_shot.to(angle.dtype) * (_SAVE - _FOLLOW) + _FOLLOW
+    return _accelerate(keeper_v, effort, angle, numbers, noise * _PLAYER_NOISE, _PLAYER_SPEED), angle
+
+
+def _accelerate(
+    velocity: Vector,
+    effort: Tensor,
+    angle: Tensor,
+    numbers: Sequence[Tensor],
+    noise: Tensor | float,
+    limit: Any,
+) -> Vector:
+    """Return the velocities after a push.
+
+    Args:
+        velocity: before it.
+        effort: the change of velocity it is meant to make, `[M]`.
+        angle: in which direction, `[M]`; noise multiplies it.
+        numbers: in (-1, 1), three of `[M]`: for the angle and the push in x and in y.
+        noise: share of the angle and of the speed that the noise takes at most, a number or `[M]`.
+        limit: of the change of each velocity and of itself, a number or `[M]`.
+    """
+    angle = angle + angle * noise * numbers[0]
+    jolt = noise * _length(*velocity)
+    push_x = (effort * angle.cos() + jolt * numbers[1]).clamp(-limit, limit)
+    push_y = (effort * angle.sin() + jolt * numbers[2]).clamp(-limit, limit)
+    return (velocity[0] + push_x).clamp(-limit, limit), (velocity[1] + push_y).clamp(-limit, limit)
+
+
+def _roll(place: Vector, velocity: Vector, decay: float) -> tuple[Vector, Vector]:
+    """Return where a body is after a tick, and its velocity then."""
+    return (place[0] + velocity[0], place[1] + velocity[1]), (velocity[0] * decay, velocity[1] * decay)
+
+
+def _collide(
+    one: Vector, other: Vector, one_v: Vector, other_v: Vector, touch: float
+) -> tuple[Vector, Vector, Vector, Vector]:
+    """Return positions and velocities of two bodies after they have bounced off each other, if they overlap.
+
+    Args:
+        one, other: positions.
+        one_v, other_v: velocities.
+        touch: distance below which they overlap.
+    """
+    apart_x, apart_y = one[0] - other[0], one[1] - other[1]
+    distance = _length(apart_x, apart_y)
+    share = (0.5 * (touch - distance)).clamp(min=0.0) / distance.clamp(min=1e-12)
+    shift_x, shift_y = apart_x * share, apart_y * share
+    sign = 1.0 - 2.0 * (distance < touch).to(distance.dtype)
+    return (
+        (one[0] + shift_x, one[1] + shift_y),
+        (other[0] - shift_x, other[1] - shift_y),
+        (one_v[0] * sign, one_v[1] * sign),
+        (other_v[0] * sign, other_v[1] * sign),
+    )
+
+
+def _length(x: Tensor, y: Tensor) -> Tensor:
+    """Return the lengths of vectors, `[M]`."""
+    # The compiler does not vectorise `hypot`; uncompiled, it is one operation instead of four.
+    return (x * x + y * y).sqrt() if torch.compiler.is_compiling() else torch.hypot(x, y)
+
+
+def goal_distance(state: GoalState, *, is_repaired: bool = False) -> Tensor:
+    """Return how far the ball is from the goal, `[N]`.
+
+    Args:
+        state: of the episodes.
+        is_repaired: measure it behind the line below the goal, too; the published code gives twice 7.01 too much there.
+    """
+    beside = state.ball_y.abs() - GOAL_HALF_WIDTH
+    depth = LENGTH - state.ball_x
+    before = torch.where(beside > 0.0, torch.hypot(depth, beside), depth)
+    behind = beside.clamp(min=0.0)
+    if not is_repaired:
+        behind = torch.where(state.ball_y < -GOAL_HALF_WIDTH, GOAL_HALF_WIDTH - state.ball_y, behind)
+    return torch.where(depth > 0.0, before, behind)
+
+
+def reward(before: GoalState, after: GoalState, *, repairs_distance: bool = False) -> Tensor:
+    """Return the reward of an action `[N]`: 50 for a goal, less the ball's goal distance for any other end.
+
+    Args:
+        before, after: the states around the action.
+        repairs_distance: as `is_repaired` of `goal_distance`.
+    """
+    ended = (after.outcome != PLAYING) & (before.outcome == PLAYING)
+    earned = torch.where(after.outcome == GOAL, GOAL_REWARD, -goal_distance(after, is_repaired=repairs_distance))
+    return torch.where(ended, earned, 0.0)
+
+
+def observe(state: GoalState, *, is_scaled: bool = True, repairs_projection: bool = False) -> Tensor:
+    """Return the observation `[N, 17]`, whose entries are OBSERVATION_NAMES.
+
+    Args:
+        state: of the episodes.
+        is_scaled: from OBSERVATION_LOW and _HIGH to [-1, 1]; orientations and the ball can leave their bounds.
+        repairs_projection: clip where the keeper's shadow from the ball falls on the goal line to the goal; the
+            published code clips it to twice the height above. The bounds are the same.
+    """
+    across, along = state.ball_y - state.keeper_y, state.ball_x - state.keeper_x
+    distance = torch.hypot(along, across).clamp(min=1e-12)
+    shadow = state.ball_y + across / along * (LENGTH - state.ball_x)
+    shadow = shadow.clamp(-GOAL_HALF_WIDTH, (1.0 if repairs_projection else 2.0) * GOAL_HALF_WIDTH)
+    level = GOAL_HALF_WIDTH * (1.0 - 2.0 * (across > 0.0).to(across.dtype))
+    named = state._asdict() | {
+        "keeper_to_ball_x": along / distance,
+        "keeper_to_ball_y": across / distance,
+        "keeper_projection": torch.where(along == 0.0, level, shadow),
+    }
+    observation = torch.stack([named[name] for name in OBSERVATION_NAMES], -1)
+    if not is_scaled:
+        return observation
+    low, high = observation.new_tensor(OBSERVATION_LOW), observation.new_tensor(OBSERVATION_HIGH)
+    return 2.0 * (observation - low) / (high - low) - 1.0

@@ -1,0 +1,342 @@
+"""GoalEnv and HardGoalEnv play Robot Soccer Goal and keep the framework's contract."""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from conftest import compose_config, global_generators_unmoved, make_config
+from counter_players import action, is_unchanged, play, random_player, restart, snapshot
+from goal_players import act, place, trained_player
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDictBase
+from torchrl.envs.utils import check_env_specs
+
+import hpamdp
+from hpamdp import keys
+from hpamdp.config import ConfigError
+from hpamdp.env.goal import rules
+from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
+from hpamdp.specs import PAMDPSpecs
+
+BOTH = pytest.mark.parametrize("domain", [GoalEnv, HardGoalEnv])
+NAN = math.nan
+
+
+@BOTH
+@pytest.mark.parametrize("num", [1, 3])
+def test_specs_hold(domain, num):
+    check_env_specs(domain(num), return_contiguous=True)
+
+
+def test_learners_see_kicks_and_shots_in_metres_in_goal_and_scaled_in_hard_goal():
+    specs = PAMDPSpecs.from_env(GoalEnv(2))
+    assert (specs.observation_dim, specs.parameter_dims) == (17, (2, 1, 1))
+    assert specs.parameter_low == pytest.approx((0.0, -15.0, -7.01, -7.01))
+    assert specs.parameter_high == pytest.approx((40.0, 15.0, 7.01, 7.01))
+    hard = PAMDPSpecs.from_env(HardGoalEnv(2))
+    assert (hard.observation_dim, hard.parameter_dims) == (17, (2, *(1,) * 10))
+    assert (hard.parameter_low, hard.parameter_high) == ((-1.0,) * 12, (1.0,) * 12)
+    assert len(HardGoalEnv.discrete_names) == 11
+
+
+@pytest.mark.parametrize(
+    ("domain", "expected_return", "most_goals"), [(GoalEnv, -8.11, 0.002), (HardGoalEnv, -7.47, 0.001)]
+)
+def test_random_play_scores_what_it_scores_by_the_published_code(domain, expected_return, most_goals):
+    env = domain(6000, seed=1)
+    last, total = play(env, random_player())
+    results = env.results(last.select(*env.result_keys))
+    assert total.mean().item() == pytest.approx(expected_return, abs=0.15)  # standard error .05
+    assert results["success"].float().mean() <= most_goals
+    assert last[keys.TERMINATED].all()
+    if domain is GoalEnv:
+        assert env.env_state()["steps"].float().mean().item() == pytest.approx(1.04, abs=0.02)
+
+
+@pytest.mark.slow
+def test_the_published_initial_parameters_find_twenty_times_more_goals():
+    env = GoalEnv(10_000, seed=2)
+    player = trained_player(env)
+    reading = env.reset()
+    while not reading[keys.DONE].all():
+        reading = env.step(player(reading))["next"]
+    assert (reading[keys.OUTCOME] == rules.GOAL).float().mean().item() == pytest.approx(0.008, abs=0.003)
+
+
+def test_initial_parameters_kick_the_ball_on_and_shoot_beside_the_posts():
+    env = GoalEnv(50, seed=3)
+    raw_env = GoalEnv(50, seed=3, observation="raw")
+    scaled, raw = env.reset()[keys.OBSERVATION], raw_env.reset()[keys.OBSERVATION]
+    weights, bias = env.initial_parameters()
+    parameters = PAMDPSpecs.from_env(env).from_unit(scaled @ weights.T + bias)
+    ball_x, ball_y, unit_x, unit_y = (raw[:, rules.OBSERVATION_NAMES.index(name)] for name in (
+        "ball_x", "ball_y", "keeper_to_ball_x", "keeper_to_ball_y"
+    ))  # fmt: skip
+    expected = [2.5 + ball_x + 1.25 * unit_x, 5.0 / 6.0 * ball_y + 5.0 / 3.0 * unit_y]
+    expected += [torch.full((50,), 6.01), torch.full((50,), -6.01)]
+    torch.testing.assert_close(parameters, torch.stack(expected, -1), rtol=0.0, atol=1e-4)
+    weights, bias = raw_env.initial_parameters()
+    from_raw = PAMDPSpecs.from_env(env).from_unit(raw @ weights.T + bias)
+    torch.testing.assert_close(from_raw, parameters, rtol=0.0, atol=1e-4)
+    assert HardGoalEnv().initial_parameters() is None
+
+
+def test_a_goal_pays_fifty_and_every_other_end_costs_the_balls_distance():
+    env = GoalEnv(3, noise=0.0)
+    env.reset()
+    # Before the open goal; with the keeper in the way; a ball that rolls off behind the player.
+    place(env, ball_x=torch.tensor([18.0, 15.0, 1.0]), ball_y=0.0, ball_vx=torch.tensor([0.0, 0.0, -2.7]))
+    place(env, player_x=torch.tensor([17.0, 14.0, 10.0]), player_y=0.0, player_angle=0.0)
+    place(env, keeper_x=torch.tensor([2.0, 16.5, 2.0]), keeper_y=torch.tensor([12.0, 1.0, 12.0]))
+    reading = act(env, [1, 1, 1], [[0.0], [0.0], [0.0]])
+    assert reading[keys.OUTCOME].tolist() == [rules.GOAL, rules.CAUGHT, rules.OUT]
+    state = env.state
+    costs = (-rules.goal_distance(state)).tolist()
+    assert reading[keys.REWARD].squeeze(-1).tolist() == [50.0, costs[1], costs[2]]
+    assert reading[keys.TERMINATED].all() and not reading[keys.TRUNCATED].any()
+    results = env.results(reading.select(*env.result_keys))
+    assert results["success"].tolist() == [True, False, False] and results["score"].tolist() == [1.0, 0.0, 0.0]
+
+
+def test_the_last_action_is_not_played_and_truncates():
+    env = GoalEnv(2, max_steps=3)
+    env.reset()
+    place(env, steps=torch.tensor([1, 2]))
+    before = snapshot(env)
+    reading = act(env, [0, 0], [[3.0, 0.0], [3.0, 0.0]])
+    assert reading[keys.TRUNCATED].squeeze(-1).tolist() == [False, True]
+    assert not reading[keys.TERMINATED].any()
+    assert reading[keys.OUTCOME].tolist()[1] == rules.TIME_LIMIT
+    assert all(torch.equal(env.env_state()[name][1], before[name][1]) for name in rules.COLUMNS)
+    assert (env.state.ball_x != before["ball_x"]).tolist() == [True, False]
+    assert reading[keys.REWARD][1].item() == -rules.goal_distance(env.state)[1].item()
+    # After it, the episode stays as it is and earns nothing.
+    over = snapshot(env)
+    reading = act(env, [1, 1], [[0.0], [0.0]])
+    assert is_unchanged(env, over, torch.tensor([False, True]))
+    assert reading[keys.DONE][1] and reading[keys.REWARD][1].item() == 0.0
+
+
+@BOTH
+@settings(max_examples=3, deadline=None)
+@given(num=st.integers(1, 9), seed=st.integers(0, 2**40), first=st.integers(0, 1000))
+def test_an_episode_does_not_depend_on_the_batch(domain, num, seed, first):
+    row = seed % num
+    many, one = domain(num, seed=seed, first_env=first), domain(1, seed=seed, first_env=first + row)
+    readings = [many.reset(), one.reset()]
+    generator = torch.Generator().manual_seed(seed % 2**31)
+    specs = PAMDPSpecs.from_env(many)
+    for _ in range(2):
+        discrete = torch.randint(2, (num,), generator=generator)
+        unit = 2.0 * torch.rand(num, specs.num_parameters, generator=generator) - 1.0
+        unit[:, 0] = -0.7  # short kicks, so that episodes go on
+        actions = action(discrete, specs.from_unit(unit))
+        readings = [many.step(actions.clone())["next"], one.step(actions[row : row + 1].clone())["next"]]
+        for name in (keys.OUTCOME, keys.DONE):
+            assert torch.equal(readings[0][name][row : row + 1], readings[1][name])
+        for name in (keys.OBSERVATION, keys.REWARD):
+            # Vectorised and scalar kernels round trigonometric functions differently.
+            torch.testing.assert_close(readings[0][name][row : row + 1], readings[1][name], rtol=1e-4, atol=1e-3)
+        many.reset(readings[0].clone().set("_reset", torch.arange(num).unsqueeze(-1) != row))
+
+
+@BOTH
+def test_a_seed_fixes_the_episodes_and_evaluation_has_its_own(domain):
+    env, copy = domain(40, seed=7), domain(40, seed=1)
+    copy.set_seed(7)
+    first, _ = play(env, random_player(), 1)
+    again, _ = play(copy, random_player(), 1)
+    assert (first == again).all()
+    starts = env.state.player_angle
+    copy.seed_evaluation(7)
+    copy.reset()
+    assert not torch.isin(copy.state.player_angle, starts).any()
+    place(copy, **{name: env.env_state()[name] for name in rules.COLUMNS})
+    copy.seed_evaluation(7)
+    copy.reset()
+    env.set_seed(7)
+    env.reset()
+    place(copy, **{name: env.env_state()[name] for name in rules.COLUMNS})
+    kicks = action(torch.zeros(40, dtype=torch.long), torch.zeros(40, sum(env.parameter_dims)))
+    readings = [e.step(kicks.clone())["next"][keys.OBSERVATION] for e in (env, copy)]
+    assert (readings[0] != readings[1]).any(-1).all()  # other noise from the same start
+
+
+def test_without_noise_the_same_start_has_one_future():
+    envs = [GoalEnv(20, noise=0.0, seed=seed) for seed in (0, 1)]
+    for env in envs:
+        env.reset()
+    place(envs[1], **{name: envs[0].env_state()[name] for name in rules.COLUMNS})
+    readings = [act(env, [0] * 20, [[4.0, 0.0]] * 20) for env in envs]
+    assert (readings[0] == readings[1]).all()
+
+
+def test_numbers_of_an_episode_are_never_drawn_twice():
+    rng = torch.tensor([12345], dtype=torch.int32)
+    ticks = torch.arange(400, dtype=torch.int32)
+    drawn = [rules.random_numbers(rng, torch.tensor([steps], dtype=torch.int32), ticks) for steps in range(100)]
+    numbers = torch.stack(drawn).flatten()
+    assert numbers.unique().numel() > 0.985 * numbers.numel()  # of 2^23 values, 240,000 rarely meet by chance
+    assert numbers.abs().max() < 1.0
+    assert numbers.mean().abs() < 0.01
+
+
+def test_a_masked_step_leaves_its_rows_alone():
+    env = GoalEnv(3)
+    env.reset()
+    before = snapshot(env)
+    actions = action(torch.zeros(3, dtype=torch.long), torch.full((3, 4), 3.0))
+    reading = env._step(actions.set("_step", torch.tensor([True, False, True])))
+    assert is_unchanged(env, before, torch.tensor([False, True, False]))
+    assert env.state.steps.tolist() == [1, 0, 1]
+    assert reading[keys.REWARD][1].item() == 0.0
+
+
+def test_a_partial_reset_leaves_the_other_environments_alone():
+    env = GoalEnv(4)
+    env.reset()
+    reading = act(env, [0] * 4, [[3.0, 0.0]] * 4)
+    before = snapshot(env)
+    mask = torch.tensor([False, True, False, True])
+    restart(env, reading, mask)
+    assert is_unchanged(env, before, ~mask)
+    assert env.state.episode.tolist() == [0, 1, 0, 1]
+    assert (env.state.player_angle != before["player_angle"]).tolist() == mask.tolist()
+
+
+def test_a_restored_state_continues_as_the_original():
+    env, copy = GoalEnv(8, seed=2), GoalEnv(8, seed=2)
+    play(env, lambda e: action(torch.zeros(8, dtype=torch.long), torch.full((8, 4), 3.0)), 2)
+    copy.set_env_state(snapshot(env))
+    results = [act(e, [0, 1] * 4, [[6.0, 0.0], [2.0]] * 4) for e in (env, copy)]
+    assert (results[0] == results[1]).all()
+
+
+def test_returned_tensors_never_change_later():
+    env = GoalEnv(16)
+    player = random_player()
+    returned: list[TensorDictBase] = [env.reset()]
+    columns, copies = env.env_state(), snapshot(env)
+    copied = [returned[0].clone()]
+    for _ in range(2):
+        reading = env.step(player(env))["next"]
+        returned.append(reading)
+        copied.append(reading.clone())
+    assert all((now == then).all() for now, then in zip(returned, copied, strict=True))
+    assert all(torch.equal(columns[name], copies[name]) for name in columns)
+
+
+def test_only_the_parameters_of_the_chosen_action_count_and_are_clipped():
+    given_env, inside = GoalEnv(3), GoalEnv(3)
+    given_env.reset()
+    inside.reset()
+    outside = torch.tensor([[99.0, -99.0, NAN, NAN], [NAN, NAN, 99.0, NAN], [NAN, NAN, NAN, -99.0]])
+    readings = [
+        given_env.step(action(torch.tensor([0, 1, 2]), outside))["next"],
+        act(inside, [0, 1, 2], [[40.0, -15.0], [7.01], [-7.01]]),
+    ]
+    torch.testing.assert_close(readings[0][keys.OBSERVATION], readings[1][keys.OBSERVATION])
+
+
+@BOTH
+@pytest.mark.parametrize("bad", ["nan", "infinite", "too large", "negative"])
+def test_an_invalid_action_is_refused_and_changes_nothing(domain, bad):
+    env = domain(2)
+    env.reset()
+    before = snapshot(env)
+    discrete = torch.tensor([0, {"too large": 11, "negative": -1}.get(bad, 0)])
+    parameters = torch.zeros(2, sum(env.parameter_dims))
+    parameters[1, 1] = {"nan": NAN, "infinite": math.inf}.get(bad, 0.0)
+    with pytest.raises(ValueError, match="step: environment 1"):
+        env.step(action(discrete, parameters))
+    assert is_unchanged(env, before)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [{"num_envs": 0}, {"max_steps": 0}, {"noise": -0.1}, {"noise": NAN}, {"observation": "x"}, {"repaired": ["x"]}],
+    ids=str,
+)
+def test_an_invalid_argument_is_refused_by_name(arguments):
+    with pytest.raises(ValueError, match=next(iter(arguments))):
+        GoalEnv(**arguments)
+
+
+def test_the_middle_shots_are_no_slip_of_goal():
+    with pytest.raises(ValueError, match="may only have kick_to, goal_distance, keeper_projection"):
+        GoalEnv(repaired=["middle_shots"])
+
+
+def test_repairs_change_what_is_done_and_seen():
+    plain, repaired = (HardGoalEnv(200, repaired=slips) for slips in ((), HardGoalEnv.slips))
+    for env in (plain, repaired):
+        env.reset()
+        place(env, keeper_y=-14.0, keeper_x=12.0, ball_y=-13.0, ball_x=11.0, player_y=-13.0, player_x=10.0)
+    still = action(torch.zeros(200, dtype=torch.long), torch.zeros(200, 12)).set("_step", torch.zeros(200).bool())
+    seen = [env._step(still.clone())[keys.OBSERVATION] for env in (plain, repaired)]
+    assert torch.equal(seen[0][:, :16], seen[1][:, :16])
+    kicks = [act(env, [0] * 200, [[-0.5, -0.5]] * 200)[keys.OBSERVATION] for env in (plain, repaired)]
+    ball_y = rules.OBSERVATION_NAMES.index("ball_y")
+    assert (kicks[0][:, ball_y] > kicks[1][:, ball_y]).float().mean() > 0.9
+
+
+def test_global_generators_are_neither_moved_nor_read():
+    env = GoalEnv(8)
+    with global_generators_unmoved():
+        env.set_seed(5)
+        env.reset()
+        act(env, [0, 1] * 4, [[3.0, 0.0], [2.0]] * 4)
+
+
+@pytest.mark.slow
+def test_compiled_ticks_play_the_same_episodes():
+    envs = [GoalEnv(64, compile_physics=compiled, noise=0.0) for compiled in (False, True)]
+    readings = []
+    for env in envs:
+        env.reset()
+        readings.append(act(env, [0] * 64, [[4.0, 0.0]] * 64))
+    torch.testing.assert_close(readings[0][keys.OBSERVATION], readings[1][keys.OBSERVATION], rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["goal", "hard_goal"])
+def test_the_yaml_makes_the_published_domain_and_names_a_wrong_repair(name):
+    made = make_config([f"env={name}", "high=none", "low=pdqn"]).env.build(num_envs=2)
+    assert (made.max_steps, made.noise, made.repaired) == (100, 1.0, ())
+    with pytest.raises(ConfigError, match="repaired"):
+        make_config([f"env={name}", "high=none", "low=pdqn", "env.repaired=[kick]"])
+    assert compose_config([f"env={name}"]).env.compile_physics is False
+
+
+@pytest.mark.parametrize("env_id", ["hpamdp/Goal-v0", "hpamdp/HardGoal-v0"])
+def test_gymnasiums_checker_passes_and_the_spaces_are_the_fields(env_id):
+    hpamdp.register()
+    env = gymnasium.make(env_id)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about bounds: parameters in metres, orientations without any
+        check_env(env.unwrapped)
+    dims = (2, 1, 1) if env_id == "hpamdp/Goal-v0" else (2, *(1,) * 10)
+    assert isinstance(env.action_space, gymnasium.spaces.Tuple)
+    assert tuple(box.shape[0] for box in env.action_space[1]) == dims
+    vector = gymnasium.make_vec(env_id, num_envs=5, vectorization_mode="vector_entry_point")
+    vector.action_space.seed(0)
+    vector.reset(seed=0)
+    observations, rewards, *_ = vector.step(vector.action_space.sample())
+    assert observations.shape == (5, 17) and rewards.shape == (5,)
+
+
+def test_pictures_show_the_episode():
+    env = gymnasium.make("hpamdp/Goal-v0", render_mode="rgb_array")
+    env.reset(seed=1)
+    before = env.render()
+    parameters = tuple(np.zeros(dim, np.float32) for dim in (2, 1, 1))
+    env.step((1, parameters))
+    after = env.render()
+    assert before.shape == after.shape == (480, 480, 3) and before.dtype == np.uint8
+    assert (before != after).any()
