@@ -135,9 +135,7 @@ class GoalEnv(CounterEnv[GoalState]):
 
     def observe(self, state: GoalState) -> Tensor:
         """Return the observations `[N, 17]`."""
-        return rules.observe(
-            state, is_scaled=self._is_scaled, repairs_projection="keeper_projection" in self.repaired
-        )
+        return rules.observe(state, is_scaled=self._is_scaled, repairs_projection="keeper_projection" in self.repaired)
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return the published initial parameters, scaled to [-1, 1], as a linear function of the observation.
