@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -9,9 +12,10 @@ from gymnasium_players import TOY, action, make, reset_rows, step
 from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
-from toy_environments import ALL, FORMS, native_action
+from toy_environments import ALL, FORMS, Toy, native_action
 
 from hpamdp.config import ConfigError, component
+from hpamdp.env.base import ProblemError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.specs import PAMDPSpecs
@@ -299,6 +303,53 @@ def mistake_in(**options) -> str:
 )
 def test_a_mistake_is_explained_in_one_line(options, complaint):
     assert complaint in mistake_in(**options)
+
+
+STEP = (np.zeros(2), 0.5, False, False, {})
+
+
+@pytest.mark.parametrize(
+    ("returned", "complaint"),
+    [
+        (STEP[:3], "step returned 3 values, not observation, reward, terminated, truncated and info"),
+        (None, "step returned NoneType, not observation"),
+        ((STEP[0], None, *STEP[2:]), "step returned None as reward, which must be a number"),
+        ((STEP[0], np.ones(2), *STEP[2:]), r"step returned array([1., 1.]) as reward, which must be a number"),
+        ((STEP[0], "much", *STEP[2:]), "step returned 'much' as reward, which must be a number"),
+        ((*STEP[:2], None, *STEP[3:]), "step returned None as terminated, which must be True or False"),
+        ((*STEP[:4], None), "step returned None as info, which must be a dictionary"),
+        ((None, *STEP[1:]), "gave an observation of 1 values, but its space has 2"),
+        (("here", *STEP[1:]), "gave an observation whose value is 'here', not numbers"),
+    ],
+)
+def test_a_step_that_breaks_gymnasiums_contract_is_told_in_one_line(returned, complaint, monkeypatch):
+    env = make(2)
+    env.reset()
+    monkeypatch.setattr(Toy, "step", lambda self, action: returned)
+    with pytest.raises(ProblemError) as raised:
+        step(env)
+    assert "environment 0: " in str(raised.value) and complaint in str(raised.value)
+
+
+def test_other_breaches_of_gymnasiums_contract_are_told_in_one_line(monkeypatch):
+    env = make(2)
+    monkeypatch.setattr(Toy, "reset", lambda self, seed=None, options=None: np.zeros(2))
+    with pytest.raises(ProblemError, match="reset must return an observation and an info"):
+        env.reset()
+    monkeypatch.setattr(Toy, "reset", lambda self: (np.zeros(2), {}))
+    with pytest.raises(ProblemError, match="reset must take seed and options: "):
+        env.reset()
+    monkeypatch.setattr(Toy, "step", lambda self, action: sys.exit(0))
+    with pytest.raises(ProblemError, match=r"step called sys.exit\(0\)"):
+        step(env)
+
+
+def test_copies_with_different_spaces_are_refused(monkeypatch):
+    forms = itertools.cycle(["nested", "shared"])
+    make_toy = Toy.__init__
+    monkeypatch.setattr(Toy, "__init__", lambda self, form: make_toy(self, next(forms)))
+    with pytest.raises(ValueError, match="the action_space of copy 1 is "):
+        make(2)
 
 
 def test_a_bug_in_an_environment_is_not_reported_as_a_mistake_of_the_user():

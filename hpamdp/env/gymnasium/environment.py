@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import importlib
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -18,7 +19,8 @@ from torchrl.data import Categorical, Composite, Unbounded
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values
 from hpamdp.env.base import PAMDPEnv, ProblemError
-from hpamdp.env.gymnasium.action_spaces import ActionSpace
+from hpamdp.env.gymnasium.action_spaces import ActionSpace, written
+from hpamdp.env.gymnasium.contract import checked
 from hpamdp.env.gymnasium.four_value import FourValueEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
 from hpamdp.messages import one_line
@@ -84,6 +86,7 @@ class GymnasiumEnv(PAMDPEnv):
         self._name = f"GymnasiumEnv: {id if entry_point is None else entry_point}"
         self.envs = [self._make(id, entry_point, kwargs or {}, max_steps) for _ in range(num_envs)]
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
+        self._check_spaces()
         limit = getattr(self.envs[0].spec, "max_episode_steps", None) if max_steps is None else max_steps
         if limit is None:
             raise ValueError(f"{self._name}: has no time limit of its own; set env.max_steps")
@@ -166,7 +169,7 @@ class GymnasiumEnv(PAMDPEnv):
         try:
             if entry_point is None:
                 assert id is not None  # checked by `_check_arguments`
-                return gymnasium.make(id, max_episode_steps=max_steps, disable_env_checker=True, **kwargs)
+                return checked(gymnasium.make(id, max_episode_steps=max_steps, disable_env_checker=True, **kwargs))
             env = self._load(entry_point)(**kwargs)
         except (gymnasium.error.Error, ImportError) as error:
             raise ValueError(f"{self._name}: {one_line(error)}") from error
@@ -177,7 +180,16 @@ class GymnasiumEnv(PAMDPEnv):
             raise ValueError(f"{self._name}: {one_line(cause)}") from error
         if not isinstance(env, gymnasium.Env):
             env = FourValueEnv(env)
+        env = checked(env)
         return env if max_steps is None else gymnasium.wrappers.TimeLimit(env, max_steps)
+
+    def _check_spaces(self) -> None:
+        first = self.envs[0]
+        for row, env in enumerate(self.envs):
+            for name in ("action_space", "observation_space"):
+                if getattr(env, name) != getattr(first, name):
+                    given, wanted = written(getattr(env, name)), written(getattr(first, name))
+                    raise ValueError(f"{self._name}: the {name} of copy {row} is {given}, but that of copy 0 {wanted}")
 
     def _load(self, entry_point: str) -> Any:
         module_name, _, name = entry_point.partition(":")
@@ -220,8 +232,9 @@ class GymnasiumEnv(PAMDPEnv):
         for row in rows:
             seed = self._next_seeds[row] if given is None else given[row].item()
             self._next_seeds[row] = None
-            observation, _ = self.envs[row].reset(seed=seed)
-            observations.append(self._flat(row, observation))
+            with self._problem_of(row):
+                observation, _ = self.envs[row].reset(seed=seed)
+                observations.append(self.observations.flat(observation))
         self._keep(rows, observations)
         self._terminated[rows] = False
         self._truncated[rows] = False
@@ -241,9 +254,10 @@ class GymnasiumEnv(PAMDPEnv):
         rewards = np.zeros((self.num_envs, 1), np.float32)
         for row in rows:
             action = self._actions.to_native(discrete[row], parameters[row])
-            observation, reward, terminated, truncated, info = self.envs[row].step(action)
-            observations.append(self._flat(row, observation))
-            rewards[row] = np.asarray(reward).item()
+            with self._problem_of(row):
+                observation, reward, terminated, truncated, info = self.envs[row].step(action)
+                observations.append(self.observations.flat(observation))
+            rewards[row] = reward
             self._terminated[row] = terminated
             self._truncated[row] = truncated and not terminated
             success = info.get("is_success", info.get(_SUCCESS))
@@ -252,10 +266,12 @@ class GymnasiumEnv(PAMDPEnv):
         self._keep(rows, observations)
         return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device))
 
-    def _flat(self, row: int, observation: Any) -> np.ndarray:
+    @contextmanager
+    def _problem_of(self, row: int) -> Iterator[None]:
+        """Say which copy broke its contract."""
         try:
-            return self.observations.flat(observation)
-        except ValueError as error:
+            yield
+        except ProblemError as error:
             raise ProblemError(f"{self._name}: environment {row}: {error}") from error
 
     def _keep(self, rows: list[int], observations: list[np.ndarray]) -> None:

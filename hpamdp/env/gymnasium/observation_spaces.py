@@ -16,6 +16,7 @@ from gymnasium.spaces.utils import flatdim, flatten, flatten_space
 from gymnasium.wrappers.utils import RunningMeanStd
 from torch import Tensor
 
+from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.action_spaces import written
 
 Scaling = Literal["bounds", "running", "none"]
@@ -77,14 +78,14 @@ class ObservationSpace:
         """Return an observation as a vector, float64 `[dim]`.
 
         Raises:
-            ValueError: an entry is missing or outside its space, the observation has another length, or a value is not
-                finite.
+            ProblemError: an entry is missing or outside its space, the observation has another length, or a value is
+                not finite.
         """
         vector = np.concatenate([self._flat_leaf(path, leaf, observation) for path, leaf in self._leaves])
         if vector.shape != (self.dim,):
-            raise ValueError(f"gave an observation of {vector.size} values, but its space has {self.dim}")
+            raise ProblemError(f"gave an observation of {vector.size} values, but its space has {self.dim}")
         if not np.isfinite(vector).all():
-            raise ValueError("gave an observation that is not finite")
+            raise ProblemError("gave an observation that is not finite")
         return vector
 
     def _flat_leaf(self, path: tuple[int | str, ...], leaf: spaces.Space, observation: Any) -> np.ndarray:
@@ -93,12 +94,15 @@ class ObservationSpace:
             for entry in path:
                 value = value[entry]
         except (LookupError, TypeError) as error:
-            raise ValueError(f"gave an observation without its {_written_path(path)}") from error
+            raise ProblemError(f"gave an observation without its {_written_path(path)}") from error
         if not _is_inside(leaf, value):
             others = [name for name in self._names if name != path[0]] if path else []
             cure = f"; env.observation_keys={others} leaves the entry out" if others else ""
-            raise ValueError(f"gave an observation whose {_written_path(path)} is {value}, outside {leaf}{cure}")
-        return np.asarray(flatten(leaf, value), np.float64)
+            raise ProblemError(f"gave an observation whose {_written_path(path)} is {value}, outside {leaf}{cure}")
+        try:
+            return np.asarray(flatten(leaf, value), np.float64)
+        except (TypeError, ValueError) as error:
+            raise ProblemError(f"gave an observation whose {_written_path(path)} is {value!r}, not numbers") from error
 
     def scaled(self, vectors: np.ndarray) -> np.ndarray:
         """Return new observations `[M, dim]` scaled, float32; with `running`, they update the statistics first."""

@@ -1,0 +1,76 @@
+"""Gymnasium's contract of `reset` and `step`, checked at every call: what breaks it is told in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from hpamdp.env.base import ProblemError
+from hpamdp.messages import one_line
+
+
+class ContractCheck(gymnasium.Wrapper):
+    """Pass on what an environment returns, after a check of its form; rewards are floats, flags are bool.
+
+    `gymnasium.wrappers.PassiveEnvChecker` checks the spaces of the values, too, but answers with warnings, and with
+    assertions of several lines.
+
+    Raises:
+        ProblemError: from `reset` and `step`, where these break their contract or end the program.
+    """
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode and return its first observation and an info."""
+        try:
+            values: Any = self.env.reset(seed=seed, options=options)
+        except TypeError as error:
+            if "argument" not in str(error):
+                raise
+            raise ProblemError(f"reset must take seed and options: {one_line(error)}") from error
+        except SystemExit as error:
+            raise ProblemError(f"reset called sys.exit({error.code})") from error
+        if not isinstance(values, tuple) or len(values) != 2 or not isinstance(values[1], Mapping):
+            raise ProblemError("reset must return an observation and an info, a dictionary")
+        return values[0], dict(values[1])
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        try:
+            values: Any = self.env.step(action)
+        except SystemExit as error:
+            raise ProblemError(f"step called sys.exit({error.code})") from error
+        if not isinstance(values, tuple) or len(values) != 5:
+            given = f"{len(values)} values" if isinstance(values, tuple) else type(values).__name__
+            raise ProblemError(f"step returned {given}, not observation, reward, terminated, truncated and info")
+        observation, reward, terminated, truncated, info = values
+        if not isinstance(info, Mapping):
+            raise ProblemError(f"step returned {info!r} as info, which must be a dictionary")
+        return observation, _number(reward), _flag("terminated", terminated), _flag("truncated", truncated), dict(info)
+
+
+def checked(env: gymnasium.Env) -> gymnasium.Env:
+    """Put a ContractCheck around the environment, inside Gymnasium's wrappers, which unpack what it returns."""
+    outer = env
+    while isinstance(outer, gymnasium.Wrapper):
+        if not isinstance(outer.env, gymnasium.Wrapper):
+            outer.env = ContractCheck(outer.env)
+            return env
+        outer = outer.env
+    return ContractCheck(env)
+
+
+def _number(reward: Any) -> float:
+    number = np.asarray(reward)
+    if number.size != 1 or number.dtype.kind not in "fiub":
+        raise ProblemError(f"step returned {reward!r} as reward, which must be a number")
+    return float(number.item())
+
+
+def _flag(name: str, value: Any) -> bool:
+    flag = np.asarray(value)
+    if flag.size != 1 or flag.dtype.kind not in "biu":
+        raise ProblemError(f"step returned {value!r} as {name}, which must be True or False")
+    return bool(flag.item())
