@@ -81,7 +81,7 @@ def test_observations_stay_in_their_space_whatever_is_pressed():
 def test_the_space_holds_the_largest_noise_at_the_rim(observation, largest, monkeypatch):
     env = BoatDock(controller="congruent", observation=observation, sensor_noise=30.0)
     signs = itertools.cycle([1, -1, -1, 1, -1, 1])
-    monkeypatch.setattr(counter_rng, "normal", lambda key, draw: torch.full(key.shape, largest * next(signs)))
+    monkeypatch.setattr(counter_rng, "normal", lambda key, draw: torch.full(key.bits.shape, largest * next(signs)))
     rim = np.array([119.9, 0.0])
     assert env.reset(seed=0, options={"start": START + rim, "goal": START - rim})[0] in env.observation_space
     assert env.step(press(1, 0.1))[0] in env.observation_space
