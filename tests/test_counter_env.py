@@ -386,3 +386,18 @@ def test_a_problem_without_pictures_or_player_says_so():
         env.draw([env.state])
     with pytest.raises(NotImplementedError, match="Bare has no hand-written player"):
         env.scripted_action(env.state)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("problem", POINTS)
+def test_compiled_rules_play_as_the_others(problem):
+    plain, compiled = problem(64, seed=3), problem(64, seed=3, compile_rules=True)
+    player = random_player()
+    torch.testing.assert_close(plain.reset()[keys.OBSERVATION], compiled.reset()[keys.OBSERVATION])
+    for _ in range(10):
+        actions = player(plain)
+        readings = [env.step(actions.clone())["next"] for env in (plain, compiled)]
+        torch.testing.assert_close(readings[0].to_dict(), readings[1].to_dict(), rtol=0.0, atol=1e-5)
+        mask = torch.arange(64) % 7 == 0
+        fresh = [restart(env, reading, mask) for env, reading in zip((plain, compiled), readings, strict=True)]
+        torch.testing.assert_close(fresh[0][keys.OBSERVATION], fresh[1][keys.OBSERVATION], rtol=0.0, atol=1e-5)

@@ -70,7 +70,7 @@ def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[
         return episode.reset(moved, over, seed, environment, rules), reward, moved.outcome
 
     if is_compiled:
-        press = torch.compile(press, **episode.COMPILE_ARGUMENTS)
+        press = torch.compile(press, **counter_rng.COMPILE_ARGUMENTS)
     env = BoatDockEnv(num_envs, device=device)
     actions = random_actions(env)
     env.reset()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -65,6 +65,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         seed: of all random numbers; the global generators are neither read nor moved.
         first_env: number of the first environment, where other processes have those before it.
         oracle: also write the action of the hand-written player, `scripted_action`, under `oracle`.
+        compile_rules: compile `start`, `act` and `observe`, which takes about half a minute.
 
     Raises:
         ValueError: an argument or an action is invalid; the state is unchanged.
@@ -87,6 +88,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         seed: int,
         first_env: int,
         oracle: bool = False,
+        compile_rules: bool = False,
     ) -> None:
         for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
             if value < 1:
@@ -99,6 +101,12 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         self._has_oracle = oracle
         self._make_specs(low, high)
         self._place_parameters(low, high)
+        self._pure_step, self._pure_reset, self._pure_observe = self._advance, self._restart, self.observe
+        if compile_rules:
+            arguments: Any = counter_rng.COMPILE_ARGUMENTS
+            self._pure_step = torch.compile(self._advance, **arguments)
+            self._pure_reset = torch.compile(self._restart, **arguments)
+            self._pure_observe = torch.compile(self.observe, **arguments)
         self._set_seed(seed)
 
     @abstractmethod
@@ -218,10 +226,24 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def _start(self, episode: Tensor) -> EpisodeState:
         return self.start(episode, counter_rng.key_for(self._seed, self._streams[0], self._environment, episode))
 
+    def _restart(self, state: EpisodeState, mask: Tensor) -> EpisodeState:
+        """Return the states with new episodes in the rows of `mask` `[N]`."""
+        return where(mask, self._start(state.episode + 1), state)
+
+    def _advance(
+        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, is_idle: Tensor
+    ) -> tuple[EpisodeState, Tensor]:
+        """Return the states after one action, with the time limit, and the rewards; idle rows stay as they are."""
+        rng = counter_rng.key_for(self._seed, self._streams[1], self._environment, state.episode)
+        after, reward = self.act(state, discrete, parameters, rng, is_idle)
+        is_out_of_time = (after.steps >= self.max_steps) & (after.outcome == GOING_ON)
+        after = replaced(after, outcome=torch.where(is_out_of_time, len(self.outcomes) - 1, after.outcome))
+        return where(is_idle, state, after), torch.where(is_idle, 0.0, reward)
+
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        fresh = self._start(self._state.episode + 1)
-        self._state = fresh if mask is None else where(mask.reshape(self.num_envs), fresh, self._state)
+        mask = torch.ones_like(self._environment, dtype=torch.bool) if mask is None else mask.reshape(self.num_envs)
+        self._state = self._pure_reset(self._state, mask)
         return self._read()
 
     def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -238,12 +260,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         mask = tensordict.get("_step", None)
         if mask is not None:
             is_idle = is_idle | ~mask.reshape(self.num_envs)
-        rng = counter_rng.key_for(self._seed, self._streams[1], self._environment, before.episode)
-        after, reward = self.act(before, discrete, parameters, rng, is_idle)
-        is_out_of_time = (after.steps >= self.max_steps) & (after.outcome == GOING_ON)
-        after = replaced(after, outcome=torch.where(is_out_of_time, len(self.outcomes) - 1, after.outcome))
-        self._state = where(is_idle, before, after)
-        return self._read().set(keys.REWARD, torch.where(is_idle, 0.0, reward).unsqueeze(-1))
+        self._state, reward = self._pure_step(before, discrete, parameters, is_idle)
+        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
 
     def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Check the action; return its discrete part `[N]` and its own parameters `[N, D]`, clipped, as `act` does."""
@@ -270,7 +288,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         done = (outcome != GOING_ON).unsqueeze(-1)
         truncated = (outcome == len(self.outcomes) - 1).unsqueeze(-1)
         leaves = {
-            keys.OBSERVATION: self.observe(self._state),
+            keys.OBSERVATION: self._pure_observe(self._state),
             keys.OUTCOME: outcome,
             keys.DONE: done,
             keys.TERMINATED: done & ~truncated,

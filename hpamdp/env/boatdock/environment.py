@@ -131,7 +131,7 @@ class BoatDockEnv(PAMDPEnv):
         self._pure_reset = episode.reset
         self._pure_read = episode.read
         if compile_physics:
-            arguments: Any = episode.COMPILE_ARGUMENTS
+            arguments: Any = counter_rng.COMPILE_ARGUMENTS
             self._pure_step = torch.compile(episode.step, **arguments)
             self._pure_reset = torch.compile(episode.reset, **arguments)
             self._pure_read = torch.compile(episode.read, **arguments)

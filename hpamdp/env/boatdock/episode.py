@@ -7,7 +7,7 @@ observation would keep a physics fused with them from being vectorised. Position
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,15 +43,6 @@ OBSERVATION_NAMES = (
     "distance",
 )
 SCALED_NAMES = (*OBSERVATION_NAMES, "to_goal_x", "to_goal_y")
-
-# How to compile the functions of this file. Each operation of the random numbers' hash reads its input twice, and the
-# compiler's default of inlining them into one another takes it two minutes. Measured at 16,384 boats: with these
-# thresholds compiling takes 4 s, and step and reset make 50 million presses/s; with (8, 2) and (20, 4) 21 million.
-COMPILE_ARGUMENTS: dict[str, Any] = {
-    "fullgraph": True,
-    "dynamic": False,
-    "options": {"realize_opcount_threshold": 16, "realize_reads_threshold": 4},
-}
 
 # Each press has 16 random numbers of its episode's noise; Gaussian number i is made of the uniform ones 2i and 2i + 1.
 _NUMBERS_PER_PRESS = 16

@@ -34,6 +34,7 @@ class _VehicleEnv(CounterEnv[VehicleState]):
         num_envs: int = 1,
         *,
         max_steps: int = rules.PUBLISHED_STEPS,
+        compile_rules: bool = False,
         oracle: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
@@ -48,6 +49,7 @@ class _VehicleEnv(CounterEnv[VehicleState]):
             seed=seed,
             first_env=first_env,
             oracle=oracle,
+            compile_rules=compile_rules,
         )
 
     @property
@@ -116,6 +118,7 @@ class MovingEnv(_VehicleEnv):
     Args:
         num_envs: number of fields.
         max_steps: actions after which an episode is truncated; gym-hybrid has 201.
+        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.

@@ -42,6 +42,7 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
         n: number of actuators.
         max_steps: actions after which an episode is truncated; HyAR has 30, DLPA 25.
         rounded_directions: whether the actuators' directions have three decimals, as published.
+        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
@@ -61,6 +62,7 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
         n: NumActuators = 4,
         max_steps: int = 30,
         rounded_directions: bool = True,
+        compile_rules: bool = False,
         oracle: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
@@ -84,6 +86,7 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
             seed=seed,
             first_env=first_env,
             oracle=oracle,
+            compile_rules=compile_rules,
         )
 
     @property
