@@ -104,6 +104,8 @@ def test_a_goal_pays_fifty_and_every_other_end_costs_the_balls_distance():
     assert reading[keys.TERMINATED].all() and not reading[keys.TRUNCATED].any()
     results = env.results(reading.select(*env.result_keys))
     assert results["success"].tolist() == [True, False, False] and results["score"].tolist() == [1.0, 0.0, 0.0]
+    shares = env.measure({name: value.numpy() for name, value in results.items()})
+    assert shares == pytest.approx({"caught": 1 / 3, "out": 1 / 3, "time_limit": 0.0})
 
 
 def test_the_last_action_is_not_played_and_truncates():

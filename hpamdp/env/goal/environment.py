@@ -7,7 +7,7 @@ arXiv:2109.05490; see `hpamdp.env.goal.rules`, also for the differences.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -174,6 +174,10 @@ class GoalEnv(CounterEnv[GoalState]):
             "out": outcome == rules.OUT,
             "time_limit": outcome == rules.TIME_LIMIT,
         }
+
+    def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return the shares of episodes that ended in each way but by a goal."""
+        return {name: float(played[name].mean()) for name in ("caught", "out", "time_limit")}
 
     def draw(self, track: Sequence[GoalState]) -> np.ndarray:
         """Return a picture of the pitch and the way of the ball, uint8 `[480, 480, 3]`."""
