@@ -21,6 +21,7 @@ from torchrl.envs.utils import check_env_specs
 import hpamdp
 from hpamdp import keys
 from hpamdp.config import ConfigError
+from hpamdp.env import counter_rng
 from hpamdp.env.goal import rules
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.specs import PAMDPSpecs
@@ -103,6 +104,8 @@ def test_a_goal_pays_fifty_and_every_other_end_costs_the_balls_distance():
     assert reading[keys.TERMINATED].all() and not reading[keys.TRUNCATED].any()
     results = env.results(reading.select(*env.result_keys))
     assert results["success"].tolist() == [True, False, False] and results["score"].tolist() == [1.0, 0.0, 0.0]
+    shares = env.measure({name: value.numpy() for name, value in results.items()})
+    assert shares == pytest.approx({"caught": 1 / 3, "out": 1 / 3, "time_limit": 0.0})
 
 
 def test_the_last_action_is_not_played_and_truncates():
@@ -179,7 +182,8 @@ def test_without_noise_the_same_start_has_one_future():
 
 
 def test_numbers_of_an_episode_are_never_drawn_twice():
-    rng = torch.tensor([12345], dtype=torch.int32)
+    one = torch.tensor([12345], dtype=torch.int32)
+    rng = counter_rng.key_for(one[0], counter_rng.NOISE, one, one)
     ticks = torch.arange(400, dtype=torch.int32)
     drawn = [rules.random_numbers(rng, torch.tensor([steps], dtype=torch.int32), ticks) for steps in range(100)]
     numbers = torch.stack(drawn).flatten()

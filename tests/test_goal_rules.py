@@ -7,6 +7,7 @@ import torch
 from goal_players import Trace
 from torch import Tensor
 
+from hpamdp.env import counter_rng
 from hpamdp.env.goal import rules
 from hpamdp.env.goal.rules import GoalState
 
@@ -60,10 +61,14 @@ def test_recorded_ticks_are_met_one_by_one(domain):
     assert len(after) > 50
 
 
+def key(episode: Tensor) -> counter_rng.Key:
+    return counter_rng.key_for(episode[0], counter_rng.TRAINING, torch.zeros_like(episode), episode)
+
+
 def state_with(num: int = 1, **columns: float | Tensor) -> GoalState:
     """Return states in the middle of the pitch, with some columns changed."""
     episode = torch.zeros(num, dtype=torch.int32)
-    state = rules.start(episode, episode, torch.float64)
+    state = rules.start(episode, key(episode), torch.float64)
     changed = {name: torch.as_tensor(value, dtype=torch.float64).expand(num) for name, value in columns.items()}
     return state._replace(**changed)
 
@@ -138,7 +143,8 @@ def test_the_keepers_projection_is_clipped_too_high_unless_repaired():
 
 def test_every_ball_lies_in_reach_at_the_start():
     num = 20_000
-    state = rules.start(torch.zeros(num, dtype=torch.int32), torch.arange(num, dtype=torch.int32) * 7919)
+    episode = torch.arange(num, dtype=torch.int32)
+    state = rules.start(episode, key(episode))
     aim = rules.goal_aim(torch.full((num,), rules.SHOOT_LEFT), torch.zeros(num, 2))
     after = rules.tick(state[:14], aim.x, aim.y, torch.zeros(6, num))
     assert (after[rules.COLUMNS.index("ball_vx")] > 0.0).all()

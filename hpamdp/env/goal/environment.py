@@ -7,7 +7,7 @@ arXiv:2109.05490; see `hpamdp.env.goal.rules`, also for the differences.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_rng import Key
 from hpamdp.env.goal import rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
 
@@ -34,8 +35,8 @@ class GoalEnv(CounterEnv[GoalState]):
     their bounds they are clipped, NaN and infinity are refused. An action lasts for many ticks: a kick until the ball
     lies still within reach, a shot until the episode ends. The two shots are the same action.
 
-    The reward is 50 for a goal. An episode that ends otherwise, since the keeper catches the ball or the ball leaves the
-    pitch, or at the time limit, costs the distance of the ball from the goal.
+    The reward is 50 for a goal. An episode that ends otherwise, since the keeper catches the ball or the ball leaves
+    the pitch, or at the time limit, costs the distance of the ball from the goal.
 
     The rules are those behind all published numbers. That includes slips of the published code, which `repaired` takes
     out:
@@ -61,8 +62,8 @@ class GoalEnv(CounterEnv[GoalState]):
 
     discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
-    observation_names: ClassVar[tuple[str, ...]] = rules.OBSERVATION_NAMES
-    parameter_dims = rules.PARAMETER_DIMS
+    observation_names = rules.OBSERVATION_NAMES
+    parameter_dims: tuple[int, ...] = rules.PARAMETER_DIMS
     parameter_low: ClassVar[tuple[float, ...]] = rules.PARAMETER_LOW
     parameter_high: ClassVar[tuple[float, ...]] = rules.PARAMETER_HIGH
     slips: ClassVar[tuple[str, ...]] = ("kick_to", "goal_distance", "keeper_projection")
@@ -110,17 +111,17 @@ class GoalEnv(CounterEnv[GoalState]):
             self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
             self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
 
-    def start(self, episode: Tensor, rng: Tensor) -> GoalState:
+    def start(self, episode: Tensor, rng: Key) -> GoalState:
         """Return the states in which episodes begin."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: GoalState, discrete: Tensor, parameters: Tensor, rng: Tensor, is_idle: Tensor
+        self, state: GoalState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
     ) -> tuple[GoalState, Tensor]:
         """Return the states after one action, and the rewards `[N]`."""
 
         def numbers(ticks: Tensor, rows: Tensor) -> Tensor:
-            return self._random_numbers(rng[rows], state.steps[rows], ticks)
+            return self._random_numbers(rng._replace(bits=rng.bits[rows]), state.steps[rows], ticks)
 
         after, _ = rules.act(
             state,
@@ -173,6 +174,10 @@ class GoalEnv(CounterEnv[GoalState]):
             "out": outcome == rules.OUT,
             "time_limit": outcome == rules.TIME_LIMIT,
         }
+
+    def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return the shares of episodes that ended in each way but by a goal."""
+        return {name: float(played[name].mean()) for name in ("caught", "out", "time_limit")}
 
     def draw(self, track: Sequence[GoalState]) -> np.ndarray:
         """Return a picture of the pitch and the way of the ball, uint8 `[480, 480, 3]`."""

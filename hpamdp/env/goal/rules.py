@@ -1,8 +1,8 @@
 """The rules of the Robot Soccer Goal domain as pure functions on columns: a player, a keeper and a ball.
 
-Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644, section on the Robot Soccer Goal domain. Constants, bounds and
-rules as in gym-goal, the version of Bester, James & Konidaris 2019, arXiv:1905.04388, with the three observations that
-their learners add; the shots of Hard Goal as in HyAR, Li et al. 2022, arXiv:2109.05490.
+Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644, section on the Robot Soccer Goal domain. Constants, bounds
+and rules as in gym-goal, the version of Bester, James & Konidaris 2019, arXiv:1905.04388, with the three observations
+that their learners add; the shots of Hard Goal as in HyAR, Li et al. 2022, arXiv:2109.05490.
 Differs from the source: the reach has a slack, since at the start the ball lies on its rim, where rounding would put
 every fifth ball out of reach in float32; where two bodies are in the same place, none is pushed away.
 """
@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
+from hpamdp.env.counter_rng import Key
 
 KICK_TO, SHOOT_LEFT, SHOOT_RIGHT = range(3)
 ACTIONS = ("kick to", "shoot left", "shoot right")
@@ -175,12 +176,12 @@ class Motion(NamedTuple):
 Tick = Callable[[Motion, Tensor, float], Motion]  # as `masked_tick`
 
 
-def start(episode: Tensor, rng: Tensor, dtype: torch.dtype = torch.float32) -> GoalState:
+def start(episode: Tensor, rng: Key, dtype: torch.dtype = torch.float32) -> GoalState:
     """Return the states in which the episodes with these numbers, int32 `[N]`, begin.
 
     Args:
         episode: numbers of the episodes, int32 `[N]`.
-        rng: their int32 `[N]` keys from `counter_rng.key_for`.
+        rng: their keys `[N]` from `counter_rng.key_for`.
         dtype: of the positions.
     """
     zeros = torch.zeros_like(episode, dtype=dtype)
@@ -256,15 +257,15 @@ def _aim(is_kick: Tensor, kick_x: Tensor, kick_y: Tensor, shot: Tensor, kicks_to
     )
 
 
-def random_numbers(rng: Tensor, steps: Tensor, ticks: Tensor) -> Tensor:
+def random_numbers(rng: Key, steps: Tensor, ticks: Tensor) -> Tensor:
     """Return the numbers in (-1, 1), float32 `[K, 6, M]`, of ticks of the next action.
 
     Args:
-        rng: int32 `[M]` from `counter_rng.key_for`.
+        rng: keys `[M]` from `counter_rng.key_for`.
         steps: how many actions the episode has had, int32 `[M]`.
         ticks: int32 `[K]`.
     """
-    place = torch.arange(NUMBERS_PER_TICK, dtype=torch.int32, device=rng.device)
+    place = torch.arange(NUMBERS_PER_TICK, dtype=torch.int32, device=ticks.device)
     index = (ticks.unsqueeze(-1) * NUMBERS_PER_TICK + place).unsqueeze(-1) + steps * _NUMBERS_PER_ACTION
     return 2.0 * counter_rng.uniform(rng, index) - 1.0
 
@@ -296,17 +297,11 @@ def act(
     is_late = moves & (steps >= max_steps)
     is_played = moves & ~is_late
     outcome = torch.where(is_late, TIME_LIMIT, state.outcome)
-    motion = Motion(
-        *state[: len(COLUMNS)],
-        aim_x=aim.x,
-        aim_y=aim.y,
-        is_kick=aim.is_kick,
-        end=torch.where(is_played, _GOING, outcome),
-        ticks=torch.zeros_like(steps),
-    )
+    end = torch.where(is_played, _GOING, outcome)
+    motion = Motion._make((*state[: len(COLUMNS)], *aim, end, torch.zeros_like(steps)))
     rows = torch.arange(len(steps), device=steps.device)
     motion = _run(motion, rows, 0, numbers, noise, tick or masked_tick)
-    return GoalState(*motion[: len(COLUMNS)], steps, motion.end, state.episode), motion.ticks
+    return GoalState._make((*motion[: len(COLUMNS)], steps, motion.end, state.episode)), motion.ticks
 
 
 def _run(motion: Motion, rows: Tensor, first: int, numbers: Numbers, noise: float, tick: Tick) -> Motion:
@@ -337,8 +332,9 @@ def masked_tick(motion: Motion, numbers: Tensor, noise: float) -> Motion:
     bodies = tick(motion[: len(COLUMNS)], motion.aim_x, motion.aim_y, numbers, noise)
     is_going = motion.end == _GOING
     end = torch.where(is_going, _end(bodies, motion.is_kick), motion.end)
-    kept = (torch.where(is_going, new, old) for new, old in zip(bodies, motion, strict=False))
-    return Motion(*kept, motion.aim_x, motion.aim_y, motion.is_kick, end, motion.ticks + is_going.to(torch.int32))
+    kept = [torch.where(is_going, new, old) for new, old in zip(bodies, motion, strict=False)]
+    ticks = motion.ticks + is_going.to(torch.int32)
+    return Motion._make((*kept, motion.aim_x, motion.aim_y, motion.is_kick, end, ticks))
 
 
 def _end(bodies: Bodies, is_kick: Tensor) -> Tensor:
