@@ -51,7 +51,7 @@ def assert_same(one: object, other: object, where: str = "") -> None:
 
 
 def stop_and_resume(given: list[str], tmp_path: Path, monkeypatch, *numbers: int) -> None:
-    """Run once as a whole; for each signal once with it in the middle and a resumption; assert that all are the same."""
+    """Run once as a whole, and for each signal once with a resumption after it; assert that all are the same."""
     assert run(compose_config(given), tmp_path / "whole", given) == 0
     whole = members_of(tmp_path / "whole")
     for number in numbers:
