@@ -82,11 +82,10 @@ $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray]'
 	@touch $@
 
-# This launcher and what it needs want older versions of much that constraints.txt pins, such as cloudpickle < 3.
-$(RAY)/.installed: pyproject.toml constraints.txt
+# This launcher wants cloudpickle < 3, so it has constraints of its own; without them pip searches for an hour.
+$(RAY)/.installed: pyproject.toml constraints-ray-launcher.txt
 	$(venv)
-	@grep -E '^(torch|torchrl|tensordict|gymnasium|hydra-core|omegaconf|ray)==' constraints.txt > $(@D)/constraints.txt
-	$(INSTALL) -c $(@D)/constraints.txt -e '.[dev,ray-launcher]'
+	$(INSTALL) -c constraints-ray-launcher.txt -e '.[dev,ray-launcher]'
 	@touch $@
 
 $(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
