@@ -20,7 +20,7 @@ OPTIONS = dict(
     features=None, phi_order=1, phi_max_coupled=2, psi_order=1, psi_max_coupled=1, warmup_frames=100,
     initial_episodes=100, relearning_episodes=100, gamma=0.9, trace_decay=0.5, step_size=1.0, temperature=0.5,
     parameter_updates=3, patience=2, rollouts=100, natural_step_size=1.0, max_divergence=1.0, ridge=1e-6,
-    initial_mean=0.0, sigma=0.2, sigma_final=0.1, sigma_decay=0.9,
+    initial_mean=0.0, initial_parameters="none", sigma=0.2, sigma_final=0.1, sigma_decay=0.9,
 )  # fmt: skip
 
 GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)

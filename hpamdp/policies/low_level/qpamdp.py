@@ -33,7 +33,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
 from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
-from hpamdp.policies.shared.networks import sample_index
+from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
@@ -54,6 +54,7 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         temperature: of the softmax.
         sigma: standard deviation of the parameters.
         mean: initial mean of the parameters.
+        initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
     """
 
     w: Tensor
@@ -61,7 +62,14 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
     sigma: Tensor
 
     def __init__(
-        self, specs: PAMDPSpecs, phi: FourierBasis, psi: FourierBasis, temperature: float, sigma: float, mean: float
+        self,
+        specs: PAMDPSpecs,
+        phi: FourierBasis,
+        psi: FourierBasis,
+        temperature: float,
+        sigma: float,
+        mean: float,
+        initial_parameters: InitialParameters,
     ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
@@ -70,8 +78,9 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         self.phi = phi
         self.psi = psi
         self.temperature = temperature
+        self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.register_buffer("w", torch.zeros(specs.num_discrete, 1))
-        self.register_buffer("theta", torch.full((specs.num_parameters, 1), mean))
+        self.register_buffer("theta", torch.full((specs.num_parameters, 1), 0.0 if self.initial.exists else mean))
         self.register_buffer("sigma", torch.tensor(sigma))
 
     def widen(self) -> None:
@@ -79,11 +88,15 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         self.w = F.pad(self.w, (0, len(self.phi.coefficients) - self.w.shape[1]))
         self.theta = F.pad(self.theta, (0, len(self.psi.coefficients) - self.theta.shape[1]))
 
+    def mean(self, observation: Tensor) -> Tensor:
+        """Return the means `[*B, num_parameters]` for observations `[*B, observation_dim]`."""
+        return self.psi(observation) @ self.theta.T + self.initial(observation)
+
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and their raw sample, each `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
         q = self.phi(observation) @ self.w.T
-        raw = self.psi(observation) @ self.theta.T
+        raw = self.mean(observation)
         if is_greedy():
             discrete = q.argmax(-1)
         else:
@@ -285,6 +298,7 @@ class QPAMDP(Learner):
         natural_step_size: PositiveFloat,
         max_divergence: PositiveFloat,
         ridge: NonNegativeFloat,
+        initial_parameters: InitialParameters,
         initial_mean: Annotated[float, Field(ge=-1.0, le=1.0)],
         sigma: PositiveFloat,
         sigma_final: PositiveFloat,
@@ -308,7 +322,7 @@ class QPAMDP(Learner):
 
         phi = FourierBasis(phi_order, phi_max_coupled)
         psi = FourierBasis(psi_order, psi_max_coupled)
-        self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean)
+        self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean, initial_parameters)
         self.sarsa = SarsaLambda(gamma, trace_decay, step_size, temperature)
         self.enac = NaturalActorCritic(ridge)
         self.register_buffer("mask", specs.parameter_mask.float())
@@ -380,8 +394,9 @@ class QPAMDP(Learner):
             rows["next_phi"] = self.policy.phi(batch["next", keys.OBSERVATION])
         else:
             psi = self.policy.psi(observation)
-            mean = psi @ self.policy.theta.T
-            score = (batch[RAW] - mean) / self.policy.sigma.square() * self.mask[rows["discrete"]]
+            score = (
+                (batch[RAW] - self.policy.mean(observation)) / self.policy.sigma.square() * self.mask[rows["discrete"]]
+            )
             rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
         return TensorDict(rows, batch_size=mask.shape)
 

@@ -90,10 +90,10 @@ class TD3BCPolicy(TensorDictModuleBase):
 class TD3BC(ReplayLearner):
     """Q-learning on the data's discrete actions with parameters near the data's, from a data set or a replay buffer."""
 
+    stores_own_parameters = True
     has_value: ClassVar[bool] = True
 
     policy: TD3BCPolicy
-    parameter_mask: Tensor
 
     def __init__(
         self,
@@ -137,7 +137,6 @@ class TD3BC(ReplayLearner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = TD3BCPolicy(self.actor, self.critics, self.behaviour, specs, discrete_threshold, parameter_noise)
-        self.register_buffer("parameter_mask", specs.parameter_mask.float())
         self.to(device)
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
@@ -174,7 +173,7 @@ class TD3BC(ReplayLearner):
         with torch.no_grad():
             frequency = self.behaviour(state).softmax(-1)
         q = (self.critics(state, own_unit).amin(0) * frequency).sum(-1)
-        distance = ((own_unit - unit).square() * self.parameter_mask[discrete]).sum(-1)
+        distance = ((own_unit - unit).square() * (self.owner == discrete.unsqueeze(-1))).sum(-1)
         # Values are divided by their mean size, so that the weight does not depend on the scale of the reward.
         loss = (self.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
         self.optimizer_step("actor", loss)
