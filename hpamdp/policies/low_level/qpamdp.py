@@ -13,14 +13,19 @@ Differs from the source:
   on its step size holds for that mean; eNAC accumulates its regression as normal equations, with ridge regularisation;
 - the value of the next discrete action is its expectation under the softmax where that action is not in the batch: in
   the batch's last column and where an episode is truncated;
-- the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to its range in the warm-up;
+- the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to `feature_range` or to its
+  range in the warm-up;
+- by default, that is with `qpamdp.yaml`: all weights of the values have the same step size, which Dabney and Barto's
+  bound limits anew at each step and whatever its sign, the temperature stays as it is, also in the parameter phases,
+  and sigma decays. The published settings: step_scaling=true, step_bound=non_increasing, temperature_decay=0.995,
+  samples_in_parameter_phase=false, sigma_decay=1;
 - parameters are in units where their bounds are [-1, 1], sigma is a standard deviation, eNAC's returns are not
   discounted, and its step is bounded by the divergence from the old policy.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -38,6 +43,8 @@ from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
 RAW = "raw_parameters"
+
+StepBound = Literal["each_step", "non_increasing"]
 
 # The phases: what is being learned.
 SARSA = 0
@@ -60,6 +67,8 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
     w: Tensor
     theta: Tensor
     sigma: Tensor
+    temperature: Tensor
+    samples_discrete: Tensor  # whether exploring actions are sampled from the softmax, or those of highest value
 
     def __init__(
         self,
@@ -77,7 +86,8 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         self.specs = specs
         self.phi = phi
         self.psi = psi
-        self.temperature = temperature
+        self.register_buffer("temperature", torch.tensor(temperature))
+        self.register_buffer("samples_discrete", torch.tensor(True))
         self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.register_buffer("w", torch.zeros(specs.num_discrete, 1))
         self.register_buffer("theta", torch.full((specs.num_parameters, 1), 0.0 if self.initial.exists else mean))
@@ -97,10 +107,9 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         observation = td.get(keys.OBSERVATION)
         q = self.phi(observation) @ self.w.T
         raw = self.mean(observation)
-        if is_greedy():
-            discrete = q.argmax(-1)
-        else:
-            discrete = sample_index(q / self.temperature)
+        is_exploring = not is_greedy()
+        discrete = sample_index(q / self.temperature) if is_exploring and self.samples_discrete else q.argmax(-1)
+        if is_exploring:
             raw = raw + self.sigma * torch.randn_like(raw)
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}, RAW: raw})
@@ -113,24 +122,28 @@ class SarsaLambda(SizedByData):
         gamma: discount of a step.
         trace_decay: lambda.
         step_size: largest step size.
-        temperature: of the softmax policy.
+        step_bound: Dabney and Barto's bound on it: `each_step`, recomputed for every update and whatever its sign, or
+            `non_increasing`: the smallest so far of the updates that reduce the error.
     """
 
     traces: Tensor
+    step_size: Tensor
 
-    def __init__(self, gamma: float, trace_decay: float, step_size: float, temperature: float) -> None:
+    def __init__(self, gamma: float, trace_decay: float, step_size: float, step_bound: StepBound) -> None:
         super().__init__()
         self.gamma = gamma
         self.trace_decay = trace_decay
-        self.step_size = step_size
-        self.temperature = temperature
+        self.step_bound = step_bound
+        self.register_buffer("step_size", torch.tensor(step_size))
         self.register_buffer("traces", torch.zeros(0, 1, 1))
 
-    def update(self, w: Tensor, rows: TensorDict) -> tuple[Tensor, Tensor]:
+    def update(self, w: Tensor, rows: TensorDict, temperature: Tensor, step_scale: Tensor) -> tuple[Tensor, Tensor]:
         """Make one update for each time step of a batch.
 
         Args:
             w: weights `[num_discrete, num_features]`.
+            temperature: of the softmax policy, `[]`.
+            step_scale: factors on the steps of the features' weights, `[num_features]`.
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
                 `done` and `mask` `[N, T]`; only the rows in `mask` count.
 
@@ -152,7 +165,7 @@ class SarsaLambda(SizedByData):
             self.traces[envs, discrete] += phi
 
             next_q = next_phi @ w.T
-            next_probs = (next_q / self.temperature).softmax(-1)
+            next_probs = (next_q / temperature).softmax(-1)
             if t + 1 < num_steps:
                 taken = F.one_hot(rows["discrete"][:, t + 1], len(w))
                 next_probs = torch.where(row["done"].unsqueeze(-1), next_probs, taken)
@@ -160,13 +173,21 @@ class SarsaLambda(SizedByData):
             error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
 
             # Dabney and Barto's bound: the mean change of the errors that a step of size 1 would cause.
-            next_change = torch.einsum("nkf,nf->nk", self.traces, next_phi)
-            change = (next_weight * next_change).sum(-1) - (self.traces[envs, discrete] * phi).sum(-1)
-            step_size = (1.0 / (change * weight).sum().abs()).clamp(max=self.step_size)
-            w = w + step_size * torch.einsum("n,nkf->kf", error * weight, self.traces)
+            next_change = torch.einsum("nkf,nf->nk", self.traces, next_phi * step_scale)
+            change = (next_weight * next_change).sum(-1) - (self.traces[envs, discrete] * step_scale * phi).sum(-1)
+            step_size = self._bounded((change * weight).sum())
+            w = w + step_size * step_scale * torch.einsum("n,nkf->kf", error * weight, self.traces)
             self.traces[row["done"]] = 0.0
             errors.append((error.square() * weight).sum())
         return w, torch.stack(errors).mean()
+
+    def _bounded(self, change: Tensor) -> Tensor:
+        """Return the step size, given how a step of size 1 changes the error, `[]`."""
+        bounded = self.step_size.minimum(1.0 / change.abs())
+        if self.step_bound == "each_step":
+            return bounded
+        self.step_size = torch.where(change < 0.0, bounded, self.step_size)
+        return self.step_size
 
 
 class NaturalActorCritic(SizedByData):
@@ -281,6 +302,7 @@ class QPAMDP(Learner):
         device: torch.device,
         *,
         features: list[NonNegativeInt] | None,
+        feature_range: Annotated[list[float], Field(min_length=2, max_length=2)] | None,
         phi_order: PositiveInt,
         phi_max_coupled: PositiveInt,
         psi_order: PositiveInt,
@@ -291,7 +313,12 @@ class QPAMDP(Learner):
         gamma: PositiveFraction,
         trace_decay: Fraction,
         step_size: PositiveFloat,
+        step_scaling: bool,
+        step_bound: StepBound,
         temperature: PositiveFloat,
+        temperature_final: PositiveFloat,
+        temperature_decay: PositiveFraction,
+        samples_in_parameter_phase: bool,
         parameter_updates: PositiveInt | None,
         patience: PositiveInt,
         rollouts: PositiveInt,
@@ -308,7 +335,14 @@ class QPAMDP(Learner):
         if features is not None and not all(i < specs.observation_dim for i in features):
             last = specs.observation_dim - 1
             raise ValueError(f"features={features}: the observation has entries 0 to {last}; use null for all of them")
+        if feature_range is not None and not feature_range[0] < feature_range[1]:
+            raise ValueError(f"feature_range={feature_range}: the first number must be less than the second")
         self.features = features
+        self.feature_range = feature_range
+        self.step_scaling = step_scaling
+        self.temperature_final = min(temperature, temperature_final)
+        self.temperature_decay = temperature_decay
+        self.samples_in_parameter_phase = samples_in_parameter_phase
         self.warmup_frames = warmup_frames
         self.initial_episodes = initial_episodes
         self.relearning_episodes = relearning_episodes
@@ -323,7 +357,7 @@ class QPAMDP(Learner):
         phi = FourierBasis(phi_order, phi_max_coupled)
         psi = FourierBasis(psi_order, psi_max_coupled)
         self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean, initial_parameters)
-        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, temperature)
+        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, step_bound)
         self.enac = NaturalActorCritic(ridge)
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf))
@@ -350,10 +384,15 @@ class QPAMDP(Learner):
             return {}
         rows = self._rows(batch, mask)
         self.window_return += (rows["reward"] * rows["mask"]).sum()
-        self.window_episodes += (rows["done"] & rows["mask"]).sum()
+        num_episodes = (rows["done"] & rows["mask"]).sum()
+        self.window_episodes += num_episodes
         scalars = {"phase": float(self.phase)}
         if self.phase == SARSA:
-            self.policy.w, error = self.sarsa.update(self.policy.w, rows)
+            phi = self.policy.phi
+            step_scale = phi.step_scale() if self.step_scaling else torch.ones_like(phi.coefficients[:, 0])
+            self.policy.w, error = self.sarsa.update(self.policy.w, rows, self.policy.temperature, step_scale)
+            cooled = self.policy.temperature * self.temperature_decay**num_episodes
+            self.policy.temperature = cooled.clamp(min=self.temperature_final)
             scalars["td_error"] = error.item()
             is_first = self.updates == 0 and self.windows == 0
             is_full = self.window_episodes >= (self.initial_episodes if is_first else self.relearning_episodes)
@@ -376,7 +415,10 @@ class QPAMDP(Learner):
         varying = (self.high - self.low > 1e-6).nonzero().squeeze(-1)
         inputs = varying if self.features is None else varying.new_tensor(self.features)
         for basis in (self.policy.phi, self.policy.psi):
-            basis.fit(inputs, self.low[inputs], self.high[inputs])
+            low, high = self.low[inputs], self.high[inputs]
+            if self.feature_range is not None:
+                low, high = (torch.full_like(low, side) for side in self.feature_range)
+            basis.fit(inputs, low, high)
         self.policy.widen()
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
@@ -418,6 +460,7 @@ class QPAMDP(Learner):
             self.windows_since_best += 1
         if self._phase_is_over():
             self.phase.fill_(PARAMETERS if self.phase == SARSA else SARSA)
+            self.policy.samples_discrete.fill_(bool(self.phase == SARSA) or self.samples_in_parameter_phase)
             self.best_return.fill_(-torch.inf)
             self.windows.zero_()
             self.windows_since_best.zero_()

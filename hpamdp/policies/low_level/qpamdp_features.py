@@ -78,6 +78,14 @@ class FourierBasis(SizedByData):
         self.width = (high - low).clamp(min=1e-6)
         self.coefficients = fourier_coefficients(len(inputs), self.order, self.max_coupled).to(low)
 
+    def step_scale(self) -> Tensor:
+        """Return the factor 1 / ||c|| on the step of each feature's weight, 1 for the constant, `[num_features]`.
+
+        Source: Konidaris, Osentoski and Thomas 2011, section 4.
+        """
+        norm = self.coefficients.norm(dim=-1)
+        return 1.0 / torch.where(norm > 0.0, norm, 1.0)
+
     def forward(self, observation: Tensor) -> Tensor:
         """Return the features `[*B, num_features]` of observations `[*B, observation_dim]`."""
         unit = ((observation[..., self.inputs] - self.low) / self.width).clamp(0.0, 1.0)
