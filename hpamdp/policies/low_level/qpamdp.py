@@ -9,8 +9,9 @@ Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learni
 on the step: Dabney and Barto 2012, *Adaptive Step-Size for Online Temporal Difference Learning*.
 
 Differs from the source:
-- all environments learn together: Sarsa makes one update per time step, the mean over the environments, and the bound
-  on its step size holds for that mean; eNAC accumulates its regression as normal equations, with ridge regularisation;
+- all environments learn together: Sarsa makes one update per time step and group of environments, the mean over the
+  group (all of them by default), and the bound on its step size holds for that mean; eNAC accumulates its regression as
+  normal equations, with ridge regularisation;
 - the value of the next discrete action is its expectation under the softmax where that action is not in the batch: in
   the batch's last column and where an episode is truncated;
 - the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to `feature_range` or to its
@@ -124,13 +125,22 @@ class SarsaLambda(SizedByData):
         step_size: largest step size.
         step_bound: Dabney and Barto's bound on it: `each_step`, recomputed for every update and whatever its sign, or
             `non_increasing`: the smallest so far of the updates that reduce the error.
+        envs_per_update: environments whose mean an update is; None: all of them.
     """
 
     traces: Tensor
     step_size: Tensor
 
-    def __init__(self, gamma: float, trace_decay: float, step_size: float, step_bound: StepBound) -> None:
+    def __init__(
+        self,
+        gamma: float,
+        trace_decay: float,
+        step_size: float,
+        step_bound: StepBound,
+        envs_per_update: int | None = None,
+    ) -> None:
         super().__init__()
+        self.envs_per_update = envs_per_update
         self.gamma = gamma
         self.trace_decay = trace_decay
         self.step_bound = step_bound
@@ -138,14 +148,14 @@ class SarsaLambda(SizedByData):
         self.register_buffer("traces", torch.zeros(0, 1, 1))
 
     def update(self, w: Tensor, rows: TensorDict, temperature: Tensor, step_scale: Tensor) -> tuple[Tensor, Tensor]:
-        """Make one update for each time step of a batch.
+        """Make the updates of a batch: one for each time step and group of `envs_per_update` environments.
 
         Args:
             w: weights `[num_discrete, num_features]`.
-            temperature: of the softmax policy, `[]`.
-            step_scale: factors on the steps of the features' weights, `[num_features]`.
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
                 `done` and `mask` `[N, T]`; only the rows in `mask` count.
+            temperature: of the softmax policy, `[]`.
+            step_scale: factors on the steps of the features' weights, `[num_features]`.
 
         Returns:
             The new weights and the mean squared temporal-difference error.
@@ -153,33 +163,55 @@ class SarsaLambda(SizedByData):
         num_envs, num_steps = rows.shape
         if self.traces.shape != (num_envs, *w.shape):
             self.traces = w.new_zeros(num_envs, *w.shape)
-        envs = torch.arange(num_envs, device=w.device)
+        # The action at the next time step; -1 in the last column, where it is not known.
+        next_discrete = F.pad(rows["discrete"][:, 1:], (0, 1), value=-1)
+        size = num_envs if self.envs_per_update is None else self.envs_per_update
+        groups = [{name: rows[name][i : i + size] for name in rows.keys()} for i in range(0, num_envs, size)]
         errors: list[Tensor] = []
         for t in range(num_steps):
-            row = rows[:, t]
-            phi = row["phi"]
-            next_phi = row["next_phi"]
-            discrete = row["discrete"]
-            weight = row["mask"] / row["mask"].sum().clamp(min=1)
-            self.traces *= self.gamma * self.trace_decay
-            self.traces[envs, discrete] += phi
-
-            next_q = next_phi @ w.T
-            next_probs = (next_q / temperature).softmax(-1)
-            if t + 1 < num_steps:
-                taken = F.one_hot(rows["discrete"][:, t + 1], len(w))
-                next_probs = torch.where(row["done"].unsqueeze(-1), next_probs, taken)
-            next_weight = self.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
-            error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
-
-            # Dabney and Barto's bound: the mean change of the errors that a step of size 1 would cause.
-            next_change = torch.einsum("nkf,nf->nk", self.traces, next_phi * step_scale)
-            change = (next_weight * next_change).sum(-1) - (self.traces[envs, discrete] * step_scale * phi).sum(-1)
-            step_size = self._bounded((change * weight).sum())
-            w = w + step_size * step_scale * torch.einsum("n,nkf->kf", error * weight, self.traces)
-            self.traces[row["done"]] = 0.0
-            errors.append((error.square() * weight).sum())
+            for group, taken, traces in zip(groups, next_discrete.split(size), self.traces.split(size), strict=True):
+                row = {name: values[:, t] for name, values in group.items()}
+                w, error = self._updated(w, row, taken[:, t], traces, temperature, step_scale)
+                errors.append(error)
         return w, torch.stack(errors).mean()
+
+    def _updated(
+        self,
+        w: Tensor,
+        row: dict[str, Tensor],
+        next_discrete: Tensor,
+        traces: Tensor,
+        temperature: Tensor,
+        step_scale: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the weights after one update, and the mean squared error before it; change the traces in place.
+
+        Args:
+            w, temperature, step_scale: as in `update`.
+            row: of a group of environments, each `[n, ...]`.
+            next_discrete: what they choose next, `[n]`; -1 where it is not known.
+            traces: of the group, `[n, num_discrete, num_features]`.
+        """
+        phi, next_phi, discrete = row["phi"], row["next_phi"], row["discrete"]
+        envs = torch.arange(len(traces), device=w.device)
+        weight = row["mask"] / row["mask"].sum().clamp(min=1)
+        traces *= self.gamma * self.trace_decay
+        traces[envs, discrete] += phi
+
+        next_q = next_phi @ w.T
+        is_known = (next_discrete >= 0) & ~row["done"]
+        taken = F.one_hot(next_discrete.clamp(min=0), len(w))
+        next_probs = torch.where(is_known.unsqueeze(-1), taken, (next_q / temperature).softmax(-1))
+        next_weight = self.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
+        error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
+
+        # Dabney and Barto's bound: the mean change of the errors that a step of size 1 would cause.
+        next_change = torch.einsum("nkf,nf->nk", traces, next_phi * step_scale)
+        change = (next_weight * next_change).sum(-1) - (traces[envs, discrete] * step_scale * phi).sum(-1)
+        step_size = self._bounded((change * weight).sum())
+        w = w + step_size * step_scale * torch.einsum("n,nkf->kf", error * weight, traces)
+        traces[row["done"]] = 0.0
+        return w, (error.square() * weight).sum()
 
     def _bounded(self, change: Tensor) -> Tensor:
         """Return the step size, given how a step of size 1 changes the error, `[]`."""
@@ -315,6 +347,7 @@ class QPAMDP(Learner):
         step_size: PositiveFloat,
         step_scaling: bool,
         step_bound: StepBound,
+        envs_per_update: PositiveInt | None,
         temperature: PositiveFloat,
         temperature_final: PositiveFloat,
         temperature_decay: PositiveFraction,
@@ -357,7 +390,7 @@ class QPAMDP(Learner):
         phi = FourierBasis(phi_order, phi_max_coupled)
         psi = FourierBasis(psi_order, psi_max_coupled)
         self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean, initial_parameters)
-        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, step_bound)
+        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, step_bound, envs_per_update)
         self.enac = NaturalActorCritic(ridge)
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf))

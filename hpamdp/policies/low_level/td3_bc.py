@@ -5,9 +5,13 @@ on the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twin cr
 (Fujimoto et al. 2018, arXiv 1802.09477). Which discrete actions are allowed: discrete BCQ (Fujimoto et al. 2019, arXiv
 1910.01708, equation in section 4).
 
-Differs from the sources: every discrete action has its own parameters, so the actor increases the values of all
-discrete actions, each weighted by its frequency in the data; the distance from the data is that of the recorded
-action's own parameters.
+Differs from the sources:
+- every discrete action has its own parameters, so the actor increases the values of all discrete actions, each weighted
+  by its frequency in the data; the distance from the data is that of the recorded action's own parameters;
+- the actor increases the minimum of both critics, not the first one's value;
+- states are not normalised, as problems scale their observations;
+- by default the values weigh twice as much: `behaviour_weight` is 1 / alpha, 0.2 where the source has alpha = 2.5, that
+  is 0.4.
 
 TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, without a discrete choice.
 """
