@@ -11,7 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, SarsaLambda
-from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients
+from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients, num_fourier_features
 from hpamdp.specs import PAMDPSpecs
 
 # Two discrete actions with a parameter each and one without.
@@ -76,6 +76,7 @@ def test_the_fourier_basis_has_every_term_of_few_enough_inputs(num_inputs, order
     rows = fourier_coefficients(num_inputs, order, max_coupled).long().tolist()
     everything = itertools.product(range(order + 1), repeat=num_inputs)
     expected = [row for row in everything if sum(c > 0 for c in row) <= max_coupled]
+    assert num_fourier_features(num_inputs, order, max_coupled) == len(rows)
     assert sorted(map(tuple, rows)) == sorted(expected) and rows[0] == [0] * num_inputs
 
 
@@ -92,6 +93,13 @@ def test_features_are_cosines_of_the_varying_entries_scaled_to_their_ranges():
 def test_entries_outside_the_observation_are_refused():
     with pytest.raises(ValueError, match="entries 0 to 1"):
         make(features=[0, 2])
+
+
+def test_a_regression_that_would_not_fit_into_memory_is_refused():
+    many = PAMDPSpecs(4, (), (1,) * 1024, (0.0,) * 1024, (1.0,) * 1024)
+    with pytest.raises(ValueError, match=r"psi_order=3: the regression .* 68619 coefficients, more than 16384"):
+        make(many, psi_order=3, psi_max_coupled=2)
+    make(many, psi_order=1, psi_max_coupled=1)
 
 
 def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:

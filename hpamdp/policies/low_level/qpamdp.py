@@ -37,7 +37,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
-from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData
+from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData, num_fourier_features
 from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
 from hpamdp.specs import PAMDPSpecs
@@ -46,6 +46,9 @@ from hpamdp.specs import PAMDPSpecs
 RAW = "raw_parameters"
 
 StepBound = Literal["each_step", "non_increasing"]
+
+# Coefficients in eNAC's regression, whose normal equations are a square of them: 2 GB.
+MAX_REGRESSORS = 16_384
 
 # The phases: what is being learned.
 SARSA = 0
@@ -368,6 +371,14 @@ class QPAMDP(Learner):
         if features is not None and not all(i < specs.observation_dim for i in features):
             last = specs.observation_dim - 1
             raise ValueError(f"features={features}: the observation has entries 0 to {last}; use null for all of them")
+        num_inputs = specs.observation_dim if features is None else len(features)
+        num_regressors = specs.num_parameters * num_fourier_features(num_inputs, psi_order, psi_max_coupled)
+        num_regressors += num_fourier_features(num_inputs, phi_order, phi_max_coupled)
+        if num_regressors > MAX_REGRESSORS:
+            raise ValueError(
+                f"psi_order={psi_order}: the regression for the parameters would have {num_regressors} coefficients, "
+                f"more than {MAX_REGRESSORS}; use fewer features, lower orders, or lower psi_max_coupled and phi_max_coupled"
+            )
         if feature_range is not None and not feature_range[0] < feature_range[1]:
             raise ValueError(f"feature_range={feature_range}: the first number must be less than the second")
         self.features = features

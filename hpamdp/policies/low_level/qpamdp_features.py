@@ -42,6 +42,11 @@ def fourier_coefficients(num_inputs: int, order: int, max_coupled: int) -> Tenso
     return torch.tensor(rows, dtype=torch.float32)
 
 
+def num_fourier_features(num_inputs: int, order: int, max_coupled: int) -> int:
+    """Return how many rows `fourier_coefficients` has."""
+    return sum(math.comb(num_inputs, coupled) * order**coupled for coupled in range(min(max_coupled, num_inputs) + 1))
+
+
 class FourierBasis(SizedByData):
     """Cosine features cos(pi c.u) of some entries of the observation, scaled to u in [0, 1].
 
