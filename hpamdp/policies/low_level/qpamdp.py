@@ -377,7 +377,7 @@ class QPAMDP(Learner):
         if num_regressors > MAX_REGRESSORS:
             raise ValueError(
                 f"psi_order={psi_order}: the regression for the parameters would have {num_regressors} coefficients, "
-                f"more than {MAX_REGRESSORS}; use fewer features, lower orders, or lower psi_max_coupled and phi_max_coupled"
+                f"more than {MAX_REGRESSORS}; use fewer features, or lower orders of psi and phi"
             )
         if feature_range is not None and not feature_range[0] < feature_range[1]:
             raise ValueError(f"feature_range={feature_range}: the first number must be less than the second")
