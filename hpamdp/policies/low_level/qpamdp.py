@@ -8,6 +8,10 @@ algorithm 1 and section 5; eNAC: Peters and Schaal 2008, *Natural Actor-Critic*,
 Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learning using the Fourier Basis*; the bound
 on the step: Dabney and Barto 2012, *Adaptive Step-Size for Online Temporal Difference Learning*.
 
+Where random actions do not lead everywhere, as on Platform, give `feature_range`: entries beyond the range that the
+warm-up saw are clipped, so that the learner cannot tell states beyond it apart. Many parallel environments then want a
+small `envs_per_update`, as Sarsa's step is no longer for a mean over more of them.
+
 Differs from the source:
 - all environments learn together: Sarsa makes one update per time step and group of environments, the mean over the
   group (all of them by default), and the bound on its step size holds for that mean; eNAC accumulates its regression as
