@@ -18,8 +18,11 @@ class PAMDPSpecs:
     Attributes:
         observation_dim: length of the observation.
         option_names: the options that the agent chooses from at a decision; none where there is no choice.
-        parameter_dims: how many parameters each key takes, `num_keys` entries; they lie side by side in the action.
+        parameter_dims: how many parameters each discrete action takes, `num_discrete` entries; they lie side by side.
         parameter_low, parameter_high: bounds of all parameters, `sum(parameter_dims)` entries.
+        initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the parameters
+            in [-1, 1] that the field starts this problem with; None where there is no such convention.
+        initial_bias: what it adds, `num_parameters` entries.
     """
 
     observation_dim: int
@@ -27,6 +30,8 @@ class PAMDPSpecs:
     parameter_dims: tuple[int, ...]
     parameter_low: tuple[float, ...]
     parameter_high: tuple[float, ...]
+    initial_weight: tuple[tuple[float, ...], ...] | None = None
+    initial_bias: tuple[float, ...] | None = None
 
     @property
     def num_options(self) -> int:
@@ -35,19 +40,31 @@ class PAMDPSpecs:
 
     @property
     def num_discrete(self) -> int:
-        """How many keys (discrete actions) there are."""
+        """How many discrete actions there are."""
         return len(self.parameter_dims)
 
     @property
     def num_parameters(self) -> int:
-        """How many parameters all keys take together."""
+        """How many parameters all discrete actions take together."""
         return sum(self.parameter_dims)
 
     @property
+    def parameter_owner(self) -> Tensor:
+        """Return int64 `[num_parameters]`: the discrete action that each parameter belongs to."""
+        return torch.repeat_interleave(torch.arange(self.num_discrete), torch.tensor(self.parameter_dims))
+
+    @property
     def parameter_mask(self) -> Tensor:
-        """Return bool `[num_keys, num_parameters]`: which parameters are each key's own."""
-        owner = torch.repeat_interleave(torch.arange(self.num_discrete), torch.tensor(self.parameter_dims))
-        return owner == torch.arange(self.num_discrete).unsqueeze(-1)
+        """Return bool `[num_discrete, num_parameters]`: which parameters are each discrete action's own."""
+        return self.parameter_owner == torch.arange(self.num_discrete).unsqueeze(-1)
+
+    @property
+    def parameter_slots(self) -> Tensor:
+        """Return int64 `[num_discrete, max(parameter_dims)]`: where each discrete action's own parameters lie.
+
+        Where it has fewer than the maximum, slots of other actions follow.
+        """
+        return (~self.parameter_mask).to(torch.int8).argsort(dim=-1, stable=True)[:, : max(self.parameter_dims)]
 
     def to_unit(self, parameters: Tensor) -> Tensor:
         """Map parameters `[*B, num_parameters]` from their bounds to [-1, 1]."""
@@ -61,17 +78,37 @@ class PAMDPSpecs:
 
     def with_option_observed(self) -> PAMDPSpecs:
         """Return the specs of a learner whose observation ends in the one-hot option."""
-        return replace(self, observation_dim=self.observation_dim + self.num_options)
+        weight = self.initial_weight
+        if weight is not None:
+            weight = tuple((*row, *[0.0] * self.num_options) for row in weight)
+        return replace(self, observation_dim=self.observation_dim + self.num_options, initial_weight=weight)
 
     @classmethod
     def from_env(cls, env: EnvBase) -> PAMDPSpecs:
-        """Read the sizes off an environment whose action has the leaves `keys.KEY` and `keys.DURATION`."""
+        """Read the sizes off a `PAMDPEnv`.
+
+        Raises:
+            ValueError: its initial parameters do not fit its observation and action.
+        """
         action = env.full_action_spec_unbatched
-        duration = action[keys.PARAMETERS]
+        parameters = action[keys.PARAMETERS]
+        observation_dim = env.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
+        initial = env.initial_parameters()
+        weight = bias = None
+        if initial is not None:
+            shapes = [list(part.shape) for part in initial]
+            num_parameters = sum(env.parameter_dims)
+            expected = [[num_parameters, observation_dim], [num_parameters]]
+            if shapes != expected:
+                raise ValueError(f"initial_parameters: shapes {shapes}, but must be {expected}")
+            weight = tuple(tuple(row) for row in initial[0].tolist())
+            bias = tuple(initial[1].tolist())
         return cls(
-            observation_dim=env.observation_spec_unbatched[keys.OBSERVATION].shape[-1],
+            observation_dim=observation_dim,
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
             parameter_dims=tuple(env.parameter_dims),
-            parameter_low=tuple(duration.space.low.flatten().tolist()),
-            parameter_high=tuple(duration.space.high.flatten().tolist()),
+            parameter_low=tuple(parameters.space.low.flatten().tolist()),
+            parameter_high=tuple(parameters.space.high.flatten().tolist()),
+            initial_weight=weight,
+            initial_bias=bias,
         )

@@ -25,7 +25,9 @@ SHORT = {
     "td3_bc": ["low.warmup_frames=64", "low.batch_size=16"],
     "hsac": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "hyar": ["low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.updates_per_frame=0.05", "low.batch_size=16"],
+    "paddpg": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
+    "pdqn_published": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
 # What has nothing to learn.

@@ -14,7 +14,8 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
-    hidden_dims=[32, 32], critic_hidden_dims=[32, 32], initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
+    hidden_dims=[32, 32], critic_hidden_dims=[32, 32], initial_parameters="none",
+    initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
     max_scale=1.0, epochs=4, minibatch_size=256, clip=0.2, gamma=0.9, gae_lambda=0.8, lr=3e-3, lr_final=3e-4,
     critic_weight=0.5, discrete_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_frames=40_000,
     max_grad_norm=1.0,

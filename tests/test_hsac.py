@@ -16,7 +16,8 @@ from hpamdp.policies.shared.hybrid_actor import HybridDistribution
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
-    hidden_dims=[64, 64], min_scale=0.01, max_scale=1.0, discrete_temperature=0.05, parameter_temperature=0.03,
+    hidden_dims=[64, 64], initial_parameters="none",
+    min_scale=0.01, max_scale=1.0, discrete_temperature=0.05, parameter_temperature=0.03,
     tune_discrete_temperature=True, tune_parameter_temperature=True, discrete_target_entropy=0.1,
     parameter_target_entropy=-1.5, temperature_lr=3e-3, warmup_frames=1000, buffer_size=20_000, batch_size=64,
     updates_per_frame=0.12, policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
@@ -58,11 +59,11 @@ def test_the_learner_finds_the_best_discrete_action_and_its_parameters():
 
 def test_densities_are_those_of_torchrls_squashed_gaussian_and_finite_at_the_bounds():
     mean, scale = torch.randn(64, 3), torch.rand(64, 3) + 0.1
-    mask = SPECS.parameter_mask.float()
-    unit, log_density = HybridDistribution(torch.zeros(64, 3), mean, scale.log(), mask).sample_squashed()
+    owner = SPECS.parameter_owner
+    unit, log_density = HybridDistribution(torch.zeros(64, 3), mean, scale.log(), owner).sample_squashed()
     expected = TanhNormal(mean, scale, event_dims=0).log_prob(unit)
     torch.testing.assert_close(log_density, expected, rtol=1e-3, atol=1e-3)
-    far = HybridDistribution(torch.zeros(1, 3), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1).log(), mask)
+    far = HybridDistribution(torch.zeros(1, 3), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1).log(), owner)
     assert far.sample_squashed()[1].isfinite().all()
 
 

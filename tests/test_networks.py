@@ -1,8 +1,99 @@
 """Networks that several learners share, and sampling from their output."""
 
-import torch
+from dataclasses import replace
 
-from hpamdp.policies.shared.networks import sample_index
+import pytest
+import torch
+from torch import Tensor
+
+from hpamdp.policies.shared import networks
+from hpamdp.policies.shared.networks import HybridCritics, InitialLayer, sample_index
+from hpamdp.specs import PAMDPSpecs
+
+
+def specs_of(*dims: int) -> PAMDPSpecs:
+    return PAMDPSpecs(4, (), dims, (-1.0,) * sum(dims), (1.0,) * sum(dims))
+
+
+def passes_one_by_one(critics: HybridCritics, specs: PAMDPSpecs, state: Tensor, unit: Tensor) -> Tensor:
+    """Return output k of a whole pass that sees the state and the own parameters of k, for every k."""
+    own = (unit * mask for mask in specs.parameter_mask.float())
+    return torch.stack([critics.net(torch.cat([state, x], -1))[..., k] for k, x in enumerate(own)], -1)
+
+
+@pytest.mark.parametrize("dims", [(1, 1, 1), (2, 0, 1), (0, 3), (0, 0), (1,) * 40])
+@pytest.mark.parametrize("hidden_dims", [[], [16], [16, 8]])
+def test_multi_pass_values_and_their_gradients_are_those_of_separate_passes(dims, hidden_dims):
+    torch.manual_seed(0)
+    specs = specs_of(*dims)
+    critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
+    state, unit = torch.randn(7, 4), (torch.rand(7, sum(dims)) * 2 - 1).requires_grad_()
+    inputs = [unit, *critics.parameters()]
+    results = []
+    for q in (critics(state, unit), passes_one_by_one(critics, specs, state, unit)):
+        gradients = torch.autograd.grad(q.square().sum(), inputs, allow_unused=True)
+        results.append((q, [None if gradient is None else gradient for gradient in gradients]))
+    torch.testing.assert_close(results[0][0], results[1][0])
+    for shared, separate in zip(results[0][1], results[1][1], strict=True):
+        if shared is not None and separate is not None:
+            torch.testing.assert_close(shared, separate, rtol=1e-4, atol=1e-5)
+
+
+def test_many_discrete_actions_are_passed_in_pieces_with_the_same_values(monkeypatch):
+    specs = specs_of(*(1,) * 50)
+    critics = HybridCritics(specs, 2, [16], is_multipass=True)
+    state, unit = torch.randn(20, 4), torch.rand(20, 50) * 2 - 1
+    whole = critics(state, unit)
+    monkeypatch.setattr(networks, "_MAX_PASSES", 150)
+    torch.testing.assert_close(critics(state, unit), whole)
+
+
+def test_passes_of_a_thousand_discrete_actions_take_no_memory_of_their_square():
+    specs = specs_of(*(1,) * 1000)
+    critics = HybridCritics(specs, 1, [8], is_multipass=True)
+    largest = 0
+
+    class Largest(torch.utils._python_dispatch.TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            nonlocal largest
+            out = func(*args, **(kwargs or {}))
+            for part in out if isinstance(out, (tuple, list)) else [out]:
+                if isinstance(part, Tensor):
+                    largest = max(largest, part.numel())
+            return out
+
+    with Largest():
+        critics(torch.randn(16, 4), (torch.rand(16, 1000) * 2 - 1).requires_grad_()).sum().backward()
+    assert largest <= 16 * 1000 * 8, "[B, K, H] and not [B, K, K]"
+
+
+WEIGHT = ((0.5, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0))
+INITIAL = replace(specs_of(1, 1), initial_weight=WEIGHT, initial_bias=(0.1, -0.8))
+
+
+def test_the_initial_layer_is_linear_and_frozen():
+    layer = InitialLayer(INITIAL, "domain", is_squashed=False)
+    state = torch.randn(9, 4)
+    expected = torch.stack([0.1 + 0.5 * state[:, 0], -0.8 + 2.0 * state[:, 3]], -1)
+    torch.testing.assert_close(layer(state), expected)
+    assert not list(layer.parameters())
+
+
+def test_squashing_the_initial_layers_output_gives_the_initial_parameters_short_of_the_bounds():
+    layer = InitialLayer(INITIAL, "domain", is_squashed=True)
+    state = torch.rand(9, 4)
+    expected = torch.stack([0.1 + 0.5 * state[:, 0], -0.8 + 2.0 * state[:, 3]], -1).clamp(-0.99, 0.99)
+    torch.testing.assert_close(layer(state).tanh(), expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("specs", "choice"), [(INITIAL, "none"), (specs_of(1, 1), "domain"), (specs_of(1), "none")])
+def test_without_initial_parameters_the_network_stays_as_it_is(specs, choice):
+    layer = InitialLayer(specs, choice, is_squashed=False)
+    assert layer(torch.randn(9, 4)) == 0.0
+    output = torch.nn.Linear(3, 1)
+    before = output.weight.clone()
+    layer.shrink(output)
+    assert torch.equal(output.weight, before)
 
 
 def test_indices_are_sampled_with_their_probabilities():

@@ -1,14 +1,17 @@
 """P-DQN and MP-DQN: multi-pass critics, targets, n-step returns, and learning a problem with a known optimum."""
 
+from dataclasses import replace
+
 import pytest
 import torch
-from conftest import global_generators_unmoved
+from conftest import global_generators_unmoved, make_config
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_steps import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
-from hpamdp.policies.low_level.pdqn import PDQN, InvertingGradients
+from hpamdp.policies.low_level.pdqn import PDQN
+from hpamdp.policies.shared.networks import InvertingGradients
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
@@ -16,6 +19,7 @@ OPTIONS = dict(
     n_step=1, bounding="tanh", hidden_dims=[64, 64], warmup_frames=1000, buffer_size=20_000, batch_size=64,
     updates_per_frame=0.12, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
     max_grad_norm=None, parameter_noise=0.1, epsilon_final=0.1, epsilon_frames=3000,
+    epsilon_episodes=None, reward_scale=1.0, initial_parameters="none",
 )  # fmt: skip
 PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
 
@@ -200,3 +204,73 @@ def test_gradients_are_clipped_to_the_given_norm():
     learner.train_step(sample())
     norm = torch.stack([p.grad.norm() for p in learner.critics.parameters()]).norm()
     assert norm <= 1.001e-3
+
+
+def test_multi_pass_stores_the_chosen_actions_parameters_alone_and_samples_them_with_zeros():
+    learner = make(warmup_frames=10_000)
+    td = one_step_rows(learner, 50)
+    learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
+    assert learner.buffer[:]["unit"].shape == (50, 2), "the largest number of parameters of an action"
+    learner.batch_size = 400
+    rows = next(iter(learner.sample_batches(1)))
+    own = SPECS.parameter_mask[rows["discrete"]]
+    assert rows["unit"].shape == (400, 3) and (rows["unit"][~own] == 0.0).all()
+    played = {tuple(unit) for unit in (SPECS.to_unit(td[keys.PARAMETERS])[:, 0]).tolist()}
+    stored = [tuple(row) for row in rows["unit"].tolist()]
+    for discrete, row in zip(rows["discrete"].tolist(), stored, strict=True):
+        mine = SPECS.parameter_mask[discrete].nonzero().flatten().tolist()
+        assert any(all(unit[i] == row[i] for i in mine) for unit in played)
+
+
+def test_single_pass_stores_all_parameters():
+    learner = make(multipass=False, warmup_frames=10_000)
+    td = one_step_rows(learner, 50)
+    learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
+    torch.testing.assert_close(learner.buffer[:]["unit"], SPECS.to_unit(td[keys.PARAMETERS])[:, 0])
+
+
+WEIGHT = ((0.5, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("bounding", ["tanh", "inverting_gradients"])
+def test_parameters_start_at_the_problems_initial_ones_and_can_move(bounding):
+    specs = replace(SPECS, initial_weight=WEIGHT, initial_bias=(0.1, 0.8, -0.6))
+    learner = make(specs, bounding=bounding, initial_parameters="domain")
+    state = torch.rand(50, 4) * 2 - 1
+    expected = torch.stack([0.1 + 0.5 * state[:, 0], torch.full((50,), 0.8), torch.full((50,), -0.6)], -1)
+    before = learner.actor(state)
+    torch.testing.assert_close(before, expected, atol=0.02, rtol=0.0)
+    learner._update_actor(state)
+    assert (learner.actor(state) != before).any()
+
+
+def test_epsilon_can_fall_with_the_episodes():
+    learner = make(warmup_frames=20, updates_per_frame=0.01, epsilon_episodes=100, epsilon_final=0.2)
+    learn(learner, 1, size=50)
+    assert learner.policy.epsilon == pytest.approx(1.0 - 0.8 * 0.5)
+    learn(learner, 2, size=50)
+    assert learner.policy.epsilon == pytest.approx(0.2)
+
+
+def test_the_scale_of_rewards_changes_the_stored_ones_and_not_the_value():
+    torch.manual_seed(0)
+    learner = make(reward_scale=0.1, warmup_frames=10_000)
+    td = one_step_rows(learner, 50)
+    learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
+    torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * td["next", keys.REWARD].flatten())
+    state = torch.randn(5, 4)
+    q = learner.critics(state, learner.actor(state)).amin(0).amax(-1)
+    torch.testing.assert_close(learner.value(state), 10.0 * q)
+
+
+def test_the_published_recipe_has_the_published_settings_and_runs_where_there_are_no_initial_parameters():
+    options = make_config(["low=pdqn_published", "high=none", "env=platform"]).low.options
+    expected = dict(
+        bounding="inverting_gradients", max_grad_norm=10.0, critic_lr=1e-3, actor_lr=1e-4, critic_tau=0.1,
+        actor_tau=0.001, epsilon_final=0.01, epsilon_episodes=1000, parameter_noise=0.0, twin_q=False,
+        target_smoothing=0.0, policy_delay=1, initial_parameters="domain", multipass=True,
+    )  # fmt: skip
+    assert {name: options[name] for name in expected} == expected
+    learner = make(**{name: value for name, value in options.items() if name != "budget"})
+    learn(learner, 3)
+    assert learner.updates > 0

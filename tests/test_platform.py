@@ -41,9 +41,17 @@ def test_specs_hold(num):
 def test_learners_see_three_discrete_actions_of_one_parameter_each_and_no_options():
     env = PlatformEnv(2)
     specs = PAMDPSpecs.from_env(env)
-    assert specs == PAMDPSpecs(9, (), (1, 1, 1), (0.0, 0.0, 0.0), (30.0, 720.0, 430.0))
+    assert specs == PAMDPSpecs(
+        9, (), (1, 1, 1), (0.0, 0.0, 0.0), (30.0, 720.0, 430.0), specs.initial_weight, specs.initial_bias
+    )
     assert env.discrete_names == ("run", "hop", "leap")
     assert not env.has_choice
+
+
+def test_learners_conventionally_start_with_run_3_hop_10_leap_400():
+    specs = PAMDPSpecs.from_env(PlatformEnv(1))
+    assert specs.initial_weight is not None and not torch.tensor(specs.initial_weight).any()
+    torch.testing.assert_close(specs.from_unit(torch.tensor(specs.initial_bias)), torch.tensor([3.0, 10.0, 400.0]))
 
 
 def test_a_hand_written_policy_arrives_with_a_return_of_one():

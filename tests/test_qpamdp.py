@@ -1,6 +1,7 @@
 """Q-PAMDP: each of its two learners against known answers, and how they take turns."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, SarsaLambda
-from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients
+from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients, num_fourier_features
 from hpamdp.specs import PAMDPSpecs
 
 # Two discrete actions with a parameter each and one without.
@@ -20,9 +21,13 @@ OPTIONS = dict(
     features=None, phi_order=1, phi_max_coupled=2, psi_order=1, psi_max_coupled=1, warmup_frames=100,
     initial_episodes=100, relearning_episodes=100, gamma=0.9, trace_decay=0.5, step_size=1.0, temperature=0.5,
     parameter_updates=3, patience=2, rollouts=100, natural_step_size=1.0, max_divergence=1.0, ridge=1e-6,
-    initial_mean=0.0, sigma=0.2, sigma_final=0.1, sigma_decay=0.9,
+    initial_mean=0.0, initial_parameters="none",
+    feature_range=None, step_scaling=False, step_bound="each_step", envs_per_update=None,
+    temperature_final=0.01, temperature_decay=1.0,
+    samples_in_parameter_phase=True, sigma=0.2, sigma_final=0.1, sigma_decay=0.9,
 )  # fmt: skip
 
+ONE = torch.ones(1)
 GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)
 
 
@@ -58,8 +63,8 @@ def learn(learner: QPAMDP, num_batches: int, **sizes: int) -> dict[str, float]:
     return scalars
 
 
-def ready(**changes) -> QPAMDP:
-    learner = make(**changes)
+def ready(specs: PAMDPSpecs = SPECS, **changes) -> QPAMDP:
+    learner = make(specs, **changes)
     learn(learner, 1)
     return learner
 
@@ -71,6 +76,7 @@ def test_the_fourier_basis_has_every_term_of_few_enough_inputs(num_inputs, order
     rows = fourier_coefficients(num_inputs, order, max_coupled).long().tolist()
     everything = itertools.product(range(order + 1), repeat=num_inputs)
     expected = [row for row in everything if sum(c > 0 for c in row) <= max_coupled]
+    assert num_fourier_features(num_inputs, order, max_coupled) == len(rows)
     assert sorted(map(tuple, rows)) == sorted(expected) and rows[0] == [0] * num_inputs
 
 
@@ -87,6 +93,13 @@ def test_features_are_cosines_of_the_varying_entries_scaled_to_their_ranges():
 def test_entries_outside_the_observation_are_refused():
     with pytest.raises(ValueError, match="entries 0 to 1"):
         make(features=[0, 2])
+
+
+def test_a_regression_that_would_not_fit_into_memory_is_refused():
+    many = PAMDPSpecs(4, (), (1,) * 1024, (0.0,) * 1024, (1.0,) * 1024)
+    with pytest.raises(ValueError, match=r"psi_order=3: the regression .* 68,619 coefficients, more than 16,384"):
+        make(many, psi_order=3, psi_max_coupled=2)
+    make(many, psi_order=1, psi_max_coupled=1)
 
 
 def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
@@ -107,13 +120,13 @@ def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
 
 def test_sarsa_matches_a_computation_by_hand():
     # One feature, two discrete actions, gamma 0.5, lambda 0.5, a step too small for the bound to matter.
-    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.1, temperature=1.0)
+    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.1, step_bound="each_step")
     w = torch.tensor([[1.0], [2.0]])
     # Environment 0 goes on after the first step, environment 1 ends its episode there.
     phi, next_phi = [[[1.0], [2.0]], [[1.0], [1.0]]], [[[2.0], [1.0]], [[9.0], [2.0]]]
     ends = [[False, True], [True, False]]
     first = sarsa_rows(phi, next_phi, [[0, 1], [1, 0]], [[1.0, 0.0], [0.0, 1.0]], ends, ends)
-    got, _ = sarsa.update(w, first)
+    got, _ = sarsa.update(w, first, ONE, ONE)
     # Step 1: error 1 + 0.5 * (2 * 2) - 1 = 2 along action 0's trace 1; error 0 - 2 = -2 along action 1's trace 1.
     w1 = [1.0 + 0.1 * 0.5 * 2.0, 2.0 - 0.1 * 0.5 * 2.0]
     # Step 2: environment 0 ends with traces (0.25, 2) and error -2 w[1]; environment 1 has traces (1, 0) and an unknown
@@ -127,7 +140,7 @@ def test_sarsa_matches_a_computation_by_hand():
     # The next batch: environment 1's trace goes on, environment 0 begins a new episode; both end.
     ends = [[True], [True]]
     second = sarsa_rows([[[1.0]], [[2.0]]], [[[0.0]], [[0.0]]], [[0], [1]], [[1.0], [1.0]], ends, ends)
-    got, _ = sarsa.update(torch.tensor(w2).unsqueeze(-1), second)
+    got, _ = sarsa.update(torch.tensor(w2).unsqueeze(-1), second, ONE, ONE)
     error_0, error_1 = 1.0 - w2[0], 1.0 - 2.0 * w2[1]
     w3 = [w2[0] + 0.05 * (error_0 + 0.25 * error_1), w2[1] + 0.05 * 2.0 * error_1]
     torch.testing.assert_close(got, torch.tensor(w3).unsqueeze(-1))
@@ -135,12 +148,136 @@ def test_sarsa_matches_a_computation_by_hand():
 
 
 def test_the_bound_shortens_sarsas_step_to_cancel_the_error():
-    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=1.0, temperature=1.0)
+    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=1.0, step_bound="each_step")
     ends = [[True], [True]]
     rows = sarsa_rows([[[3.0]], [[3.0]]], [[[0.0]], [[0.0]]], [[0], [0]], [[6.0], [6.0]], ends, ends)
-    got, error = sarsa.update(torch.zeros(2, 1), rows)
+    got, error = sarsa.update(torch.zeros(2, 1), rows, ONE, ONE)
     torch.testing.assert_close(got, torch.tensor([[2.0], [0.0]]))
     assert error == 36.0
+
+
+def one_row(phi: float, reward: float, done: bool = True) -> TensorDict:
+    """Return one step of one environment with discrete action 0; the next state has the feature 1."""
+    return sarsa_rows([[[phi]]] * 2, [[[1.0]]] * 2, [[0]] * 2, [[reward]] * 2, [[done]] * 2, [[done]] * 2)
+
+
+def test_a_non_increasing_bound_stays_at_the_smallest_so_far_and_heeds_only_updates_that_reduce_the_error():
+    sarsa = SarsaLambda(gamma=1.0, trace_decay=1.0, step_size=1.0, step_bound="non_increasing")
+    w = torch.zeros(2, 1)
+    w, _ = sarsa.update(w, one_row(2.0, 4.0), ONE, ONE)
+    assert sarsa.step_size == 0.25, "the error changes by -2 * 2"
+    torch.testing.assert_close(w[0], torch.tensor([2.0]))
+    sarsa.update(w, one_row(0.5, 1.0), ONE, ONE)
+    assert sarsa.step_size == 0.25, "a bound of 4 does not raise it"
+    # From a feature of 0.1 to one of 1, with the same action next: the error grows by 0.1 * (1 - 0.1).
+    w = torch.tensor([[9.0], [-99.0]])
+    sarsa.update(w, one_row(0.1, 1.0, done=False), ONE, ONE)
+    assert sarsa.step_size == 0.25
+
+
+def test_updates_of_groups_of_environments_follow_one_another():
+    torch.manual_seed(0)
+    rows = TensorDict(
+        {
+            "phi": torch.randn(5, 3, 4),
+            "next_phi": torch.randn(5, 3, 4),
+            "discrete": torch.randint(2, (5, 3)),
+            "reward": torch.randn(5, 3),
+            "terminated": torch.rand(5, 3) < 0.2,
+            "done": torch.rand(5, 3) < 0.4,
+            "mask": torch.rand(5, 3) < 0.8,
+        },
+        [5, 3],
+    )
+    rows["done"] |= rows["terminated"]
+    features = torch.ones(4)
+    grouped = SarsaLambda(0.9, 0.5, 0.1, "each_step", envs_per_update=2)
+    got, _ = grouped.update(torch.zeros(2, 4), rows, ONE, features)
+
+    # By hand: each group has its own traces; a batch of one time step and one group at a time, with its next action.
+    w = torch.zeros(2, 4)
+    groups = [rows[:2], rows[2:4], rows[4:]]
+    alone = [SarsaLambda(0.9, 0.5, 0.1, "each_step") for _ in groups]
+    for sarsa, group in zip(alone, groups, strict=True):
+        sarsa.traces = torch.zeros(len(group), 2, 4)
+    for t in range(3):
+        for sarsa, group in zip(alone, groups, strict=True):
+            row = {name: group[name][:, t] for name in group.keys()}
+            taken = group["discrete"][:, t + 1] if t < 2 else torch.full((len(group),), -1)
+            w, _ = sarsa._updated(w, row, taken, sarsa.traces, ONE, features)
+    torch.testing.assert_close(got, w)
+    torch.testing.assert_close(grouped.traces, torch.cat([sarsa.traces for sarsa in alone]))
+    together, _ = SarsaLambda(0.9, 0.5, 0.1, "each_step").update(torch.zeros(2, 4), rows, ONE, features)
+    assert not torch.allclose(got, together)
+
+
+def test_step_scaling_divides_each_weights_step_by_the_norm_of_its_coefficients():
+    learner = ready(phi_order=2, phi_max_coupled=2, step_scaling=True)
+    phi = learner.policy.phi
+    expected = [1.0 / max(1.0, sum(c * c for c in row) ** 0.5) for row in phi.coefficients.tolist()]
+    torch.testing.assert_close(phi.step_scale(), torch.tensor(expected))
+    scale = torch.tensor([1.0, 0.5])
+    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.01, step_bound="each_step")
+    rows = sarsa_rows([[[1.0, 2.0]]] * 2, [[[0.0, 0.0]]] * 2, [[0]] * 2, [[6.0]] * 2, [[True]] * 2, [[True]] * 2)
+    w, _ = sarsa.update(torch.zeros(2, 2), rows, ONE, scale)
+    torch.testing.assert_close(w[0], torch.tensor([0.06, 0.06]))
+    # With the bound the error is cancelled: 1 + 2 * 2 / 2 = 3 of a step of size 1.
+    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=1.0, step_bound="each_step")
+    w, _ = sarsa.update(torch.zeros(2, 2), rows, ONE, scale)
+    torch.testing.assert_close(w[0] @ torch.tensor([1.0, 2.0]), torch.tensor(6.0))
+
+
+def test_the_temperature_falls_with_the_episodes_of_the_sarsa_phases_alone():
+    learner = ready(temperature=0.5, temperature_decay=0.99, temperature_final=0.1)
+    learn(learner, 1, num_envs=10)
+    assert learner.policy.temperature == pytest.approx(0.5 * 0.99**20)
+    learn(learner, 4, num_envs=10)
+    assert learner.phase == PARAMETERS
+    held = learner.policy.temperature.clone()
+    learn(learner, 1, num_envs=10)
+    assert learner.policy.temperature == held
+    learner.policy.temperature.fill_(0.1)
+    learner.phase.fill_(SARSA)
+    learn(learner, 1, num_envs=10)
+    assert learner.policy.temperature == pytest.approx(0.1), "never below temperature_final"
+
+
+@pytest.mark.parametrize("samples", [True, False])
+def test_discrete_actions_are_sampled_in_the_parameter_phases_only_if_asked(samples):
+    torch.manual_seed(0)
+    learner = ready(samples_in_parameter_phase=samples, temperature=50.0, temperature_final=50.0)
+    observation = TensorDict({keys.OBSERVATION: torch.zeros(200, 2)}, [200])
+    assert learner.policy(observation.clone())[keys.DISCRETE].unique().numel() == 3, "Sarsa's phase"
+    learn(learner, 2, num_envs=50)
+    assert learner.phase == PARAMETERS
+    td = learner.policy(observation.clone())
+    assert td[keys.DISCRETE].unique().numel() == (3 if samples else 1)
+    assert (td[RAW].std(0) > 0.0).all(), "the parameters are always sampled"
+
+
+def test_a_feature_range_sees_states_that_the_warm_up_did_not_reach():
+    learners = [ready(feature_range=feature_range, phi_max_coupled=1) for feature_range in (None, [-2.0, 2.0])]
+    # The warm-up's observations lie in [0, 1].
+    beyond = torch.tensor([[1.0, 0.5], [1.5, 0.5], [2.0, 0.5]])
+    clipped, seen = (learner.policy.phi(beyond) for learner in learners)
+    torch.testing.assert_close(clipped, clipped[:1].expand(3, -1), atol=1e-3, rtol=0.0)
+    assert max(column.unique().numel() for column in seen.T) == 3
+
+
+def test_a_feature_range_without_width_is_refused():
+    with pytest.raises(ValueError, match=r"feature_range=\[1.0, 1.0\]: the first number must be less than the second"):
+        make(feature_range=[1.0, 1.0])
+
+
+def test_means_start_at_the_problems_initial_parameters_instead_of_initial_mean():
+    specs = replace(SPECS, initial_weight=((0.5, 0.0), (0.0, 0.0)), initial_bias=(0.1, -0.8))
+    learner = ready(specs=specs, initial_parameters="domain", initial_mean=0.7)
+    state = torch.rand(9, 2)
+    expected = torch.stack([0.1 + 0.5 * state[:, 0], torch.full((9,), -0.8)], -1)
+    torch.testing.assert_close(learner.policy.mean(state), expected)
+    torch.testing.assert_close(
+        ready(initial_parameters="domain", initial_mean=0.7).policy.mean(state), torch.full((9, 2), 0.7)
+    )
 
 
 def test_the_natural_gradient_finds_the_best_parameters():

@@ -114,6 +114,14 @@ class PAMDPEnv(EnvBase):
         """Return what is known of the episodes that were just reset, first dimension `N`; computed once a run."""
         return {}
 
+    def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
+        """Return the parameters that learners conventionally start this problem with, where there is a convention.
+
+        They are linear in the observation, as the learner sees it: weights `[num_parameters, observation_dim]` and a
+        bias `[num_parameters]`, in units where the parameters' bounds are [-1, 1].
+        """
+        return None
+
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return how episodes `[M]` went, from the leaves `result_keys` of their last steps, each `[M]`.
 

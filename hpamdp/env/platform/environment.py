@@ -71,6 +71,11 @@ class PlatformEnv(CounterEnv[PlatformState]):
         )
         self.noise = noise
 
+    def initial_parameters(self) -> tuple[Tensor, Tensor]:
+        """Return constants: run 3, hop 10, leap 400."""
+        bias = 2.0 * torch.tensor(rules.INITIAL_PARAMETERS) / torch.tensor(rules.PARAMETER_HIGH) - 1.0
+        return torch.zeros(len(bias), len(rules.OBSERVATION_NAMES)), bias
+
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[9]` each."""

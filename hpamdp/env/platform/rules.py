@@ -17,6 +17,8 @@ from torch import Tensor
 RUN, HOP, LEAP = range(3)
 ACTIONS = ("run", "hop", "leap")
 PARAMETER_HIGH = (30.0, 720.0, 430.0)
+# What learners conventionally start with (Masson et al. 2016, and the code of Bester et al. 2019).
+INITIAL_PARAMETERS = (3.0, 10.0, 400.0)
 OUTCOMES = ("on the way", "arrived", "fell", "met an enemy", "time limit")
 ON_THE_WAY, ARRIVED, FELL, MET_ENEMY, TIME_LIMIT = range(5)
 OBSERVATION_NAMES = (

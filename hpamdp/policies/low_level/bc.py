@@ -35,6 +35,7 @@ class BC(ReplayLearner):
         weight_decay: of AdamW.
     """
 
+    stores_own_parameters = True
     modes: ClassVar[tuple[str, ...]] = ("offline",)
 
     def __init__(

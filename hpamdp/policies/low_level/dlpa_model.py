@@ -40,11 +40,8 @@ class Predictor(nn.Module):
         self.first = nn.Linear(first_dim, hidden_dims[0]) if form == "sequential" else None
         in_dim = hidden_dims[0] if form == "sequential" else first_dim
         self.net = EnsembleMLP(num_members, in_dim + parameters_dim, hidden_dims, out_dim)
-        mask = specs.parameter_mask
-        self.register_buffer("mask", mask.float())
-        # The columns of each discrete action's own parameters; where it has fewer than the maximum, columns of other
-        # actions follow, which the mask sets to 0.
-        self.register_buffer("slots", (~mask).to(torch.int8).argsort(dim=-1, stable=True)[:, :max_parameters])
+        self.register_buffer("mask", specs.parameter_mask.float())
+        self.register_buffer("slots", specs.parameter_slots)
 
     def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Apply all members."""

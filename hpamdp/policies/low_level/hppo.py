@@ -33,6 +33,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
 from hpamdp.policies.shared.fractions import FinalLearningRate, Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
+from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
 
@@ -81,6 +82,7 @@ class HPPO(OnPolicy, Learner):
         *,
         hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
         critic_hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
+        initial_parameters: InitialParameters,
         initial_scale: PositiveFloat,
         min_scale: PositiveFloat,
         min_scale_final: PositiveFloat,
@@ -118,7 +120,7 @@ class HPPO(OnPolicy, Learner):
         self.lr_final = lr_final
         self.anneal_frames = anneal_frames
 
-        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), initial_scale)
+        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), initial_scale, initial_parameters)
         self.critic = nn.Sequential(
             encoder(specs.observation_dim, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
         )

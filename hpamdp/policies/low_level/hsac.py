@@ -36,7 +36,7 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridDistribution
-from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
+from hpamdp.policies.shared.networks import HybridCritics, InitialLayer, InitialParameters, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -48,22 +48,33 @@ class HSACActor(nn.Module):
         specs: sizes and bounds of the problem.
         hidden_dims: sizes of the hidden layers.
         scale_range: smallest and largest standard deviation.
+        initial_parameters: `domain`: the squashed means start at the problem's initial parameters, if it has any.
     """
 
-    parameter_mask: Tensor
+    owner: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, hidden_dims: list[int], scale_range: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        hidden_dims: list[int],
+        scale_range: tuple[float, float],
+        initial_parameters: InitialParameters,
+    ) -> None:
         super().__init__()
         self.sizes = [specs.num_discrete, specs.num_parameters, specs.num_parameters]
         self.log_min_scale, self.log_max_scale = (math.log(scale) for scale in scale_range)
         self.net = mlp(specs.observation_dim, hidden_dims, sum(self.sizes))
-        self.register_buffer("parameter_mask", specs.parameter_mask.float(), persistent=False)
+        self.initial = InitialLayer(specs, initial_parameters, is_squashed=True)
+        means = slice(specs.num_discrete, specs.num_discrete + specs.num_parameters)
+        self.initial.shrink(self.net[-1], means)
+        self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
     def forward(self, state: Tensor) -> HybridDistribution:
         """Return the distribution of the action for states `[*B, observation_dim]`."""
         logits, mean, raw_scale = self.net(state).split(self.sizes, -1)
+        mean = mean + self.initial(state)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
-        return HybridDistribution(logits.log_softmax(-1), mean, log_scale, self.parameter_mask)
+        return HybridDistribution(logits.log_softmax(-1), mean, log_scale, self.owner)
 
 
 class HSACPolicy(TensorDictModuleBase):
@@ -95,7 +106,10 @@ class HSACPolicy(TensorDictModuleBase):
 class HSAC(ReplayLearner):
     """Soft policy iteration over discrete actions and their parameters, from a replay buffer of its own."""
 
+    stores_own_parameters = True
+
     policy: HSACPolicy
+    parameter_dims: Tensor
 
     def __init__(
         self,
@@ -103,6 +117,7 @@ class HSAC(ReplayLearner):
         device: torch.device,
         *,
         hidden_dims: list[PositiveInt],
+        initial_parameters: InitialParameters,
         min_scale: PositiveFloat,
         max_scale: PositiveFloat,
         discrete_temperature: PositiveFloat,
@@ -135,10 +150,11 @@ class HSAC(ReplayLearner):
         )
         self.discrete_target_entropy = discrete_target_entropy * math.log(specs.num_discrete)
         self.parameter_target_entropy = parameter_target_entropy
+        self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
         self.policy_delay = policy_delay
         self.tau = tau
 
-        self.actor = HSACActor(specs, hidden_dims, (min_scale, max_scale))
+        self.actor = HSACActor(specs, hidden_dims, (min_scale, max_scale), initial_parameters)
         self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_discrete_temperature = nn.Parameter(
@@ -173,11 +189,10 @@ class HSAC(ReplayLearner):
         discrete_weight, parameter_weight = self.temperatures()
         distribution: HybridDistribution = self.actor(state)
         unit, log_density = distribution.sample_squashed()
-        mask = distribution.parameter_mask
         log_probs = distribution.discrete_log_probs
         # Of each discrete action's own parameters together, `[B, num_discrete]`.
-        own_log_density = log_density @ mask.T
-        own_target = self.parameter_target_entropy * mask.sum(-1)
+        own_log_density = distribution.sum_of_own(log_density)
+        own_target = self.parameter_target_entropy * self.parameter_dims
         q = critics(state, unit).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
         probs = log_probs.exp()
         discrete_excess = -(probs * log_probs).sum(-1) - self.discrete_target_entropy

@@ -35,6 +35,8 @@ from hpamdp.specs import PAMDPSpecs
 class IQL(ReplayLearner):
     """Twin critics, a state value and an advantage-weighted policy, from a data set or a replay buffer."""
 
+    stores_own_parameters = True
+
     def __init__(
         self,
         specs: PAMDPSpecs,

@@ -12,9 +12,12 @@ arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.041
 Differs from the source:
 - one learner with uniform replay and target networks, which move at a rate each, as in Bester et al., instead of
   asynchronous learners;
-- where only the chosen action's value matters, only its pass is computed;
-- with twin critics, Q is their minimum everywhere: in the targets, in the actor's loss and in the choice of the action;
-- exploration adds Gaussian noise to the parameters, besides epsilon-random actions.
+- where only the chosen action's value matters, only its pass is computed; passes share what they have in common;
+- networks start as PyTorch's, not as Kaiming et al. proposed;
+- by default, that is with `pdqn.yaml`: twin critics, whose minimum is Q everywhere (in the targets, in the actor's loss
+  and in the choice of the action), target smoothing, a delayed actor, parameters squashed by tanh, one learning rate
+  and one target rate for both networks, gradients of any length, Gaussian noise on the parameters besides
+  epsilon-random actions. `pdqn_published.yaml` has the settings of Bester et al. instead.
 
 TorchRL's DQNLoss does not fit: its value network sees the observation alone, whereas Q and its target here also take
 the parameters, which come from a network with a target and a loss of its own.
@@ -23,7 +26,7 @@ the parameters, which come from a network with a target and a loss of its own.
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -34,41 +37,33 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
-from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
+from hpamdp.policies.shared.networks import (
+    HybridCritics,
+    InitialLayer,
+    InitialParameters,
+    InvertingGradients,
+    mlp,
+    polyak_update,
+)
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
-
-
-class InvertingGradients(torch.autograd.Function):
-    """Clips to [-1, 1]; scales the gradient by the fraction of the range that is left in its direction.
-
-    Past a bound this fraction is negative, so that the gradient points back into the range.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, raw: Tensor) -> Tensor:
-        """Return the clipped parameters."""
-        ctx.save_for_backward(raw)
-        return raw.clamp(-1.0, 1.0)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        """Return the scaled gradient of a loss; where it is negative, descent increases the parameter."""
-        (raw,) = ctx.saved_tensors
-        return gradient * torch.where(gradient < 0.0, 1.0 - raw, 1.0 + raw) * 0.5
 
 
 class ParameterActor(nn.Module):
     """The parameters of all discrete actions: `[*B, observation_dim]` -> `[*B, num_parameters]` in [-1, 1]."""
 
-    def __init__(self, specs: PAMDPSpecs, hidden_dims: list[int], bounding: str) -> None:
+    def __init__(
+        self, specs: PAMDPSpecs, hidden_dims: list[int], bounding: str, initial_parameters: InitialParameters
+    ) -> None:
         super().__init__()
         self.net = mlp(specs.observation_dim, hidden_dims, specs.num_parameters)
         self.is_inverting = bounding == "inverting_gradients"
+        self.initial = InitialLayer(specs, initial_parameters, is_squashed=not self.is_inverting)
+        self.initial.shrink(self.net[-1])
 
     def forward(self, state: Tensor) -> Tensor:
         """Return the bounded parameters."""
-        raw = self.net(state)
+        raw = self.net(state) + self.initial(state)
         return InvertingGradients.apply(raw) if self.is_inverting else raw.tanh()
 
 
@@ -106,6 +101,7 @@ class PDQN(ReplayLearner):
     """Q-learning over discrete actions and gradient ascent on their parameters, from a replay buffer of its own."""
 
     policy: PDQNPolicy
+    episodes: Tensor
 
     def __init__(
         self,
@@ -120,12 +116,14 @@ class PDQN(ReplayLearner):
         policy_delay: PositiveInt,
         n_step: PositiveInt,
         bounding: Literal["tanh", "inverting_gradients"],
+        initial_parameters: InitialParameters,
         hidden_dims: list[PositiveInt],
         warmup_frames: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
         gamma: PositiveFraction,
+        reward_scale: PositiveFloat,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
         actor_tau: PositiveFraction,
@@ -134,6 +132,7 @@ class PDQN(ReplayLearner):
         parameter_noise: NonNegativeFloat,
         epsilon_final: Fraction,
         epsilon_frames: NonNegativeInt,
+        epsilon_episodes: PositiveInt | None,
     ) -> None:
         super().__init__(
             specs,
@@ -144,6 +143,7 @@ class PDQN(ReplayLearner):
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
         )
+        self.stores_own_parameters = multipass
         self.double_q = double_q
         self.target_smoothing = target_smoothing
         self.target_smoothing_clip = target_smoothing_clip
@@ -152,10 +152,13 @@ class PDQN(ReplayLearner):
         self.actor_tau = actor_tau
         self.critic_tau = critic_tau
         self.max_grad_norm = max_grad_norm
+        self.reward_scale = reward_scale
         self.epsilon_final = epsilon_final
         self.epsilon_frames = epsilon_frames
+        self.epsilon_episodes = epsilon_episodes
+        self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
 
-        self.actor = ParameterActor(specs, hidden_dims, bounding)
+        self.actor = ParameterActor(specs, hidden_dims, bounding, initial_parameters)
         self.critics = HybridCritics(specs, 2 if twin_q else 1, hidden_dims, multipass)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
@@ -166,13 +169,22 @@ class PDQN(ReplayLearner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
 
+    def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
+        """Store the batch's transitions, count its episodes; after the warm-up, make the updates that are due."""
+        self.episodes += (batch["next", keys.DONE].squeeze(-1) & mask).sum()
+        return super().learn(batch, mask)
+
     def explore(self, frames: int) -> None:
         """Lower the fraction of random actions."""
-        self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
+        time, over = frames, self.epsilon_frames
+        if self.epsilon_episodes is not None:
+            time, over = int(self.episodes), self.epsilon_episodes
+        self.policy.epsilon.fill_(linear_schedule(time, over, self.epsilon_final))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state that follows and the discount of that state's value."""
         rows = super().transitions(batch)
+        rows["reward"] = self.reward_scale * rows["reward"]
         done = option_ends(batch).squeeze(-1)
         terminated = batch["next", keys.TERMINATED].squeeze(-1)
         reward, last = n_step_returns(rows["reward"], done, self.n_step, self.gamma)
@@ -200,7 +212,8 @@ class PDQN(ReplayLearner):
         """Update the actor to increase the sum of the discrete actions' values; return the loss."""
         self.critics.requires_grad_(False)
         loss = -self.critics(state, self.actor(state)).amin(0).sum(-1).mean()
-        self.optimizer_step("actor", loss, self.max_grad_norm)
+        if loss.requires_grad:  # not if no discrete action has parameters
+            self.optimizer_step("actor", loss, self.max_grad_norm)
         self.critics.requires_grad_(True)
         return loss
 

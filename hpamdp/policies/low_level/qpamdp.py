@@ -8,19 +8,29 @@ algorithm 1 and section 5; eNAC: Peters and Schaal 2008, *Natural Actor-Critic*,
 Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learning using the Fourier Basis*; the bound
 on the step: Dabney and Barto 2012, *Adaptive Step-Size for Online Temporal Difference Learning*.
 
+Where random actions do not lead everywhere, as on Platform, give `feature_range`: entries beyond the range that the
+warm-up saw are clipped, so that the learner cannot tell states beyond it apart. Many parallel environments then want a
+small `envs_per_update`, as Sarsa's step is no longer for a mean over more of them.
+
 Differs from the source:
-- all environments learn together: Sarsa makes one update per time step, the mean over the environments, and the bound
-  on its step size holds for that mean; eNAC accumulates its regression as normal equations, with ridge regularisation;
+- all environments learn together: Sarsa makes one update per time step and group of environments, the mean over the
+  group (all of them by default), and the bound on its step size holds for that mean; eNAC accumulates its regression as
+  normal equations, with ridge regularisation;
 - the value of the next discrete action is its expectation under the softmax where that action is not in the batch: in
   the batch's last column and where an episode is truncated;
-- the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to its range in the warm-up;
+- the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to `feature_range` or to its
+  range in the warm-up;
+- by default, that is with `qpamdp.yaml`: all weights of the values have the same step size, which Dabney and Barto's
+  bound limits anew at each step and whatever its sign, the temperature stays as it is, also in the parameter phases,
+  and sigma decays. The published settings: step_scaling=true, step_bound=non_increasing, temperature_decay=0.995,
+  samples_in_parameter_phase=false, sigma_decay=1;
 - parameters are in units where their bounds are [-1, 1], sigma is a standard deviation, eNAC's returns are not
   discounted, and its step is bounded by the divergence from the old policy.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -31,13 +41,18 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
-from hpamdp.policies.low_level.qpamdp_features import MAX_FEATURES, FourierBasis, SizedByData, num_fourier_features
+from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData, num_fourier_features
 from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
-from hpamdp.policies.shared.networks import sample_index
+from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
 RAW = "raw_parameters"
+
+StepBound = Literal["each_step", "non_increasing"]
+
+# Coefficients in eNAC's regression, whose normal equations are a square of them: 2 GB.
+MAX_REGRESSORS = 16_384
 
 # The phases: what is being learned.
 SARSA = 0
@@ -54,14 +69,24 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         temperature: of the softmax.
         sigma: standard deviation of the parameters.
         mean: initial mean of the parameters.
+        initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
     """
 
     w: Tensor
     theta: Tensor
     sigma: Tensor
+    temperature: Tensor
+    samples_discrete: Tensor  # whether exploring actions are sampled from the softmax, or those of highest value
 
     def __init__(
-        self, specs: PAMDPSpecs, phi: FourierBasis, psi: FourierBasis, temperature: float, sigma: float, mean: float
+        self,
+        specs: PAMDPSpecs,
+        phi: FourierBasis,
+        psi: FourierBasis,
+        temperature: float,
+        sigma: float,
+        mean: float,
+        initial_parameters: InitialParameters,
     ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
@@ -69,9 +94,11 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         self.specs = specs
         self.phi = phi
         self.psi = psi
-        self.temperature = temperature
+        self.register_buffer("temperature", torch.tensor(temperature))
+        self.register_buffer("samples_discrete", torch.tensor(True))
+        self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.register_buffer("w", torch.zeros(specs.num_discrete, 1))
-        self.register_buffer("theta", torch.full((specs.num_parameters, 1), mean))
+        self.register_buffer("theta", torch.full((specs.num_parameters, 1), 0.0 if self.initial.exists else mean))
         self.register_buffer("sigma", torch.tensor(sigma))
 
     def widen(self) -> None:
@@ -79,15 +106,18 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         self.w = F.pad(self.w, (0, len(self.phi.coefficients) - self.w.shape[1]))
         self.theta = F.pad(self.theta, (0, len(self.psi.coefficients) - self.theta.shape[1]))
 
+    def mean(self, observation: Tensor) -> Tensor:
+        """Return the means `[*B, num_parameters]` for observations `[*B, observation_dim]`."""
+        return self.psi(observation) @ self.theta.T + self.initial(observation)
+
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and their raw sample, each `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
         q = self.phi(observation) @ self.w.T
-        raw = self.psi(observation) @ self.theta.T
-        if is_greedy():
-            discrete = q.argmax(-1)
-        else:
-            discrete = sample_index(q / self.temperature)
+        raw = self.mean(observation)
+        is_exploring = not is_greedy()
+        discrete = sample_index(q / self.temperature) if is_exploring and self.samples_discrete else q.argmax(-1)
+        if is_exploring:
             raw = raw + self.sigma * torch.randn_like(raw)
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}, RAW: raw})
@@ -100,26 +130,39 @@ class SarsaLambda(SizedByData):
         gamma: discount of a step.
         trace_decay: lambda.
         step_size: largest step size.
-        temperature: of the softmax policy.
+        step_bound: Dabney and Barto's bound on it: `each_step`, recomputed for every update and whatever its sign, or
+            `non_increasing`: the smallest so far of the updates that reduce the error.
+        envs_per_update: environments whose mean an update is; None: all of them.
     """
 
     traces: Tensor
+    step_size: Tensor
 
-    def __init__(self, gamma: float, trace_decay: float, step_size: float, temperature: float) -> None:
+    def __init__(
+        self,
+        gamma: float,
+        trace_decay: float,
+        step_size: float,
+        step_bound: StepBound,
+        envs_per_update: int | None = None,
+    ) -> None:
         super().__init__()
+        self.envs_per_update = envs_per_update
         self.gamma = gamma
         self.trace_decay = trace_decay
-        self.step_size = step_size
-        self.temperature = temperature
+        self.step_bound = step_bound
+        self.register_buffer("step_size", torch.tensor(step_size))
         self.register_buffer("traces", torch.zeros(0, 1, 1))
 
-    def update(self, w: Tensor, rows: TensorDict) -> tuple[Tensor, Tensor]:
-        """Make one update for each time step of a batch.
+    def update(self, w: Tensor, rows: TensorDict, temperature: Tensor, step_scale: Tensor) -> tuple[Tensor, Tensor]:
+        """Make the updates of a batch: one for each time step and group of `envs_per_update` environments.
 
         Args:
             w: weights `[num_discrete, num_features]`.
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
                 `done` and `mask` `[N, T]`; only the rows in `mask` count.
+            temperature: of the softmax policy, `[]`.
+            step_scale: factors on the steps of the features' weights, `[num_features]`.
 
         Returns:
             The new weights and the mean squared temporal-difference error.
@@ -127,33 +170,63 @@ class SarsaLambda(SizedByData):
         num_envs, num_steps = rows.shape
         if self.traces.shape != (num_envs, *w.shape):
             self.traces = w.new_zeros(num_envs, *w.shape)
-        envs = torch.arange(num_envs, device=w.device)
+        # The action at the next time step; -1 in the last column, where it is not known.
+        next_discrete = F.pad(rows["discrete"][:, 1:], (0, 1), value=-1)
+        size = num_envs if self.envs_per_update is None else self.envs_per_update
+        groups = [{name: rows[name][i : i + size] for name in rows.keys()} for i in range(0, num_envs, size)]
         errors: list[Tensor] = []
         for t in range(num_steps):
-            row = rows[:, t]
-            phi = row["phi"]
-            next_phi = row["next_phi"]
-            discrete = row["discrete"]
-            weight = row["mask"] / row["mask"].sum().clamp(min=1)
-            self.traces *= self.gamma * self.trace_decay
-            self.traces[envs, discrete] += phi
-
-            next_q = next_phi @ w.T
-            next_probs = (next_q / self.temperature).softmax(-1)
-            if t + 1 < num_steps:
-                taken = F.one_hot(rows["discrete"][:, t + 1], len(w))
-                next_probs = torch.where(row["done"].unsqueeze(-1), next_probs, taken)
-            next_weight = self.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
-            error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
-
-            # Dabney and Barto's bound: the mean change of the errors that a step of size 1 would cause.
-            next_change = torch.einsum("nkf,nf->nk", self.traces, next_phi)
-            change = (next_weight * next_change).sum(-1) - (self.traces[envs, discrete] * phi).sum(-1)
-            step_size = (1.0 / (change * weight).sum().abs()).clamp(max=self.step_size)
-            w = w + step_size * torch.einsum("n,nkf->kf", error * weight, self.traces)
-            self.traces[row["done"]] = 0.0
-            errors.append((error.square() * weight).sum())
+            for group, taken, traces in zip(groups, next_discrete.split(size), self.traces.split(size), strict=True):
+                row = {name: values[:, t] for name, values in group.items()}
+                w, error = self._updated(w, row, taken[:, t], traces, temperature, step_scale)
+                errors.append(error)
         return w, torch.stack(errors).mean()
+
+    def _updated(
+        self,
+        w: Tensor,
+        row: dict[str, Tensor],
+        next_discrete: Tensor,
+        traces: Tensor,
+        temperature: Tensor,
+        step_scale: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the weights after one update, and the mean squared error before it; change the traces in place.
+
+        Args:
+            w, temperature, step_scale: as in `update`.
+            row: of a group of environments, each `[n, ...]`.
+            next_discrete: what they choose next, `[n]`; -1 where it is not known.
+            traces: of the group, `[n, num_discrete, num_features]`.
+        """
+        phi, next_phi, discrete = row["phi"], row["next_phi"], row["discrete"]
+        envs = torch.arange(len(traces), device=w.device)
+        weight = row["mask"] / row["mask"].sum().clamp(min=1)
+        traces *= self.gamma * self.trace_decay
+        traces[envs, discrete] += phi
+
+        next_q = next_phi @ w.T
+        is_known = (next_discrete >= 0) & ~row["done"]
+        taken = F.one_hot(next_discrete.clamp(min=0), len(w))
+        next_probs = torch.where(is_known.unsqueeze(-1), taken, (next_q / temperature).softmax(-1))
+        next_weight = self.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
+        error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
+
+        # Dabney and Barto's bound: the mean change of the errors that a step of size 1 would cause.
+        next_change = torch.einsum("nkf,nf->nk", traces, next_phi * step_scale)
+        change = (next_weight * next_change).sum(-1) - (traces[envs, discrete] * step_scale * phi).sum(-1)
+        step_size = self._bounded((change * weight).sum())
+        w = w + step_size * step_scale * torch.einsum("n,nkf->kf", error * weight, traces)
+        traces[row["done"]] = 0.0
+        return w, (error.square() * weight).sum()
+
+    def _bounded(self, change: Tensor) -> Tensor:
+        """Return the step size, given how a step of size 1 changes the error, `[]`."""
+        bounded = self.step_size.minimum(1.0 / change.abs())
+        if self.step_bound == "each_step":
+            return bounded
+        self.step_size = torch.where(change < 0.0, bounded, self.step_size)
+        return self.step_size
 
 
 class NaturalActorCritic(SizedByData):
@@ -269,6 +342,7 @@ class QPAMDP(Learner):
         device: torch.device,
         *,
         features: list[NonNegativeInt] | None,
+        feature_range: Annotated[list[float], Field(min_length=2, max_length=2)] | None,
         phi_order: PositiveInt,
         phi_max_coupled: PositiveInt,
         psi_order: PositiveInt,
@@ -279,13 +353,20 @@ class QPAMDP(Learner):
         gamma: PositiveFraction,
         trace_decay: Fraction,
         step_size: PositiveFloat,
+        step_scaling: bool,
+        step_bound: StepBound,
+        envs_per_update: PositiveInt | None,
         temperature: PositiveFloat,
+        temperature_final: PositiveFloat,
+        temperature_decay: PositiveFraction,
+        samples_in_parameter_phase: bool,
         parameter_updates: PositiveInt | None,
         patience: PositiveInt,
         rollouts: PositiveInt,
         natural_step_size: PositiveFloat,
         max_divergence: PositiveFloat,
         ridge: NonNegativeFloat,
+        initial_parameters: InitialParameters,
         initial_mean: Annotated[float, Field(ge=-1.0, le=1.0)],
         sigma: PositiveFloat,
         sigma_final: PositiveFloat,
@@ -300,13 +381,22 @@ class QPAMDP(Learner):
                 raise ValueError(f"features={features}: names an entry twice")
         if sigma_final > sigma:
             raise ValueError(f"sigma_final={sigma_final}: must be at most {sigma=}")
-        for basis, order, max_coupled in (("phi", phi_order, phi_max_coupled), ("psi", psi_order, psi_max_coupled)):
-            num = num_fourier_features(1 if features is None else len(features), order, max_coupled)
-            if num > MAX_FEATURES:
-                raise ValueError(
-                    f"{basis}_order={order}: gives {num:,} features, of which there may be {MAX_FEATURES:,}"
-                )
+        num_inputs = specs.observation_dim if features is None else len(features)
+        num_regressors = specs.num_parameters * num_fourier_features(num_inputs, psi_order, psi_max_coupled)
+        num_regressors += num_fourier_features(num_inputs, phi_order, phi_max_coupled)
+        if num_regressors > MAX_REGRESSORS:
+            raise ValueError(
+                f"phi_order={phi_order}, psi_order={psi_order}: the regression for the parameters would have "
+                f"{num_regressors:,} coefficients, more than {MAX_REGRESSORS:,}; use fewer features or lower orders"
+            )
+        if feature_range is not None and not feature_range[0] < feature_range[1]:
+            raise ValueError(f"feature_range={feature_range}: the first number must be less than the second")
         self.features = features
+        self.feature_range = feature_range
+        self.step_scaling = step_scaling
+        self.temperature_final = min(temperature, temperature_final)
+        self.temperature_decay = temperature_decay
+        self.samples_in_parameter_phase = samples_in_parameter_phase
         self.warmup_frames = warmup_frames
         self.initial_episodes = initial_episodes
         self.relearning_episodes = relearning_episodes
@@ -320,8 +410,8 @@ class QPAMDP(Learner):
 
         phi = FourierBasis(phi_order, phi_max_coupled)
         psi = FourierBasis(psi_order, psi_max_coupled)
-        self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean)
-        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, temperature)
+        self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean, initial_parameters)
+        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, step_bound, envs_per_update)
         self.enac = NaturalActorCritic(ridge)
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf))
@@ -344,10 +434,15 @@ class QPAMDP(Learner):
             return {}
         rows = self._rows(batch, mask)
         self.window_return += (rows["reward"] * rows["mask"]).sum()
-        self.window_episodes += (rows["done"] & rows["mask"]).sum()
+        num_episodes = (rows["done"] & rows["mask"]).sum()
+        self.window_episodes += num_episodes
         scalars = {"phase": float(self.phase)}
         if self.phase == SARSA:
-            self.policy.w, error = self.sarsa.update(self.policy.w, rows)
+            phi = self.policy.phi
+            step_scale = phi.step_scale() if self.step_scaling else torch.ones_like(phi.coefficients[:, 0])
+            self.policy.w, error = self.sarsa.update(self.policy.w, rows, self.policy.temperature, step_scale)
+            cooled = self.policy.temperature * self.temperature_decay**num_episodes
+            self.policy.temperature = cooled.clamp(min=self.temperature_final)
             scalars["td_error"] = error.item()
             is_first = self.updates == 0 and self.windows == 0
             is_full = self.window_episodes >= (self.initial_episodes if is_first else self.relearning_episodes)
@@ -370,7 +465,10 @@ class QPAMDP(Learner):
         varying = (self.high - self.low > 1e-6).nonzero().squeeze(-1)
         inputs = varying if self.features is None else varying.new_tensor(self.features)
         for basis in (self.policy.phi, self.policy.psi):
-            basis.fit(inputs, self.low[inputs], self.high[inputs])
+            low, high = self.low[inputs], self.high[inputs]
+            if self.feature_range is not None:
+                low, high = (torch.full_like(low, side) for side in self.feature_range)
+            basis.fit(inputs, low, high)
         self.policy.widen()
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
@@ -388,8 +486,9 @@ class QPAMDP(Learner):
             rows["next_phi"] = self.policy.phi(batch["next", keys.OBSERVATION])
         else:
             psi = self.policy.psi(observation)
-            mean = psi @ self.policy.theta.T
-            score = (batch[RAW] - mean) / self.policy.sigma.square() * self.mask[rows["discrete"]]
+            score = (
+                (batch[RAW] - self.policy.mean(observation)) / self.policy.sigma.square() * self.mask[rows["discrete"]]
+            )
             rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
         return TensorDict(rows, batch_size=mask.shape)
 
@@ -411,6 +510,7 @@ class QPAMDP(Learner):
             self.windows_since_best += 1
         if self._phase_is_over():
             self.phase.fill_(PARAMETERS if self.phase == SARSA else SARSA)
+            self.policy.samples_discrete.fill_(bool(self.phase == SARSA) or self.samples_in_parameter_phase)
             self.best_return.fill_(-torch.inf)
             self.windows.zero_()
             self.windows_since_best.zero_()

@@ -25,15 +25,6 @@ class SizedByData(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
-# Natural policy gradient solves for as many regressors as there are features.
-MAX_FEATURES = 10_000
-
-
-def num_fourier_features(num_inputs: int, order: int, max_coupled: int) -> int:
-    """Return how many features `fourier_coefficients` has."""
-    return sum(math.comb(num_inputs, num) * order**num for num in range(min(max_coupled, num_inputs) + 1))
-
-
 def fourier_coefficients(num_inputs: int, order: int, max_coupled: int) -> Tensor:
     """Return the coefficients of the cosines, `[num_features, num_inputs]`.
 
@@ -49,6 +40,11 @@ def fourier_coefficients(num_inputs: int, order: int, max_coupled: int) -> Tenso
                     row[i] = value
                 rows.append(row)
     return torch.tensor(rows, dtype=torch.float32)
+
+
+def num_fourier_features(num_inputs: int, order: int, max_coupled: int) -> int:
+    """Return how many rows `fourier_coefficients` has."""
+    return sum(math.comb(num_inputs, coupled) * order**coupled for coupled in range(min(max_coupled, num_inputs) + 1))
 
 
 class FourierBasis(SizedByData):
@@ -86,6 +82,14 @@ class FourierBasis(SizedByData):
         self.low = low
         self.width = (high - low).clamp(min=1e-6)
         self.coefficients = fourier_coefficients(len(inputs), self.order, self.max_coupled).to(low)
+
+    def step_scale(self) -> Tensor:
+        """Return the factor 1 / ||c|| on the step of each feature's weight, 1 for the constant, `[num_features]`.
+
+        Source: Konidaris, Osentoski and Thomas 2011, section 4.
+        """
+        norm = self.coefficients.norm(dim=-1)
+        return 1.0 / torch.where(norm > 0.0, norm, 1.0)
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the features `[*B, num_features]` of observations `[*B, observation_dim]`."""

@@ -5,9 +5,13 @@ on the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twin cr
 (Fujimoto et al. 2018, arXiv 1802.09477). Which discrete actions are allowed: discrete BCQ (Fujimoto et al. 2019, arXiv
 1910.01708, equation in section 4).
 
-Differs from the sources: every discrete action has its own parameters, so the actor increases the values of all
-discrete actions, each weighted by its frequency in the data; the distance from the data is that of the recorded
-action's own parameters.
+Differs from the sources:
+- every discrete action has its own parameters, so the actor increases the values of all discrete actions, each weighted
+  by its frequency in the data; the distance from the data is that of the recorded action's own parameters;
+- the actor increases the minimum of both critics, not the first one's value;
+- states are not normalised, as problems scale their observations;
+- by default the values weigh twice as much: `behaviour_weight` is 1 / alpha, 0.2 where the source has alpha = 2.5, that
+  is 0.4.
 
 TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, without a discrete choice.
 """
@@ -90,8 +94,9 @@ class TD3BCPolicy(TensorDictModuleBase):
 class TD3BC(ReplayLearner):
     """Q-learning on the data's discrete actions with parameters near the data's, from a data set or a replay buffer."""
 
+    stores_own_parameters = True
+
     policy: TD3BCPolicy
-    parameter_mask: Tensor
 
     def __init__(
         self,
@@ -135,7 +140,6 @@ class TD3BC(ReplayLearner):
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = TD3BCPolicy(self.actor, self.critics, self.behaviour, specs, discrete_threshold, parameter_noise)
-        self.register_buffer("parameter_mask", specs.parameter_mask.float())
         self.to(device)
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
@@ -167,7 +171,7 @@ class TD3BC(ReplayLearner):
         with torch.no_grad():
             frequency = self.behaviour(state).softmax(-1)
         q = (self.critics(state, own_unit).amin(0) * frequency).sum(-1)
-        distance = ((own_unit - unit).square() * self.parameter_mask[discrete]).sum(-1)
+        distance = ((own_unit - unit).square() * (self.owner == discrete.unsqueeze(-1))).sum(-1)
         # Values are divided by their mean size, so that the weight does not depend on the scale of the reward.
         loss = (self.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
         self.optimizer_step("actor", loss)

@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.networks import sample_index
+from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -33,13 +33,13 @@ class HybridDistribution(NamedTuple):
         discrete_log_probs: log-probabilities of the discrete actions, `[*B, num_discrete]`.
         mean: of the raw parameters, `[*B, num_parameters]`.
         log_scale: logarithm of their standard deviation, `[*B, num_parameters]`.
-        parameter_mask: 1 where a parameter belongs to a discrete action, else 0, `[num_discrete, num_parameters]`.
+        owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
     """
 
     discrete_log_probs: Tensor
     mean: Tensor
     log_scale: Tensor
-    parameter_mask: Tensor
+    owner: Tensor
 
     def sample(self) -> tuple[Tensor, Tensor]:
         """Sample discrete actions `[*B]` and the raw parameters of all of them, `[*B, num_parameters]`."""
@@ -76,14 +76,22 @@ class HybridDistribution(NamedTuple):
         """
         discrete_log_prob = self.discrete_log_probs.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
         log_density = gaussian_log_density((raw - self.mean) / self.log_scale.exp(), self.log_scale)
-        return discrete_log_prob, (log_density * self.parameter_mask[discrete]).sum(-1)
+        return discrete_log_prob, (log_density * (self.owner == discrete.unsqueeze(-1))).sum(-1)
 
     def entropy(self) -> tuple[Tensor, Tensor]:
         """Return the entropy of the discrete action and the expected entropy of its own raw parameters, each `[*B]`."""
         probs = self.discrete_log_probs.exp()
         discrete_entropy = -(probs * self.discrete_log_probs).sum(-1)
         gaussian_entropy = self.log_scale + 0.5 * math.log(2 * math.pi * math.e)
-        return discrete_entropy, ((probs @ self.parameter_mask) * gaussian_entropy).sum(-1)
+        return discrete_entropy, (probs[..., self.owner] * gaussian_entropy).sum(-1)
+
+    def sum_of_own(self, values: Tensor) -> Tensor:
+        """Return the sums over each discrete action's own parameters, `[*B, num_discrete]`, of values of all of them.
+
+        Args:
+            values: `[*B, num_parameters]`.
+        """
+        return torch.zeros_like(self.discrete_log_probs).index_add(-1, self.owner, values)
 
 
 class HybridActor(nn.Module):
@@ -94,15 +102,22 @@ class HybridActor(nn.Module):
         hidden_dims: sizes of the encoder's layers.
         scale_range: smallest and largest standard deviation, in units where the bounds are [-1, 1].
         initial_scale: standard deviation at initialisation, strictly within `scale_range`.
+        initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
     """
 
     log_min_scale: Tensor
-    parameter_mask: Tensor
+    owner: Tensor
 
     def __init__(
-        self, specs: PAMDPSpecs, hidden_dims: Sequence[int], scale_range: tuple[float, float], initial_scale: float
+        self,
+        specs: PAMDPSpecs,
+        hidden_dims: Sequence[int],
+        scale_range: tuple[float, float],
+        initial_scale: float,
+        initial_parameters: InitialParameters = "none",
     ) -> None:
         super().__init__()
+        self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.encoder = encoder(specs.observation_dim, hidden_dims)
         self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete)
         self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters)
@@ -115,14 +130,15 @@ class HybridActor(nn.Module):
                 head.weight.mul_(0.01)
                 head.bias.zero_()
             self.parameter_head.bias[specs.num_parameters :] = math.log(fraction / (1.0 - fraction))
-        self.register_buffer("parameter_mask", specs.parameter_mask.float())
+        self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
     def forward(self, observation: Tensor) -> HybridDistribution:
         """Return the distribution of the action for observations `[*B, observation_dim]`."""
         hidden = self.encoder(observation)
         mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
+        mean = mean + self.initial(observation)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
-        return HybridDistribution(self.discrete_head(hidden).log_softmax(-1), mean, log_scale, self.parameter_mask)
+        return HybridDistribution(self.discrete_head(hidden).log_softmax(-1), mean, log_scale, self.owner)
 
     def set_min_scale(self, min_scale: float) -> None:
         """Set the smallest standard deviation."""

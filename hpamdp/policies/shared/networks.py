@@ -5,11 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from hpamdp.specs import PAMDPSpecs
+
+# What parameters start with: the problem's own convention, where it has one, or whatever the network begins with.
+InitialParameters = Literal["domain", "none"]
+
+# Past these a squashed parameter hardly moves any more, so none starts there.
+_LARGEST_SQUASHED = 0.99
+
+# Passes of multi-pass critics that are computed at once: bounds the memory where there are many discrete actions.
+_MAX_PASSES = 1 << 13
 
 
 class EnsembleLinear(nn.Module):
@@ -68,36 +78,125 @@ def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
         target_parameter.lerp_(parameter.detach(), tau)
 
 
+class InvertingGradients(torch.autograd.Function):
+    """Clips to [-1, 1]; scales the gradient by the fraction of the range that is left in its direction.
+
+    Past a bound this fraction is negative, so that the gradient points back into the range.
+
+    Source: Hausknecht and Stone 2016, *Deep Reinforcement Learning in Parameterized Action Space*, arXiv 1511.04143,
+    equation 11.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, raw: Tensor) -> Tensor:
+        """Return the clipped parameters."""
+        ctx.save_for_backward(raw)
+        return raw.clamp(-1.0, 1.0)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        """Return the scaled gradient of a loss; where it is negative, descent increases the parameter."""
+        (raw,) = ctx.saved_tensors
+        return gradient * torch.where(gradient < 0.0, 1.0 - raw, 1.0 + raw) * 0.5
+
+
+class InitialLayer(nn.Module):
+    """A problem's initial parameters as a frozen linear layer, to add to what a network says of the parameters.
+
+    Source: the code of Bester, James and Konidaris 2019, arXiv 1905.04388 (`action_parameters_passthrough_layer`).
+
+    Args:
+        specs: of the problem.
+        choice: `domain`: the problem's convention, if it has one; `none`: no layer, which adds 0.
+        is_squashed: whether the sum is squashed by tanh, and not clipped, into the bounds.
+    """
+
+    weight: Tensor
+    bias: Tensor
+
+    def __init__(self, specs: PAMDPSpecs, choice: InitialParameters, *, is_squashed: bool) -> None:
+        super().__init__()
+        self.exists = choice == "domain" and specs.initial_weight is not None
+        self.is_squashed = is_squashed
+        if self.exists:
+            self.register_buffer("weight", torch.tensor(specs.initial_weight))
+            self.register_buffer("bias", torch.tensor(specs.initial_bias))
+
+    def forward(self, observation: Tensor) -> Tensor | float:
+        """Return what to add for observations `[*B, observation_dim]`: `[*B, num_parameters]`, or 0."""
+        if not self.exists:
+            return 0.0
+        unit = nn.functional.linear(observation, self.weight, self.bias)
+        return unit.clamp(-_LARGEST_SQUASHED, _LARGEST_SQUASHED).atanh() if self.is_squashed else unit
+
+    def shrink(self, output: nn.Module, rows: slice = slice(None)) -> None:
+        """Bring the parameters' rows of a network's linear output near 0 where this layer adds something."""
+        assert isinstance(output, nn.Linear)
+        if self.exists:
+            with torch.no_grad():
+                output.weight[rows].mul_(0.01)
+                output.bias[rows].zero_()
+
+
 class HybridCritics(nn.Module):
     """`num_members` independent networks for Q(s, k, x), the value of discrete action k with parameters x.
 
     With `is_multipass`, the value of k comes from a forward pass that sees only its own parameters x_k; the others are
-    0.
+    0. The passes of a state share their first layer but for the columns of x_k, and pass k computes only output k. So K
+    passes of H units take memory `[B, K, H]`, and never `[B, K, K]`.
+
     Shapes: states `[B, observation_dim]`, parameters `[B, num_parameters]` in [-1, 1].
     """
 
-    mask: Tensor
+    owner: Tensor
+    slots: Tensor
+    is_own: Tensor
 
     def __init__(self, specs: PAMDPSpecs, num_members: int, hidden_dims: Sequence[int], is_multipass: bool) -> None:
         super().__init__()
         self.is_multipass = is_multipass
+        self.num_discrete = specs.num_discrete
+        self.observation_dim = specs.observation_dim
         input_dim = specs.observation_dim + specs.num_parameters
         self.net = EnsembleMLP(num_members, input_dim, hidden_dims, specs.num_discrete)
-        self.register_buffer("mask", specs.parameter_mask.float())
+        owner, slots = specs.parameter_owner, specs.parameter_slots
+        self.register_buffer("owner", owner, persistent=False)
+        self.register_buffer("slots", slots, persistent=False)
+        self.register_buffer(
+            "is_own", (owner[slots] == torch.arange(self.num_discrete).unsqueeze(-1)).float(), persistent=False
+        )
 
     def forward(self, state: Tensor, unit: Tensor) -> Tensor:
         """Return the values of all discrete actions, `[E, B, num_discrete]`."""
         if not self.is_multipass:
             return self.net(torch.cat([state, unit], -1))
-        num_states = state.shape[0]
-        num_discrete = self.mask.shape[0]
-        own = unit.unsqueeze(1) * self.mask
-        passes = torch.cat([state.unsqueeze(1).expand(-1, num_discrete, -1), own], -1)
-        q = self.net(passes.flatten(0, 1))
-        return q.unflatten(1, (num_states, num_discrete)).diagonal(dim1=-2, dim2=-1)
+        num_rows = max(1, _MAX_PASSES // self.num_discrete)
+        if len(state) <= num_rows:
+            return self._passes(state, unit)
+        pieces = zip(state.split(num_rows), unit.split(num_rows), strict=True)
+        return torch.cat([self._passes(*piece) for piece in pieces], 1)
 
     def of_discrete(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Return the values `[E, B]` of the given discrete actions `[B]`."""
-        own = unit * self.mask[discrete] if self.is_multipass else unit
+        own = unit * (self.owner == discrete.unsqueeze(-1)) if self.is_multipass else unit
         q = self.net(torch.cat([state, own], -1))
         return q.gather(-1, discrete.expand(q.shape[0], -1).unsqueeze(-1)).squeeze(-1)
+
+    def _passes(self, state: Tensor, unit: Tensor) -> Tensor:
+        """Return output k of pass k for every discrete action k, `[E, B, num_discrete]`."""
+        first, last = self.net.layers[0], self.net.layers[-1]
+        assert isinstance(first, EnsembleLinear) and isinstance(last, EnsembleLinear)
+        of_state, of_unit = first.weight.split([self.observation_dim, unit.shape[-1]], 1)
+        common = torch.baddbmm(first.bias, state.expand(len(of_state), *state.shape), of_state)
+        x = common.unsqueeze(2)
+        for slot, is_own in zip(self.slots.unbind(-1), self.is_own.unbind(-1), strict=True):
+            # Of every discrete action the next one of its parameters, `[B, K]`, in its own pass.
+            x = torch.addcmul(x, (unit[:, slot] * is_own).unsqueeze(-1), of_unit[:, slot].unsqueeze(1))
+        if first is last:
+            return x.expand(-1, -1, self.num_discrete, -1).diagonal(dim1=-2, dim2=-1)
+        x = x.expand(-1, -1, self.num_discrete, -1).relu()
+        shape = x.shape[1:3]
+        x = x.flatten(1, 2)
+        for layer in self.net.layers[1:-1]:
+            x = layer(x).relu_()
+        return torch.einsum("ebkh,ehk->ebk", x.unflatten(1, shape), last.weight) + last.bias

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import torch
@@ -24,13 +24,20 @@ class ReplayLearner(Learner):
     - `sample_batches`: what an update sees;
     - `start` and `explore`: what happens at the end of the warm-up, and with every batch after it;
     - `updates_due`: when updates are made.
+
+    Attributes:
+        stores_own_parameters: whether the buffer holds the parameters of the discrete action taken alone, which is less
+            where there are many; samples then have 0 for the others.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
+    stores_own_parameters: bool = False
 
     optimizers: dict[str, torch.optim.Optimizer]
     frames: Tensor
     updates: Tensor
+    slots: Tensor
+    owner: Tensor
 
     def __init__(
         self,
@@ -54,6 +61,8 @@ class ReplayLearner(Learner):
         self.updates_per_frame = updates_per_frame
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
+        self.register_buffer("slots", specs.parameter_slots, persistent=False)
+        self.register_buffer("owner", specs.parameter_owner, persistent=False)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
@@ -102,12 +111,24 @@ class ReplayLearner(Learner):
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""
-        self.buffer.extend(self.transitions(batch)[mask])
+        rows = self.transitions(batch)[mask]
+        if self.stores_own_parameters:
+            rows["unit"] = rows["unit"].gather(-1, self.slots[rows["discrete"]])
+        self.buffer.extend(rows)
 
-    def sample_batches(self, num_batches: int) -> Iterable[TensorDictBase]:
-        """Return samples for `num_batches` updates, each with transitions `[batch_size]`."""
+    def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
+        """Yield samples for `num_batches` updates, each with transitions `[batch_size]`."""
         # One call for all updates: the buffer's overhead is as long as a forward pass.
-        return self.buffer.sample(num_batches * self.batch_size).split(self.batch_size)
+        for sample in self.buffer.sample(num_batches * self.batch_size).split(self.batch_size):
+            if self.stores_own_parameters:
+                sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
+            yield sample
+
+    def _all_parameters(self, discrete: Tensor, own: Tensor) -> Tensor:
+        """Return parameters `[B, num_parameters]`, 0 but for the discrete actions' own `[B, max(parameter_dims)]`."""
+        slots = self.slots[discrete]
+        is_own = self.owner[slots] == discrete.unsqueeze(-1)
+        return own.new_zeros(len(own), self.specs.num_parameters).scatter(-1, slots, own * is_own)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the step terminated, else gamma."""

@@ -1,0 +1,203 @@
+"""PADDPG and PATD3: one actor outputs a score for each discrete action and the parameters of all of them.
+
+The policy takes the discrete action with the highest score, with its own parameters. The critic sees all scores and
+parameters; the actor ascends its value by inverting gradients, which keep its output within [-1, 1]. With `twin`, both
+are trained as in TD3, which later papers call PATD3.
+
+Source: Hausknecht and Stone, *Deep Reinforcement Learning in Parameterized Action Space*, 2016, arXiv 1511.04143:
+sections 4 and 5, equation 11. TD3: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477. PATD3: Li et al. 2022, arXiv
+2109.05490 (a row of its tables).
+
+Differs from the source:
+- a random action is stored with random scores of which the highest is its own, as in the code of Bester, James and
+  Konidaris 2019, arXiv 1905.04388;
+- `exploration_noise` adds Gaussian noise to scores and parameters, besides epsilon-random actions;
+- smaller networks, which start as PyTorch's; the learning rates and the target rate are those of this project;
+- the problem's initial parameters, if `initial_parameters` asks for them, are added by a frozen layer, as in Bester et
+  al.
+
+TorchRL's DDPGLoss and TD3Loss would need a composite action split for them, bounds of their own, and have no inverting
+gradients, for which the gradient must be changed between critic and actor.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import ClassVar
+
+import torch
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from hpamdp import keys
+from hpamdp.policies.base import is_greedy
+from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.networks import (
+    EnsembleMLP,
+    InitialLayer,
+    InitialParameters,
+    InvertingGradients,
+    mlp,
+    polyak_update,
+)
+from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
+from hpamdp.specs import PAMDPSpecs
+
+# The policy also writes the scores of the discrete actions, which the critic sees.
+SCORES = "scores"
+
+
+class PADDPGActor(nn.Module):
+    """Scores and parameters: `[*B, observation_dim]` -> `[*B, num_discrete + num_parameters]` in [-1, 1]."""
+
+    def __init__(self, specs: PAMDPSpecs, hidden_dims: list[int], initial_parameters: InitialParameters) -> None:
+        super().__init__()
+        self.num_discrete = specs.num_discrete
+        self.net = mlp(specs.observation_dim, hidden_dims, specs.num_discrete + specs.num_parameters)
+        self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
+        self.initial.shrink(self.net[-1], slice(self.num_discrete, None))
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Return what the actor outputs, clipped; its gradients are inverted."""
+        scores, parameters = self.net(state).tensor_split([self.num_discrete], -1)
+        return InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1))
+
+
+class PADDPGPolicy(TensorDictModuleBase):
+    """Takes the discrete action with the highest score; explores with random outputs and noise on the actor's."""
+
+    epsilon: Tensor
+
+    def __init__(self, actor: PADDPGActor, specs: PAMDPSpecs, noise: float) -> None:
+        super().__init__()
+        self.in_keys = [keys.OBSERVATION]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, SCORES]
+        self.actor = actor
+        self.specs = specs
+        self.noise = noise
+        self.register_buffer("epsilon", torch.ones(()))
+
+    @torch.no_grad()
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write the discrete action `[*B]`, all parameters `[*B, num_parameters]`, all scores `[*B, num_discrete]`."""
+        output = self.actor(td.get(keys.OBSERVATION))
+        if not is_greedy():
+            is_random = torch.rand_like(output[..., :1]) < self.epsilon
+            noisy = (output + self.noise * torch.randn_like(output)).clamp(-1.0, 1.0)
+            output = torch.where(is_random, 2.0 * torch.rand_like(output) - 1.0, noisy)
+        scores, unit = output.tensor_split([self.specs.num_discrete], -1)
+        action = {"discrete": scores.argmax(-1), "parameters": self.specs.from_unit(unit)}
+        return td.update({keys.ACTION: action, SCORES: scores})
+
+
+class PADDPG(ReplayLearner):
+    """Deterministic policy gradients on scores and parameters together, from a replay buffer of its own."""
+
+    has_value: ClassVar[bool] = True
+
+    modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no scores
+
+    policy: PADDPGPolicy
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        twin: bool,
+        target_smoothing: NonNegativeFloat,
+        target_smoothing_clip: NonNegativeFloat,
+        policy_delay: PositiveInt,
+        initial_parameters: InitialParameters,
+        hidden_dims: list[PositiveInt],
+        warmup_frames: NonNegativeInt,
+        buffer_size: PositiveInt,
+        batch_size: PositiveInt,
+        updates_per_frame: PositiveFloat,
+        gamma: PositiveFraction,
+        tau: PositiveFraction,
+        actor_lr: LearningRate,
+        critic_lr: LearningRate,
+        max_grad_norm: PositiveFloat | None,
+        exploration_noise: NonNegativeFloat,
+        epsilon_final: Fraction,
+        epsilon_frames: NonNegativeInt,
+    ) -> None:
+        super().__init__(
+            specs,
+            device,
+            gamma=gamma,
+            warmup_frames=warmup_frames,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=updates_per_frame,
+        )
+        self.target_smoothing = target_smoothing if twin else 0.0
+        self.target_smoothing_clip = target_smoothing_clip
+        self.policy_delay = policy_delay if twin else 1
+        self.tau = tau
+        self.max_grad_norm = max_grad_norm
+        self.epsilon_final = epsilon_final
+        self.epsilon_frames = epsilon_frames
+
+        action_dim = specs.num_discrete + specs.num_parameters
+        self.actor = PADDPGActor(specs, hidden_dims, initial_parameters)
+        self.critics = EnsembleMLP(2 if twin else 1, specs.observation_dim + action_dim, hidden_dims, 1)
+        self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
+        self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
+        self.policy = PADDPGPolicy(self.actor, specs, exploration_noise)
+        self.to(device)
+        self.optimizers = {
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
+        }
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return Q of the actor's output, `[B]`."""
+        return self._q(self.critics, observation, self.actor(observation)).amin(0)
+
+    def explore(self, frames: int) -> None:
+        """Lower the fraction of random actions."""
+        self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
+
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return the rows to store, with all scores."""
+        return super().transitions(batch).set(SCORES, batch[SCORES])
+
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
+        state = sample["state"]
+        q = self._q(self.critics, state, torch.cat([sample[SCORES], sample["unit"]], -1))
+        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
+        self.optimizer_step("critics", critic_loss, self.max_grad_norm)
+        scalars = {"critic": critic_loss, "q": q.mean(), "epsilon": self.policy.epsilon}
+        if self.updates % self.policy_delay == 0:
+            scalars["actor"] = self._update_actor(state)
+            polyak_update(self.target_actor, self.actor, self.tau)
+            polyak_update(self.target_critics, self.critics, self.tau)
+        return scalars
+
+    def _q(self, critics: EnsembleMLP, state: Tensor, output: Tensor) -> Tensor:
+        """Return the critics' values `[E, B]` of an actor's outputs `[B, num_discrete + num_parameters]`."""
+        return critics(torch.cat([state, output], -1)).squeeze(-1)
+
+    def _update_actor(self, state: Tensor) -> Tensor:
+        """Update the actor towards higher values of the first critic; return the loss."""
+        self.critics.requires_grad_(False)
+        loss = -self._q(self.critics, state, self.actor(state))[0].mean()
+        self.optimizer_step("actor", loss, self.max_grad_norm)
+        self.critics.requires_grad_(True)
+        return loss
+
+    @torch.no_grad()
+    def _target(self, batch: TensorDictBase) -> Tensor:
+        """Return r + discount min Q'(s', a'), `[B]`, with a' the target actor's output, smoothed with `twin`."""
+        state = batch["next_state"]
+        output = self.target_actor(state)
+        if self.target_smoothing > 0.0:
+            bound = self.target_smoothing_clip
+            noise = (self.target_smoothing * torch.randn_like(output)).clamp(-bound, bound)
+            output = (output + noise).clamp(-1.0, 1.0)
+        return batch["reward"] + batch["discount"] * self._q(self.target_critics, state, output).amin(0)
