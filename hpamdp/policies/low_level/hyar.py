@@ -393,7 +393,10 @@ class HyAR(ReplayLearner):
         """Set the range of z to the central `latent_coverage` of the encoded stored actions."""
         sample = self.buffer.sample(4096)
         with torch.no_grad():
-            z, _ = self.codec.encode(sample["state"], sample["discrete"], sample["unit"])
+            mean, log_variance = self.codec.encode(sample["state"], sample["discrete"], sample["unit"])
+            # Samples, not means: in a dimension that the codec does not use all means are alike, and their range, mapped
+            # onto [-1, 1], would blow up differences that mean nothing.
+            z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
         tail = (1.0 - self.latent_coverage) / 2.0
         low, high = z.quantile(tail, 0), z.quantile(1.0 - tail, 0)
         self.codec.z_low.copy_(low)
