@@ -12,7 +12,8 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
-    rl="td3", discrete="greedy", embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000,
+    rl="td3", discrete="greedy",
+    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000,
     codec_pretrain_updates=1500, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, relabelling="mean",
     buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
@@ -165,7 +166,9 @@ def test_only_the_greedy_form_leaves_a_discrete_action_whose_neighbours_are_wors
     # On the line of embeddings the rewards are .5, -1 and 1: the gradient leads back to the first.
     torch.manual_seed(0)
     specs = PAMDPSpecs(1, (), (1, 1, 1), (-1.0,) * 3, (1.0,) * 3)
-    learner = make(specs, discrete=discrete, embedding_dim=1, latent_dim=1, codec_every=10**9, actor_lr=2e-3, critic_lr=3e-3)
+    learner = make(
+        specs, discrete=discrete, embedding_dim=1, latent_dim=1, codec_every=10**9, actor_lr=2e-3, critic_lr=3e-3
+    )
     with torch.no_grad():
         learner.codec.table.copy_(torch.tensor([[-0.8], [0.0], [0.8]]).atanh())
         if discrete == "nearest":
@@ -174,9 +177,9 @@ def test_only_the_greedy_form_leaves_a_discrete_action_whose_neighbours_are_wors
     num = 128
     taken = torch.randint(3, (num,))
     rows = TensorDict(
-        state=torch.zeros(num, 1), discrete=taken, unit=torch.zeros(num, 3), reward=torch.tensor([0.5, -1.0, 1.0])[taken],
-        next_state=torch.zeros(num, 1), discount=torch.zeros(num), latent=torch.full((num, 2), torch.nan),
-        batch_size=[num],
+        state=torch.zeros(num, 1), discrete=taken, unit=torch.zeros(num, 3),
+        reward=torch.tensor([0.5, -1.0, 1.0])[taken], next_state=torch.zeros(num, 1), discount=torch.zeros(num),
+        latent=torch.full((num, 2), torch.nan), batch_size=[num],
     )  # fmt: skip
     for _ in range(400):
         learner.updates += 1

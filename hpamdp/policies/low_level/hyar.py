@@ -1,11 +1,17 @@
-"""HyAR: TD3 in a learned latent space of discrete actions and their parameters.
+"""HyAR: TD3 or DDPG in a learned latent space of discrete actions and their parameters.
 
 An embedding table and a conditional VAE turn a discrete action and its parameters into one continuous latent action
 (e, z), which is what the actor gives and the critics judge.
 
 Source: Li, Tang, Zheng, Hao, Li, Wang, Meng and Wang, *HyAR: Addressing Discrete-Continuous Action Reinforcement
 Learning via Hybrid Action Representation*, 2022, arXiv 2109.05490: equations 2 to 6 and algorithm 1; TD3: Fujimoto, van
-Hoof and Meger 2018, arXiv 1802.09477.
+Hoof and Meger 2018, arXiv 1802.09477; DDPG: Lillicrap et al. 2016, arXiv 1509.02971.
+
+In the published form (`discrete="nearest"`) the actor gives e and z, and e stands for the discrete action with the
+nearest embedding. It moves along the gradient of Q only, so it stays with a discrete action whose neighbours in the
+latent space are worse, whatever lies behind them. `discrete="greedy"` takes an exact maximum over the discrete actions
+instead: the actor gives a z for each of them, and the one whose own embedding and z have the highest Q is taken, in the
+policy as in the targets. It costs a pass of the critics for each discrete action.
 
 Differs from the source:
 - discrete actions may take different numbers of parameters, which lie side by side; the encoder sees only the chosen
@@ -13,7 +19,13 @@ Differs from the source:
 - the change of the state is predicted in units of its standard deviation over the warm-up data, so that the scale of no
   entry dominates the reconstruction loss;
 - the random actions of the warm-up and of epsilon-greedy exploration have no latent action of their own: they are
-  encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones.
+  encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones;
+- the mean error to which the correction compares that of a stored action is a running one, over the last hundred or so
+  updates of the codec, instead of the last one;
+- tanh bounds the actor's output; the published code multiplies the gradient by the range that is left (inverting
+  gradients) besides, and clips its norm at 10;
+- exploration is by random actions, ever fewer, and by Gaussian noise of a constant scale; in the published code it is
+  by Gaussian noise alone, whose scale falls from 1 to .1.
 
 TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.5 times as long with it (8.0 instead of
 5.3 ms of CPU time, batches of 256), because it runs the networks as functional calls under vmap.
@@ -114,9 +126,7 @@ class LatentActor(nn.Module):
         output_dim = specs.num_discrete * latent_dim if is_greedy else embedding_dim + latent_dim
         self.net = mlp(specs.observation_dim, hidden_dims, output_dim)
 
-    def forward(
-        self, state: Tensor, embeddings: Tensor, noise: float = 0.0, noise_clip: float = math.inf
-    ) -> Tensor:
+    def forward(self, state: Tensor, embeddings: Tensor, noise: float = 0.0, noise_clip: float = math.inf) -> Tensor:
         """Return the proposals, `[B, num_proposals, embedding_dim + latent_dim]`.
 
         Args:
@@ -142,16 +152,17 @@ class LatentCritics(nn.Module):
         super().__init__()
         self.net = EnsembleMLP(num_members, observation_dim + action_dim, hidden_dims, 1)
 
-    def forward(self, state: Tensor, latent: Tensor) -> Tensor:
+    def forward(self, state: Tensor, latent: Tensor, num_members: int | None = None) -> Tensor:
         """Return the values `[E, B, N]` of N latent actions in each state.
 
         Args:
             state: `[B, observation_dim]`.
             latent: `[B, N, embedding_dim + latent_dim]`.
+            num_members: ask the first networks alone, so many of them.
         """
         batch_size, num_latents, _ = latent.shape
         rows = torch.cat([state.unsqueeze(1).expand(-1, num_latents, -1), latent], -1)
-        return self.net(rows.flatten(0, 1)).reshape(-1, batch_size, num_latents)
+        return self.net(rows.flatten(0, 1), num_members).reshape(-1, batch_size, num_latents)
 
 
 class HyARPolicy(TensorDictModuleBase):
@@ -205,7 +216,7 @@ class HyARPolicy(TensorDictModuleBase):
 
 
 class HyAR(ReplayLearner):
-    """TD3 over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
+    """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
     has_value: ClassVar[bool] = True
 
@@ -331,7 +342,10 @@ class HyAR(ReplayLearner):
 
         This is the representation-shift correction: e is replaced by the discrete action's embedding where it no longer
         decodes to that action; z is encoded anew where the predicted change of the state is off by more than
-        `correction_factor` times the codec's mean error. Latents are `[B, embedding_dim + latent_dim]`.
+        `correction_factor` times the codec's mean error. With `relabelling="sample"` the new e carries noise, and the
+        new z is a sample of the encoder's distribution instead of its mean.
+
+        Latents are `[B, embedding_dim + latent_dim]`.
         """
         state = batch["state"]
         discrete = batch["discrete"]
@@ -369,7 +383,7 @@ class HyAR(ReplayLearner):
         """Update the actor towards higher values of its proposals by the first critic; return the loss."""
         self.critics.requires_grad_(False)
         proposals = self.actor(state, self.codec.embeddings.detach())
-        loss = -self.critics(state, proposals)[0].sum(-1).mean()
+        loss = -self.critics(state, proposals, num_members=1).sum(-1).mean()
         self.optimizer_step("actor", loss)
         self.critics.requires_grad_(True)
         return loss
@@ -394,8 +408,8 @@ class HyAR(ReplayLearner):
         sample = self.buffer.sample(4096)
         with torch.no_grad():
             mean, log_variance = self.codec.encode(sample["state"], sample["discrete"], sample["unit"])
-            # Samples, not means: in a dimension that the codec does not use all means are alike, and their range, mapped
-            # onto [-1, 1], would blow up differences that mean nothing.
+            # Samples, not means: in a dimension that the codec does not use, all means are alike, and mapping their
+            # narrow range onto [-1, 1] would blow up differences that mean nothing.
             z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
         tail = (1.0 - self.latent_coverage) / 2.0
         low, high = z.quantile(tail, 0), z.quantile(1.0 - tail, 0)
