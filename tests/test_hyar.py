@@ -239,3 +239,9 @@ def test_the_range_of_a_latent_dimension_that_the_codec_does_not_use_is_that_of_
             parameter.zero_()  # mean 0 and variance 1 for every action
     learner._fit_latent_range()
     assert (learner.codec.z_high > 1.8).all() and (learner.codec.z_low < -1.8).all()
+
+
+def test_without_a_number_z_has_as_many_dimensions_as_an_action_has_parameters_at_most():
+    assert make(latent_dim=None).codec.latent_dim == 2
+    no_parameters = PAMDPSpecs(4, (), (0, 0), (), ())
+    assert make(no_parameters, latent_dim=None).codec.latent_dim == 1

@@ -232,7 +232,7 @@ class HyAR(ReplayLearner):
         rl: Literal["td3", "ddpg"],
         discrete: Literal["greedy", "nearest"],
         embedding_dim: PositiveInt,
-        latent_dim: PositiveInt,
+        latent_dim: PositiveInt | None,
         codec_hidden_dim: PositiveInt,
         hidden_dims: list[PositiveInt],
         warmup_frames: PositiveInt,
@@ -282,6 +282,7 @@ class HyAR(ReplayLearner):
         self.epsilon_final = epsilon_final
         self.epsilon_frames = epsilon_frames
 
+        latent_dim = latent_dim or max(1, *specs.parameter_dims)
         self.codec = HybridCodec(specs, embedding_dim, latent_dim, codec_hidden_dim)
         self.actor = LatentActor(specs, embedding_dim, latent_dim, hidden_dims, is_greedy=discrete == "greedy")
         num_critics = 2 if is_td3 else 1
