@@ -223,6 +223,7 @@ class HyAR(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
 
     policy: HyARPolicy
+    dynamics_error: Tensor
 
     def __init__(
         self,
