@@ -12,10 +12,11 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
+    rl="td3", discrete="greedy",
     embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000,
     codec_pretrain_updates=1500, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
-    latent_coverage=0.96, correction_threshold=0.1,
-    buffer_size=20_000, batch_size=128, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
+    latent_coverage=0.96, correction_factor=5.0, relabelling="mean",
+    buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
     policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1, epsilon_final=0.05,
     epsilon_frames=3000,
 )  # fmt: skip
@@ -46,11 +47,11 @@ def learn(learner: HyAR, num_batches: int, size: int = 200) -> dict[str, float]:
     return scalars
 
 
-@pytest.fixture(scope="module")
-def trained() -> HyAR:
+@pytest.fixture(scope="module", params=["greedy", "nearest"])
+def trained(request) -> HyAR:
     torch.manual_seed(0)
-    learner = make()
-    learn(learner, 60)
+    learner = make(discrete=request.param)
+    learn(learner, 50)
     return learner
 
 
@@ -80,7 +81,7 @@ def test_latents_that_still_decode_to_their_action_are_kept_and_a_shifted_codec_
         rows["latent"] = torch.cat([trained.codec.embeddings[rows["discrete"]], trained.codec.z_to_unit(mean)], -1)
     _, is_corrected = trained.corrected_latent(rows)
     assert is_corrected.float().mean() < 0.1
-    shifted = make()
+    shifted = make(discrete="greedy" if trained.actor.is_greedy else "nearest")
     shifted.load_state_dict(trained.state_dict())
     with torch.no_grad():
         shifted.codec.table.copy_(shifted.codec.table.flip(0))
@@ -125,3 +126,122 @@ def test_targets_bootstrap_past_truncation_and_not_past_termination(trained):
     torch.testing.assert_close(trained._target(rows), rows["reward"])
     rows["discount"] = torch.full((64,), 0.9)
     assert (trained._target(rows) - rows["reward"]).abs().mean() > 0.05
+
+
+def test_the_greedy_form_takes_the_discrete_action_with_the_highest_q():
+    class OwnCritics(torch.nn.Module):
+        """Values the embedding `favourite` alone, and z by its first entry."""
+
+        favourite = 0
+
+        def forward(self, state, latent):
+            is_favourite = (latent[..., :3] - learner.codec.embeddings[self.favourite]).norm(dim=-1) < 1e-6
+            return is_favourite.float().unsqueeze(0) + 0.1 * latent[..., 3].unsqueeze(0)
+
+    learner = make()
+    learner.policy.critics = learner.target_critics = critics = OwnCritics()
+    td = TensorDict({keys.OBSERVATION: torch.randn(50, 4)}, [50])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        for critics.favourite in range(3):
+            acted = learner.policy(td.clone())
+            assert (acted[keys.DISCRETE] == critics.favourite).all()
+            torch.testing.assert_close(acted[LATENT][:, :3], learner.codec.embeddings[critics.favourite].expand(50, -1))
+
+
+def test_the_target_of_the_greedy_form_is_the_maximum_over_discrete_actions():
+    learner = make(target_noise=0.0)
+    rows = TensorDict(next_state=torch.randn(50, 4), reward=torch.zeros(50), discount=torch.ones(50), batch_size=[50])
+    z = learner.target_actor.net(rows["next_state"]).tanh().unflatten(-1, (3, 3))
+    each = [
+        learner.target_critics(
+            rows["next_state"], torch.cat([learner.codec.embeddings[k].expand(50, -1), z[:, k]], -1).unsqueeze(1)
+        )
+        for k in range(3)
+    ]
+    torch.testing.assert_close(learner._target(rows), torch.cat(each, -1).amin(0).amax(-1))
+
+
+@pytest.mark.parametrize(("discrete", "is_left"), [("nearest", False), ("greedy", True)])
+def test_only_the_greedy_form_leaves_a_discrete_action_whose_neighbours_are_worse(discrete, is_left):
+    # On the line of embeddings the rewards are .5, -1 and 1: the gradient leads back to the first.
+    torch.manual_seed(0)
+    specs = PAMDPSpecs(1, (), (1, 1, 1), (-1.0,) * 3, (1.0,) * 3)
+    learner = make(
+        specs, discrete=discrete, embedding_dim=1, latent_dim=1, codec_every=10**9, actor_lr=2e-3, critic_lr=3e-3
+    )
+    with torch.no_grad():
+        learner.codec.table.copy_(torch.tensor([[-0.8], [0.0], [0.8]]).atanh())
+        if discrete == "nearest":
+            learner.actor.net[-1].weight.zero_()
+            learner.actor.net[-1].bias.copy_(torch.tensor([-1.0, 0.0]))
+    num = 128
+    taken = torch.randint(3, (num,))
+    rows = TensorDict(
+        state=torch.zeros(num, 1), discrete=taken, unit=torch.zeros(num, 3),
+        reward=torch.tensor([0.5, -1.0, 1.0])[taken], next_state=torch.zeros(num, 1), discount=torch.zeros(num),
+        latent=torch.full((num, 2), torch.nan), batch_size=[num],
+    )  # fmt: skip
+    for _ in range(400):
+        learner.updates += 1
+        learner.train_step(rows)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        acted = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(1, 1)}, [1]))
+    assert acted[keys.DISCRETE].item() == (2 if is_left else 0)
+
+
+def test_ddpg_has_one_critic_an_actor_update_each_time_and_no_noise_in_its_targets():
+    learner = make(rl="ddpg", target_noise=0.5, policy_delay=2, warmup_frames=200, codec_pretrain_updates=1)
+    learn(learner, 2)
+    assert learner.critics(torch.zeros(5, 4), torch.zeros(5, 1, 6)).shape == (1, 5, 1)
+    assert make().critics(torch.zeros(5, 4), torch.zeros(5, 1, 6)).shape == (2, 5, 1)
+    before = learner.actor.net[0].weight.clone()
+    learner.updates += 1 + learner.updates % 2  # an odd number, at which TD3 leaves the actor as it is
+    rows = learner.buffer.sample(64)
+    learner.train_step(rows)
+    assert not torch.equal(learner.actor.net[0].weight, before)
+    rows["discount"] = torch.ones(64)
+    assert torch.equal(learner._target(rows), learner._target(rows))
+
+
+def test_a_latent_is_outdated_by_the_codecs_own_error(trained):
+    rows = trained.buffer.sample(1000)
+    rows["latent"] = torch.rand(1000, 6) * 2 - 1
+    usual = trained.dynamics_error.clone()
+    shares = []
+    for factor in (0.01, 1.0, 1e6):
+        trained.dynamics_error.copy_(usual * factor)
+        _, is_corrected = trained.corrected_latent(rows)
+        is_own = trained.codec.nearest_discrete(rows["latent"][:, :3]) == rows["discrete"]
+        shares.append(is_corrected[is_own].float().mean().item())
+    trained.dynamics_error.copy_(usual)
+    assert shares[0] > shares[1] > shares[2] == 0.0
+    assert 0.0 < usual < 1.0
+
+
+def test_relabelling_by_samples_spreads_over_the_latent_space():
+    learner = make(relabelling="sample", discrete="nearest")
+    rows = TensorDict(
+        state=torch.zeros(1000, 4), next_state=torch.zeros(1000, 4), discrete=torch.ones(1000, dtype=torch.long),
+        unit=torch.zeros(1000, 3), latent=torch.full((1000, 6), torch.nan), batch_size=[1000],
+    )  # fmt: skip
+    latent, _ = learner.corrected_latent(rows)
+    assert (latent.std(0) > 0.05).all() and (latent.abs() <= 1.0).all()
+    learner.relabels_with_noise = False
+    latent, _ = learner.corrected_latent(rows)
+    assert (latent.std(0) < 1e-6).all()
+
+
+def test_the_range_of_a_latent_dimension_that_the_codec_does_not_use_is_that_of_its_prior():
+    learner = make()
+    learn(learner, 1)
+    with torch.no_grad():
+        for parameter in learner.codec.encoder[-1].parameters():
+            parameter.zero_()  # mean 0 and variance 1 for every action
+    learner._fit_latent_range()
+    assert (learner.codec.z_high > 1.8).all() and (learner.codec.z_low < -1.8).all()
+
+
+def test_without_a_number_z_has_as_many_dimensions_as_an_action_has_parameters_at_most():
+    assert make(latent_dim=None).codec.latent_dim == 2
+    no_parameters = PAMDPSpecs(4, (), (0, 0), (), ())
+    assert make(no_parameters, latent_dim=None).codec.latent_dim == 1

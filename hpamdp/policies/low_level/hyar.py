@@ -1,11 +1,17 @@
-"""HyAR: TD3 in a learned latent space of discrete actions and their parameters.
+"""HyAR: TD3 or DDPG in a learned latent space of discrete actions and their parameters.
 
 An embedding table and a conditional VAE turn a discrete action and its parameters into one continuous latent action
 (e, z), which is what the actor gives and the critics judge.
 
 Source: Li, Tang, Zheng, Hao, Li, Wang, Meng and Wang, *HyAR: Addressing Discrete-Continuous Action Reinforcement
 Learning via Hybrid Action Representation*, 2022, arXiv 2109.05490: equations 2 to 6 and algorithm 1; TD3: Fujimoto, van
-Hoof and Meger 2018, arXiv 1802.09477.
+Hoof and Meger 2018, arXiv 1802.09477; DDPG: Lillicrap et al. 2016, arXiv 1509.02971.
+
+In the published form (`discrete="nearest"`) the actor gives e and z, and e stands for the discrete action with the
+nearest embedding. It moves along the gradient of Q only, so it stays with a discrete action whose neighbours in the
+latent space are worse, whatever lies behind them. `discrete="greedy"` takes an exact maximum over the discrete actions
+instead: the actor gives a z for each of them, and the one whose own embedding and z have the highest Q is taken, in the
+policy as in the targets. It costs a pass of the critics for each discrete action.
 
 Differs from the source:
 - discrete actions may take different numbers of parameters, which lie side by side; the encoder sees only the chosen
@@ -13,7 +19,13 @@ Differs from the source:
 - the change of the state is predicted in units of its standard deviation over the warm-up data, so that the scale of no
   entry dominates the reconstruction loss;
 - the random actions of the warm-up and of epsilon-greedy exploration have no latent action of their own: they are
-  encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones.
+  encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones;
+- the mean error to which the correction compares that of a stored action is a running one, over the last hundred or so
+  updates of the codec, instead of the last one;
+- tanh bounds the actor's output; the published code multiplies the gradient by the range that is left (inverting
+  gradients) besides, and clips its norm at 10;
+- exploration is by random actions, ever fewer, and by Gaussian noise of a constant scale; in the published code it is
+  by Gaussian noise alone, whose scale falls from 1 to .1.
 
 TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.5 times as long with it (8.0 instead of
 5.3 ms of CPU time, batches of 256), because it runs the networks as functional calls under vmap.
@@ -22,7 +34,8 @@ TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.
 from __future__ import annotations
 
 import copy
-from typing import ClassVar
+import math
+from typing import ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -97,42 +110,102 @@ class HybridCodec(nn.Module):
         return (2.0 * (z - self.z_low) / (self.z_high - self.z_low) - 1.0).clamp(-1.0, 1.0)
 
 
+class LatentActor(nn.Module):
+    """Proposes latent actions (e, z) in [-1, 1]: one for each discrete action, or one alone.
+
+    With `is_greedy`, e is each discrete action's own embedding, and the actor gives a z for each. Otherwise it gives a
+    single (e, z).
+    """
+
+    def __init__(
+        self, specs: PAMDPSpecs, embedding_dim: int, latent_dim: int, hidden_dims: list[int], is_greedy: bool
+    ) -> None:
+        super().__init__()
+        self.is_greedy = is_greedy
+        self.latent_dim = latent_dim
+        output_dim = specs.num_discrete * latent_dim if is_greedy else embedding_dim + latent_dim
+        self.net = mlp(specs.observation_dim, hidden_dims, output_dim)
+
+    def forward(self, state: Tensor, embeddings: Tensor, noise: float = 0.0, noise_clip: float = math.inf) -> Tensor:
+        """Return the proposals, `[B, num_proposals, embedding_dim + latent_dim]`.
+
+        Args:
+            state: `[B, observation_dim]`.
+            embeddings: of the discrete actions, `[num_discrete, embedding_dim]`.
+            noise: standard deviation of the Gaussian noise on what the actor gives.
+            noise_clip: bound of this noise.
+        """
+        output = self.net(state).tanh()
+        if noise > 0.0:
+            added = (noise * torch.randn_like(output)).clamp(-noise_clip, noise_clip)
+            output = (output + added).clamp(-1.0, 1.0)
+        if not self.is_greedy:
+            return output.unsqueeze(1)
+        z = output.unflatten(-1, (-1, self.latent_dim))
+        return torch.cat([embeddings.expand(len(z), -1, -1), z], -1)
+
+
+class LatentCritics(nn.Module):
+    """`num_members` independent networks for Q(s, e, z)."""
+
+    def __init__(self, num_members: int, observation_dim: int, action_dim: int, hidden_dims: list[int]) -> None:
+        super().__init__()
+        self.net = EnsembleMLP(num_members, observation_dim + action_dim, hidden_dims, 1)
+
+    def forward(self, state: Tensor, latent: Tensor, num_members: int | None = None) -> Tensor:
+        """Return the values `[E, B, N]` of N latent actions in each state.
+
+        Args:
+            state: `[B, observation_dim]`.
+            latent: `[B, N, embedding_dim + latent_dim]`.
+            num_members: ask the first networks alone, so many of them.
+        """
+        batch_size, num_latents, _ = latent.shape
+        rows = torch.cat([state.unsqueeze(1).expand(-1, num_latents, -1), latent], -1)
+        return self.net(rows.flatten(0, 1), num_members).reshape(-1, batch_size, num_latents)
+
+
 class HyARPolicy(TensorDictModuleBase):
-    """Decode the actor's latent action; explore with Gaussian noise on it and with uniformly random actions."""
+    """Decode the best of the actor's proposals; explore with Gaussian noise on them and with random actions."""
 
     epsilon: Tensor
 
-    def __init__(self, actor: nn.Module, codec: HybridCodec, specs: PAMDPSpecs, noise: float) -> None:
+    def __init__(
+        self, actor: LatentActor, critics: LatentCritics, codec: HybridCodec, specs: PAMDPSpecs, noise: float
+    ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, LATENT]
         self.actor = actor
+        self.critics = critics
         self.codec = codec
         self.specs = specs
         self.noise = noise
         self.register_buffer("epsilon", torch.ones(()))
 
+    @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters `[*B, num_parameters]` and the latent action.
 
         The latent action is `[*B, embedding_dim + latent_dim]`.
         """
-        state = td.get(keys.OBSERVATION)
+        state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         exploring = not is_greedy()
-        with torch.no_grad():
-            latent = self.actor(state).tanh()
-            if exploring:
-                latent = (latent + self.noise * torch.randn_like(latent)).clamp(-1.0, 1.0)
-            discrete, unit = self.decode(state, latent)
-            if exploring and self.epsilon > 0.0:
-                is_random = torch.rand_like(unit[..., :1]) < self.epsilon
-                unit = torch.where(is_random, 2.0 * torch.rand_like(unit) - 1.0, unit)
-                random_discrete = torch.randint_like(discrete, self.specs.num_discrete)
-                discrete = torch.where(is_random.squeeze(-1), random_discrete, discrete)
-                latent = torch.where(is_random, torch.nan, latent)
-        return td.update(
-            {LATENT: latent, keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}}
-        )
+        proposals = self.actor(state, self.codec.embeddings, self.noise if exploring else 0.0)
+        latent = proposals[:, 0]
+        if proposals.shape[1] > 1:
+            best = self.critics(state, proposals).amin(0).argmax(-1)
+            latent = proposals[torch.arange(len(best), device=best.device), best]
+        discrete, unit = self.decode(state, latent)
+        if exploring and self.epsilon > 0.0:
+            is_random = torch.rand_like(unit[:, :1]) < self.epsilon
+            unit = torch.where(is_random, 2.0 * torch.rand_like(unit) - 1.0, unit)
+            random_discrete = torch.randint_like(discrete, self.specs.num_discrete)
+            discrete = torch.where(is_random.squeeze(-1), random_discrete, discrete)
+            latent = torch.where(is_random, torch.nan, latent)
+        td.set(LATENT, latent.reshape(*td.batch_size, -1))
+        td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
     def decode(self, state: Tensor, latent: Tensor) -> tuple[Tensor, Tensor]:
         """Return the discrete action `[B]` and the parameters `[B, num_parameters]` in [-1, 1] of a latent action."""
@@ -143,19 +216,22 @@ class HyARPolicy(TensorDictModuleBase):
 
 
 class HyAR(ReplayLearner):
-    """TD3 over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
+    """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
 
     policy: HyARPolicy
+    dynamics_error: Tensor
 
     def __init__(
         self,
         specs: PAMDPSpecs,
         device: torch.device,
         *,
+        rl: Literal["td3", "ddpg"],
+        discrete: Literal["greedy", "nearest"],
         embedding_dim: PositiveInt,
-        latent_dim: PositiveInt,
+        latent_dim: PositiveInt | None,
         codec_hidden_dim: PositiveInt,
         hidden_dims: list[PositiveInt],
         warmup_frames: PositiveInt,
@@ -165,7 +241,8 @@ class HyAR(ReplayLearner):
         kl_weight: NonNegativeFloat,
         dynamics_weight: NonNegativeFloat,
         latent_coverage: PositiveFraction,
-        correction_threshold: NonNegativeFloat,
+        correction_factor: PositiveFloat,
+        relabelling: Literal["mean", "sample"],
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
@@ -194,21 +271,26 @@ class HyAR(ReplayLearner):
         self.kl_weight = kl_weight
         self.dynamics_weight = dynamics_weight
         self.latent_coverage = latent_coverage
-        self.correction_threshold = correction_threshold
+        self.correction_factor = correction_factor
+        self.relabels_with_noise = relabelling == "sample"
         self.tau = tau
-        self.policy_delay = policy_delay
-        self.target_noise = target_noise
+        is_td3 = rl == "td3"
+        self.policy_delay = policy_delay if is_td3 else 1
+        self.target_noise = target_noise if is_td3 else 0.0
         self.target_noise_clip = target_noise_clip
         self.epsilon_final = epsilon_final
         self.epsilon_frames = epsilon_frames
 
-        action_dim = embedding_dim + latent_dim
+        latent_dim = latent_dim or max(1, *specs.parameter_dims)
         self.codec = HybridCodec(specs, embedding_dim, latent_dim, codec_hidden_dim)
-        self.actor = mlp(specs.observation_dim, hidden_dims, action_dim)
-        self.critics = EnsembleMLP(2, specs.observation_dim + action_dim, hidden_dims, 1)
+        self.actor = LatentActor(specs, embedding_dim, latent_dim, hidden_dims, is_greedy=discrete == "greedy")
+        num_critics = 2 if is_td3 else 1
+        self.critics = LatentCritics(num_critics, specs.observation_dim, embedding_dim + latent_dim, hidden_dims)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = HyARPolicy(self.actor, self.codec, specs, exploration_noise)
+        self.policy = HyARPolicy(self.actor, self.critics, self.codec, specs, exploration_noise)
+        # The codec's recent mean squared error of the scaled change of the state.
+        self.register_buffer("dynamics_error", torch.ones(()))
         self.to(device)
         self.optimizers = {
             "codec": torch.optim.Adam(self.codec.parameters(), lr=codec_lr, fused=True),
@@ -237,7 +319,7 @@ class HyAR(ReplayLearner):
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
         latent, is_corrected = self.corrected_latent(sample)
-        q = self.critics(torch.cat([sample["state"], latent], -1)).squeeze(-1)
+        q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
         critic_loss = (q - self._target(sample)).square().mean(-1).sum()
         self.optimizer_step("critics", critic_loss)
         scalars = {"critic": critic_loss, "redone": is_corrected.float().mean(), "epsilon": self.policy.epsilon}
@@ -255,8 +337,11 @@ class HyAR(ReplayLearner):
         """Return latents that the codec still decodes to the executed actions, and which of them were corrected, `[B]`.
 
         This is the representation-shift correction: e is replaced by the discrete action's embedding where it no longer
-        decodes to that action; z is encoded anew where the predicted change of the state is off by more than the
-        threshold (mean square of the scaled change). Latents are `[B, embedding_dim + latent_dim]`.
+        decodes to that action; z is encoded anew where the predicted change of the state is off by more than
+        `correction_factor` times the codec's mean error. With `relabelling="sample"` the new e carries noise, and the
+        new z is a sample of the encoder's distribution instead of its mean.
+
+        Latents are `[B, embedding_dim + latent_dim]`.
         """
         state = batch["state"]
         discrete = batch["discrete"]
@@ -265,26 +350,36 @@ class HyAR(ReplayLearner):
             _, change = self.codec.decode(state, discrete, self.codec.z_from_unit(z))
             target = (batch["next_state"] - state) / self.codec.change_scale
             # A random action's latent is NaN; comparisons with it are false, so it is always encoded anew.
-            is_same_change = (change - target).square().mean(-1) <= self.correction_threshold
+            threshold = self.correction_factor * self.dynamics_error
+            is_same_change = (change - target).square().mean(-1) <= threshold
             is_same_discrete = (self.codec.nearest_discrete(e.nan_to_num()) == discrete) & ~e.isnan().any(-1)
-            mean, _ = self.codec.encode(state, discrete, batch["unit"])
-            e = torch.where(is_same_discrete.unsqueeze(-1), e, self.codec.embeddings[discrete])
-            z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(mean))
+            new_e = self.codec.embeddings[discrete]
+            new_z, log_variance = self.codec.encode(state, discrete, batch["unit"])
+            if self.relabels_with_noise:
+                new_e = (new_e + (0.1 * torch.randn_like(new_e)).clamp(-0.5, 0.5)).clamp(-1.0, 1.0)
+                new_z = new_z + (0.5 * log_variance).exp() * torch.randn_like(new_z)
+            e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
+            z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(new_z))
+            if self.actor.is_greedy:
+                e = self.codec.embeddings[discrete]  # the critics are asked about these alone
         return torch.cat([e, z], -1), ~(is_same_discrete & is_same_change)
 
     def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount * min Q'(s', a'), `[B]`, with a' the target actor's latent action plus clipped noise."""
+        """Return r + discount * max over the target actor's proposals a' of min Q'(s', a'), `[B]`.
+
+        The proposals carry clipped noise.
+        """
+        state = batch["next_state"]
         with torch.no_grad():
-            action = self.target_actor(batch["next_state"]).tanh()
-            noise = self.target_noise * torch.randn_like(action)
-            action = (action + noise.clamp(-self.target_noise_clip, self.target_noise_clip)).clamp(-1.0, 1.0)
-            q = self.target_critics(torch.cat([batch["next_state"], action], -1)).squeeze(-1).amin(0)
+            proposals = self.target_actor(state, self.codec.embeddings, self.target_noise, self.target_noise_clip)
+            q = self.target_critics(state, proposals).amin(0).amax(-1)
             return batch["reward"] + batch["discount"] * q
 
     def _update_actor(self, state: Tensor) -> Tensor:
-        """Update the actor towards higher values of the first critic; return the loss."""
+        """Update the actor towards higher values of its proposals by the first critic; return the loss."""
         self.critics.requires_grad_(False)
-        loss = -self.critics(torch.cat([state, self.actor(state).tanh()], -1))[0].mean()
+        proposals = self.actor(state, self.codec.embeddings.detach())
+        loss = -self.critics(state, proposals, num_members=1).sum(-1).mean()
         self.optimizer_step("actor", loss)
         self.critics.requires_grad_(True)
         return loss
@@ -301,13 +396,17 @@ class HyAR(ReplayLearner):
         dynamics = F.mse_loss(change, target)
         loss = reconstruction + self.kl_weight * divergence + self.dynamics_weight * dynamics
         self.optimizer_step("codec", loss)
+        self.dynamics_error.lerp_(dynamics.detach(), 0.01)
         return {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
 
     def _fit_latent_range(self) -> None:
         """Set the range of z to the central `latent_coverage` of the encoded stored actions."""
         sample = self.buffer.sample(4096)
         with torch.no_grad():
-            z, _ = self.codec.encode(sample["state"], sample["discrete"], sample["unit"])
+            mean, log_variance = self.codec.encode(sample["state"], sample["discrete"], sample["unit"])
+            # Samples, not means: in a dimension that the codec does not use, all means are alike, and mapping their
+            # narrow range onto [-1, 1] would blow up differences that mean nothing.
+            z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
         tail = (1.0 - self.latent_coverage) / 2.0
         low, high = z.quantile(tail, 0), z.quantile(1.0 - tail, 0)
         self.codec.z_low.copy_(low)

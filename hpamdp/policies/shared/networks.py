@@ -32,8 +32,10 @@ class EnsembleLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(num_members, 1, out_dim).uniform_(-bound, bound))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply each member to its own slice of `x`."""
-        return torch.baddbmm(self.bias, x, self.weight)
+        """Apply each member to its own slice of `x`; if there are fewer slices, apply the first members alone."""
+        if len(x) == len(self.weight):
+            return torch.baddbmm(self.bias, x, self.weight)
+        return torch.baddbmm(self.bias[: len(x)], x, self.weight[: len(x)])
 
 
 class EnsembleMLP(nn.Module):
@@ -49,9 +51,9 @@ class EnsembleMLP(nn.Module):
         self.num_members = num_members
         self.layers = nn.ModuleList(EnsembleLinear(num_members, size, next_size) for size, next_size in pairwise(dims))
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Apply all members."""
-        x = x.expand(self.num_members, *x.shape)
+    def forward(self, x: Tensor, num_members: int | None = None) -> Tensor:
+        """Apply all members, or the first `num_members`."""
+        x = x.expand(num_members or self.num_members, *x.shape)
         for layer in self.layers[:-1]:
             x = layer(x).relu_()
         return self.layers[-1](x)
