@@ -65,7 +65,7 @@ REFUSED = [
     ("low=qpamdp low.features=[0,0]", "low: features=[0, 0]: names an entry twice"),
     (
         "low=qpamdp low.phi_order=1000000",
-        "low: phi_order=1000000, psi_order=3: the regression for the parameters would have ",
+        "low: phi_order=1000000, psi_order=3: the regression for the parameters would ",
     ),
     ("low=qpamdp low.psi_order=200", "low: phi_order=5, psi_order=200: the regression for the parameters would have "),
     ("high=linucb high.inputs=[1,1]", "high: inputs=[1, 1]: names an entry twice"),
