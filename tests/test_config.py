@@ -222,12 +222,25 @@ def test_a_value_without_a_comment_is_found():
 def test_every_value_of_a_yaml_is_explained_by_a_comment(file):
     text = file.read_text()
     assert text.startswith("#"), f"{file} does not say what it is"
-    if file.parent.name != "experiment":  # whose values are explained where they are defined
+    if file.parent.name not in ("experiment", "recipe"):  # whose values are explained where they are defined
         assert not values_without_comment(text.partition("\nhydra:")[0].partition("\ndefaults:")[2] or text)
 
 
 def test_every_group_has_a_folder():
-    assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, "experiment", "search"}
+    assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, "experiment", "search", "recipe"}
+
+
+def test_a_learner_gets_what_it_needs_on_a_problem_and_the_command_line_has_the_last_word():
+    config = make_config(["env=platform", "high=none", "low=dlpa"])
+    assert (config.low.options["horizon"], config.run.total_frames) == (6, 10000)
+    config = make_config(["env=platform", "high=none", "low=dlpa", "low.horizon=3", "total_frames=64"])
+    assert (config.low.options["horizon"], config.run.total_frames) == (3, 64)
+    assert make_config(["low=dlpa"]).low.options["horizon"] != 6
+
+
+def test_every_recipe_is_of_a_problem_and_a_learner():
+    pairs = {f"{env}_{low}" for env in choices("env") for low in choices("low")}
+    assert {file.stem for file in CONF.glob("recipe/*.yaml")} <= pairs
 
 
 def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):
