@@ -17,8 +17,8 @@ OPTIONS = dict(
     codec_pretrain_updates=1500, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, relabelling="mean",
     buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
-    policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1, epsilon_final=0.05,
-    epsilon_frames=3000,
+    lr_final=1.0, lr_frames=0, policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1,
+    epsilon_final=0.05, epsilon_frames=3000,
 )  # fmt: skip
 
 
@@ -245,3 +245,12 @@ def test_without_a_number_z_has_as_many_dimensions_as_an_action_has_parameters_a
     assert make(latent_dim=None).codec.latent_dim == 2
     no_parameters = PAMDPSpecs(4, (), (0, 0), (), ())
     assert make(no_parameters, latent_dim=None).codec.latent_dim == 1
+
+
+def test_the_learning_rates_fall_to_their_final_fraction():
+    learner = make(lr_final=0.1, lr_frames=1000, codec_lr=2e-3, actor_lr=1e-3, critic_lr=3e-3)
+    rates = []
+    for frames in (0, 500, 1000, 5000):
+        learner.explore(frames)
+        rates.append([learner.optimizers[name].param_groups[0]["lr"] for name in ("codec", "actor", "critics")])
+    assert rates == [pytest.approx([f * 2e-3, f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]

@@ -250,6 +250,8 @@ class HyAR(ReplayLearner):
         tau: PositiveFraction,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
+        lr_final: PositiveFraction,
+        lr_frames: NonNegativeInt,
         policy_delay: PositiveInt,
         target_noise: NonNegativeFloat,
         target_noise_clip: NonNegativeFloat,
@@ -274,6 +276,8 @@ class HyAR(ReplayLearner):
         self.correction_factor = correction_factor
         self.relabels_with_noise = relabelling == "sample"
         self.tau = tau
+        self.lr_final = lr_final
+        self.lr_frames = lr_frames
         is_td3 = rl == "td3"
         self.policy_delay = policy_delay if is_td3 else 1
         self.target_noise = target_noise if is_td3 else 0.0
@@ -292,6 +296,7 @@ class HyAR(ReplayLearner):
         # The codec's recent mean squared error of the scaled change of the state.
         self.register_buffer("dynamics_error", torch.ones(()))
         self.to(device)
+        self.learning_rates = {"codec": codec_lr, "actor": actor_lr, "critics": critic_lr}
         self.optimizers = {
             "codec": torch.optim.Adam(self.codec.parameters(), lr=codec_lr, fused=True),
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
@@ -313,8 +318,12 @@ class HyAR(ReplayLearner):
         self._fit_latent_range()
 
     def explore(self, frames: int) -> None:
-        """Lower the fraction of random actions."""
+        """Lower the fraction of random actions and the learning rates."""
         self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
+        fraction = linear_schedule(frames, self.lr_frames, self.lr_final)
+        for name, rate in self.learning_rates.items():
+            for group in self.optimizers[name].param_groups:
+                group["lr"] = rate * fraction
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
