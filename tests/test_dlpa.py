@@ -161,7 +161,7 @@ def counting_batches(num_environments: int, num_batches: int, num_steps: int, op
 
 @pytest.mark.parametrize("buffer_size", [5000, 40])
 def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_or_option(buffer_size):
-    learner = make(horizon=3, buffer_size=buffer_size)
+    learner = make(horizon=3, buffer_size=buffer_size, batch_size=min(64, buffer_size))
     for batch in counting_batches(4, 12, 3):
         learner.store(batch, batch[keys.OPTION] == 1)
     windows = next_windows(learner)
@@ -184,7 +184,7 @@ def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_o
 @pytest.mark.parametrize("num_steps", [1, 2, 5])
 def test_windows_cross_no_option_that_changes_inside_an_episode(num_steps, buffer_size, is_shared):
     option_length = 2
-    learner = make(horizon=4, buffer_size=buffer_size, batch_size=512, warmup_frames=1000)
+    learner = make(horizon=4, buffer_size=buffer_size, batch_size=min(512, buffer_size), warmup_frames=1000)
     for batch in counting_batches(4, 60 // num_steps, num_steps, option_length):
         learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool) if is_shared else batch[keys.OPTION] == 1)
     windows = next_windows(learner)

@@ -252,15 +252,12 @@ def test_epsilon_can_fall_with_the_episodes():
     assert learner.policy.epsilon == pytest.approx(0.2)
 
 
-def test_the_scale_of_rewards_changes_the_stored_ones_and_not_the_value():
+def test_rewards_are_stored_scaled():
     torch.manual_seed(0)
     learner = make(reward_scale=0.1, warmup_frames=10_000)
     td = one_step_rows(learner, 50)
     learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
     torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * td["next", keys.REWARD].flatten())
-    state = torch.randn(5, 4)
-    q = learner.critics(state, learner.actor(state)).amin(0).amax(-1)
-    torch.testing.assert_close(learner.value(state), 10.0 * q)
 
 
 def test_the_published_recipe_has_the_published_settings_and_runs_where_there_are_no_initial_parameters():

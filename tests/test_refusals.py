@@ -79,7 +79,7 @@ REFUSED = [
     ("low=random low._target_=hpamdp.policies.random_agent.random_agent", "there is no class random_agent in "),
     ("low=random low._target_=torch.nn.Identity", "low=random: Identity is no Learner (hpamdp.policies.base)"),
     ("high=uniform high._target_=torch.nn.Identity", "high=uniform: Identity is no Selector (hpamdp.policies.base)"),
-    ("low._target_=collections.OrderedDict", "; and 22 more like this"),
+    ("low._target_=collections.OrderedDict", " more like this"),
     ("agent=null", "agent=null: must be a mapping (conf/config.yaml)"),
     ("env.motor_noise=[1]", "env.motor_noise=[1]: must be a valid number or must have at least 2 items (BoatDockEnv"),
     ("low=hppo low.critic_hidden_dims=[]", "low.critic_hidden_dims=[]: must have at least 1 item (HPPO"),
