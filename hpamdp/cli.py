@@ -176,6 +176,8 @@ def _check_groups(words: list[str], conf: Path) -> None:
     for override in OverridesParser.create().parse_overrides(words):
         if not override.key_or_group or override.key_or_group == "hydra":
             raise ConfigError(f"{override.input_line}: {_GRAMMAR}")
+        if override.is_delete() and override.key_or_group in GROUPS:
+            raise ConfigError(f"{override.key_or_group}: nothing chosen; set {override.key_or_group}=NAME")
         folder = conf / override.key_or_group
         if not folder.is_dir() or override.is_delete():
             continue

@@ -13,6 +13,7 @@ import torch
 from conftest import CONF, TRAINED, compose_config, make_config
 
 from hpamdp.config import ConfigError
+from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.worker import EnvShard, PolicyCopy, packed
 from hpamdp.run.recorder import Recorder
@@ -239,7 +240,8 @@ def test_a_terminals_ctrl_c_stops_all_processes_and_the_run_goes_on_in_one(colle
         time.sleep(0.1)
     assert not processes_of(process.pid)
     frames = len(metrics.read_text().splitlines())
-    overrides = [f"resume={tmp_path / 'run'}", "collector=single", "total_frames=32"]
+    more = checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] + 32
+    overrides = [f"resume={tmp_path / 'run'}", "collector=single", f"total_frames={more}"]
     assert run(compose_config(overrides), tmp_path / "resumed", overrides) == 0 and frames > 3
 
 

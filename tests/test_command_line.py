@@ -181,6 +181,7 @@ def test_the_script_tells_a_mistake_in_one_line(tmp_path):
     assert done.stderr.startswith("low.lrr: no such option of HyAR") and done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_script_tells_a_mistake_inside_a_job_in_one_line(tmp_path):
     done = run_script("--multirun", "high.exploration=0", "low=random", cwd=tmp_path)
     assert done.returncode == 2

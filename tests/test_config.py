@@ -151,7 +151,10 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
     assert group != "low" or set(cfg[group].budget) == {"num_envs", "steps_per_batch", "total_frames", "eval_every"}
 
 
-@pytest.mark.parametrize("experiment", choices("experiment"))
+EXPERIMENTS = [*choices("experiment"), *(f"domains/{name}" for name in choices("experiment/domains"))]
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_an_experiment_is_a_valid_config(experiment):
     assert make_config([f"experiment={experiment}"])
 
@@ -222,7 +225,8 @@ def test_a_value_without_a_comment_is_found():
 def test_every_value_of_a_yaml_is_explained_by_a_comment(file):
     text = file.read_text()
     assert text.startswith("#"), f"{file} does not say what it is"
-    if file.parent.name not in ("experiment", "recipe"):  # whose values are explained where they are defined
+    # The values of these are explained where they are defined.
+    if file.relative_to(CONF).parts[0] not in ("experiment", "recipe"):
         assert not values_without_comment(text.partition("\nhydra:")[0].partition("\ndefaults:")[2] or text)
 
 

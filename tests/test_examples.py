@@ -16,6 +16,7 @@ def test_examples_in_plain_torchrl_import_only_our_environments(file):
     assert ours and all(module.startswith("hpamdp.env.") for module in ours)
 
 
+@pytest.mark.slow
 def test_an_option_policy_in_plain_torchrl_beats_either_boat_alone(capsys):
     scores = runpy.run_path(str(EXAMPLES / "option_policy_plain_torchrl.py"))["main"](10)
     assert list(scores) == ["incongruent", "congruent", "learned"]

@@ -1,16 +1,18 @@
 """The examples of examples/extending run from outside the package, by the commands that their README gives."""
 
 import json
+import multiprocessing
 import os
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
+
+from hpamdp import cli
 
 FOLDER = Path(__file__).resolve().parent.parent / "examples" / "extending"
 COMMANDS = re.findall(r"^python (-m hpamdp\.cli .*)$", (FOLDER / "README.md").read_text(), re.MULTILINE)
@@ -19,11 +21,20 @@ SHORT = ["num_envs=8", "steps_per_batch=4", "total_frames=256", "eval.every=0", 
 
 
 def run(words: list[str], folder: Path) -> dict:
-    environment = os.environ | {"PYTHONPATH": str(FOLDER.parent.parent)}
-    command = [sys.executable, *words, f"hydra.run.dir={folder}"]
-    done = subprocess.run(command, cwd=FOLDER, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    """Run `python -m hpamdp.cli ...` in the examples' folder, in a process of its own."""
+    assert words[:2] == ["-m", "hpamdp.cli"]
+    # Forked, because the imports take longer than the run.
+    child = multiprocessing.get_context("fork").Process(target=_main, args=([*words[2:], f"hydra.run.dir={folder}"],))
+    child.start()
+    child.join()
+    assert child.exitcode == 0
     return json.loads((folder / "summary.json").read_text())
+
+
+def _main(words: list[str]) -> None:
+    os.chdir(FOLDER)
+    sys.argv = ["hpamdp", *words]
+    cli.main()
 
 
 def test_the_readme_has_a_command_for_each_file():

@@ -47,7 +47,7 @@ def learn(learner: HyAR, num_batches: int, size: int = 200) -> dict[str, float]:
     return scalars
 
 
-@pytest.fixture(scope="module", params=["greedy", "nearest"])
+@pytest.fixture(scope="module", params=["greedy", pytest.param("nearest", marks=pytest.mark.slow)])
 def trained(request) -> HyAR:
     torch.manual_seed(0)
     learner = make(discrete=request.param)

@@ -29,7 +29,7 @@ def rows_with_scores(num: int = 200) -> TensorDict:
     return sample(num).set(SCORES, torch.rand(num, 3) * 2 - 1)
 
 
-@pytest.mark.parametrize("twin", [False, True])
+@pytest.mark.parametrize("twin", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters(twin):
     torch.manual_seed(0)
     learner = make(twin=twin)

@@ -33,7 +33,10 @@ def learn(learner: PDQN, num_batches: int, size: int = 200) -> None:
         learner.learn(one_step_rows(learner, size), torch.ones(size, 1, dtype=torch.bool))
 
 
-@pytest.mark.parametrize("changes", [{}, PUBLISHED, {"bounding": "inverting_gradients", "double_q": True}])
+OTHER_FORMS = [PUBLISHED, {"bounding": "inverting_gradients", "double_q": True}]
+
+
+@pytest.mark.parametrize("changes", [{}, *(pytest.param(form, marks=pytest.mark.slow) for form in OTHER_FORMS)])
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters(changes):
     torch.manual_seed(0)
     learner = make(**changes)

@@ -237,6 +237,7 @@ def compiled():
     return torch.compile(press_and_step, fullgraph=True, dynamic=False)
 
 
+@pytest.mark.slow
 def test_compiled_and_eager_agree(compiled):
     num = 4096
     rows = torch.arange(num, dtype=torch.int32)

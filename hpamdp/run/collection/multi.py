@@ -26,11 +26,14 @@ class MultiCollection(WorkerCollection):
 
     def _death(self) -> str | None:
         workers = self._collector.procs
-        connection.wait([worker.sentinel for worker in workers if not worker._closed], _PATIENCE_S)
+        ended = connection.wait([worker.sentinel for worker in workers if not worker._closed], _PATIENCE_S)
         for i, worker in enumerate(workers):
-            if worker._closed or worker.exitcode is None:
+            if worker._closed or worker.sentinel not in ended:
                 continue
+            worker.join(_PATIENCE_S)  # its files are closed before it has an exit code
             code = worker.exitcode
+            if code is None:
+                continue
             why = f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
             return f"collector=multi: worker {i} of {len(workers)} died ({why})"
         return None
