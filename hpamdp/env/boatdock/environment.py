@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
+_PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 
 
@@ -228,16 +229,23 @@ class BoatDockEnv(PAMDPEnv):
         return figures.draw(evaluation, summary)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the boats' columns."""
-        return self._state._asdict()
+        """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
+        plans = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
+        return {**self._state._asdict(), **plans}
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Put the boats where `state_columns` were taken."""
-        if len(columns["episode"]) != self.num_envs:
-            raise ValueError(
-                f"BoatDockEnv: the state of {len(columns['episode'])} boats, but there are {self.num_envs}"
-            )
-        self.state = BoatState(**columns)
+        """Continue from an `env_state`.
+
+        Raises:
+            ValueError: it is not the state of this many boats.
+        """
+        plans = {name.removeprefix(_PLAN): plan for name, plan in columns.items() if name.startswith(_PLAN)}
+        boats = {name: column for name, column in columns.items() if not name.startswith(_PLAN)}
+        if len(boats["episode"]) != self.num_envs:
+            raise ValueError(f"BoatDockEnv: the state of {len(boats['episode'])} boats, but there are {self.num_envs}")
+        self.state = BoatState(**boats)
+        if self._oracle is not None and plans:
+            self._oracle.set_plans(plans)
 
     def _make_specs(self) -> None:
         n, device = self.num_envs, self.device

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -46,6 +48,15 @@ class BoatDockOracle:
         shape = (num_envs, _num_plans(rules), planner.MAX_PRESSES)
         self.keys = torch.zeros(shape, dtype=torch.long, device=device)
         self.durations = torch.zeros(shape, device=device)
+
+    def plans(self) -> dict[str, Tensor]:
+        """Return the attributes for a checkpoint: a plan is made at the start of its episode."""
+        return {"option": self.option, "keys": self.keys, "durations": self.durations}
+
+    def set_plans(self, plans: Mapping[str, Tensor]) -> None:
+        """Continue with what `plans` returned."""
+        for name, plan in plans.items():
+            getattr(self, name).copy_(plan)
 
     def plan(self, state: BoatState, rows: Tensor) -> None:
         """Plan for the boats of `rows` bool `[N]` from where they are."""
