@@ -36,7 +36,7 @@ def scores(folder: Path) -> list[dict[str, str]]:
 
 def weights(folder: Path) -> dict[str, torch.Tensor]:
     """Return the agent's tensors of a run's checkpoint."""
-    return torch.load(folder / "policy.pt", weights_only=True)["state"]
+    return torch.load(folder / "policy.pt", weights_only=True)["agent"]
 
 
 def is_same(one: Path, other: Path) -> bool:
