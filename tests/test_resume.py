@@ -102,7 +102,8 @@ def kill(given: list[str], folder: Path) -> None:
 def run_reproducibly(test: str) -> None:
     """Run a test of this file in a process of its own in which the products of matrices are reproducible."""
     command = [sys.executable, "-m", "pytest", "-q", "-m", "slow", "-p", "no:cacheprovider", f"{__file__}::{test}"]
-    subprocess.run(command, env={**os.environ, "MKL_CBWR": "COMPATIBLE"}, check=True)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    subprocess.run(command, env={**environment, "MKL_CBWR": "COMPATIBLE"}, check=True)
 
 
 def words_of(high: str, low: str) -> list[str]:
