@@ -5,8 +5,6 @@ import itertools
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,8 +20,6 @@ from hpamdp.run.train import run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=640", "eval.layouts=6", "eval.every=256", "log_every=64"]
 STOPPED_AFTER = 9  # batches, in the middle of a log interval
-# Otherwise products of matrices depend on where these lie in memory, and two runs of Q-PAMDP differ by rounding.
-IS_REPRODUCIBLE = os.environ.get("MKL_CBWR") == "COMPATIBLE"
 SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
 QUICK = {"meta_critic": ["high.warmup_decisions=20", "high.batch_size=16"], "actor": ["high.minibatch_size=32"]}
 
@@ -99,13 +95,6 @@ def kill(given: list[str], folder: Path) -> None:
     assert child.exitcode == -signal.SIGKILL
 
 
-def run_reproducibly(test: str) -> None:
-    """Run a test of this file in a process of its own in which the products of matrices are reproducible."""
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "slow", "-p", "no:cacheprovider", f"{__file__}::{test}"]
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-    subprocess.run(command, env={**environment, "MKL_CBWR": "COMPATIBLE"}, check=True)
-
-
 def words_of(high: str, low: str) -> list[str]:
     return [f"high={high}", f"low={low}", *SHORT.get(low, []), *QUICK.get(high, []), *SMALL]
 
@@ -128,9 +117,6 @@ def test_every_signal_that_stops_a_run_saves_it(number, tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize(("high", "low"), list(itertools.product(SELECTORS, TRAINED)))
 def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
-    if low == "qpamdp" and not IS_REPRODUCIBLE:
-        run_reproducibly(f"test_every_pair_resumes_to_the_last_bit[{high}-{low}]")
-        return
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
     stop_and_resume(words_of(high, low), tmp_path, monkeypatch, *numbers)
 
@@ -143,9 +129,6 @@ def test_a_killed_run_resumes_from_its_last_checkpoint_to_the_last_bit(tmp_path,
     "low", ["hppo", *(pytest.param(low, marks=pytest.mark.slow) for low in TRAINED if low != "hppo")]
 )
 def test_a_run_with_worker_processes_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
-    if low == "qpamdp" and not IS_REPRODUCIBLE:
-        run_reproducibly(f"test_a_run_with_worker_processes_resumes_to_the_last_bit[{low}]")
-        return
     stop_and_resume([*words_of("ucb", low), "collector=multi"], tmp_path, monkeypatch, signal.SIGTERM)
 
 

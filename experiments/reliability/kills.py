@@ -62,11 +62,14 @@ def main() -> None:
             ending = command_line.run([*words, *COMMON, "hydra.run.dir=run"], root / name, 600)
             assert ending.code == 0, (name, ending)
             durations[name] = time.monotonic() - begin
-        for number in range(arguments.kills):
-            name = list(RUNS)[number % len(RUNS)]
-            folder = root / f"{name}-{number}"
-            kill_and_resume(name, folder, root / name / "run", moments.uniform(0.0, durations[name]), counts[name])
-            shutil.rmtree(folder)
+        try:
+            for number in range(arguments.kills):
+                name = list(RUNS)[number % len(RUNS)]
+                folder = root / f"{name}-{number}"
+                kill_and_resume(name, folder, root / name / "run", moments.uniform(0.0, durations[name]), counts[name])
+                shutil.rmtree(folder)
+        except KeyboardInterrupt:
+            print("stopped early")
     print("| run | " + " | ".join(counts["hppo"]) + " |")
     for name, row in counts.items():
         print(f"| {name} | " + " | ".join(map(str, row.values())) + " |")

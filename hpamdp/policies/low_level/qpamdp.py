@@ -309,7 +309,10 @@ class NaturalActorCritic(SizedByData):
             size 1 along them causes, in nats an episode, `[]`.
         """
         penalty = self.ridge * self.gram.diagonal().mean() * torch.eye(len(self.gram)).to(self.gram)
-        solution = torch.linalg.lstsq(self.gram + penalty, self.moment.unsqueeze(-1)).solution[:num_weights, 0]
+        # With gelsy, the default on the CPU, the last digits differ from run to run, and a resumed run from its own.
+        driver = "gelsd" if self.gram.device.type == "cpu" else None
+        regression = torch.linalg.lstsq(self.gram + penalty, self.moment.unsqueeze(-1), driver=driver)
+        solution = regression.solution[:num_weights, 0]
         fisher = self.gram[:num_weights, :num_weights] / self.num_episodes
         return solution.float(), (0.5 * solution @ fisher @ solution).float()
 
