@@ -63,6 +63,14 @@ def crossing(*words: str) -> Config:
             "high=none env=platform agent.option_length=3",
             "agent.option_length=3: env=platform has no options; use agent.option_length=episode",
         ),
+        *(
+            (
+                f"high={high} env=crossing low=stepper agent.option_length=3",
+                f"agent.option_length=3: high={high} is a bandit, which counts what an option pays and nothing of what "
+                "follows it; use agent.option_length=episode, high=meta_critic or high=actor",
+            )
+            for high in ("ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson")
+        ),
         (
             "high=none env.controller=random low.freeze=true",
             "low.freeze=true: there is no choice left to learn; use low.freeze=false",

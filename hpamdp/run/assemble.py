@@ -283,6 +283,11 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
         raise ConfigError(
             f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
         )
+    if length != "episode" and getattr(config.high.cls, "is_bandit", False):
+        raise ConfigError(
+            f"agent.option_length={length}: {config.high} is a bandit, which counts what an option pays and nothing of "
+            "what follows it; use agent.option_length=episode, high=meta_critic or high=actor"
+        )
 
 
 def check_modes(config: Config) -> None:

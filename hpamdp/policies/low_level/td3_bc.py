@@ -179,12 +179,14 @@ class TD3BC(ReplayLearner):
         return loss
 
     @torch.no_grad()
-    def _target(self, sample: TensorDictBase) -> Tensor:
-        """Return r + discount max_k Q'(s', k, x'(s')) over the allowed discrete actions k, `[B]`."""
-        state = sample["next_state"]
-        unit = self.target_actor(state)
+    def value(self, observation: Tensor) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`."""
+        unit = self.target_actor(observation)
         bound = self.target_smoothing_clip
         noise = (self.target_smoothing * torch.randn_like(unit)).clamp(-bound, bound)
-        q = self.target_critics(state, (unit + noise).clamp(-1.0, 1.0)).amin(0)
-        best = q.masked_fill(self.policy.is_rare(state), -torch.inf).amax(-1)
-        return sample["reward"] + sample["discount"] * best
+        q = self.target_critics(observation, (unit + noise).clamp(-1.0, 1.0)).amin(0)
+        return q.masked_fill(self.policy.is_rare(observation), -torch.inf).amax(-1)
+
+    def _target(self, sample: TensorDictBase) -> Tensor:
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return sample["reward"] + sample["discount"] * self.next_value(sample)
