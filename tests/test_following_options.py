@@ -172,7 +172,9 @@ def test_a_replayed_step_is_followed_by_the_option_that_the_selector_would_choos
     seen = torch.cat([state, torch.tensor([[1.0, 0.0]]).expand(20, 2)], -1) if is_shared else state
     chosen_then = torch.randint(2, (20,))
     is_ended = torch.rand(20) < 0.7
-    sample = TensorDict({"next_state": seen, "option_ended": is_ended, "next_option": chosen_then}, [20])
+    sample = TensorDict(
+        {"next_state": seen, "option_ended": is_ended, "next_option": chosen_then, "option": chosen_then}, [20]
+    )
     expected = []
     for i in range(20):
         option = int(state[i, 0] > 0.0) if is_ended[i] else 0
@@ -183,16 +185,16 @@ def test_a_replayed_step_is_followed_by_the_option_that_the_selector_would_choos
 def test_a_replayed_step_is_followed_by_the_option_of_that_time_if_the_selector_needs_more_than_the_observation():
     agent = make_agent("pdqn", OfTold(), is_shared=False)
     option = torch.randint(2, (20,))
-    assert torch.equal(agent.learners[0].following.choose(torch.rand(20, 2), option), option)
+    assert torch.equal(agent.learners[0].following.choose(torch.rand(20, 2), option, option), option)
     agent = make_agent("pdqn", OfSign(SPECS), is_shared=False)
-    assert agent.learners[0].following.choose(torch.rand(20, 2), option).tolist() == [1] * 20
+    assert agent.learners[0].following.choose(torch.rand(20, 2), option, option).tolist() == [1] * 20
 
 
 def test_asking_the_selector_again_leaves_its_exploration_alone():
     agent = make_agent("pdqn", OfSign(SPECS), is_shared=False)
     seen = []
     agent.selector.select = lambda td: seen.append(exploration_type()) or td[keys.OBSERVATION][..., 0].long()
-    agent.learners[0].following.choose(torch.rand(20, 2), torch.zeros(20).long())
+    agent.learners[0].following.choose(torch.rand(20, 2), *torch.zeros(2, 20).long())
     assert seen == [ExplorationType.DETERMINISTIC] and exploration_type() != ExplorationType.DETERMINISTIC
 
 

@@ -35,10 +35,11 @@ class DecisionTracker(Transform):
 
     Args:
         gamma: discount of an environment step within the option.
-        option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode.
+        option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode;
+            `math.inf`: the selector ends it, by setting `is_decision` in the root of the step that it chooses anew at.
     """
 
-    def __init__(self, gamma: float = 1.0, option_length: int | None = None) -> None:
+    def __init__(self, gamma: float = 1.0, option_length: float | None = None) -> None:
         super().__init__()
         self.gamma = gamma
         self.option_length = option_length
@@ -119,6 +120,6 @@ class DecisionEnv(TransformedEnv):
         return self.transform._reset(fresh.empty() if given is None else given, fresh)
 
 
-def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: int | None = None) -> DecisionEnv:
+def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionEnv:
     """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
     return DecisionEnv(env, DecisionTracker(gamma, option_length))

@@ -115,19 +115,47 @@ class NextOptions:
                 value[rows] = learner.value(observation[rows])
         return value
 
+    @property
+    def decides_ends(self) -> bool:
+        """Whether the selector decides where options end."""
+        return self.selector.decides_ends
+
     @torch.no_grad()
-    def choose(self, observation: Tensor, option: Tensor) -> Tensor:
+    def choose(self, observation: Tensor, option: Tensor, held: Tensor) -> Tensor:
         """Return the selector's greedy options `[N]`, or the given ones if it needs more than the observation."""
         if not self.sees_observation_alone:
             return option
-        return self.greedy(TensorDict({keys.OBSERVATION: self._without_option(observation)}, [len(observation)]))
+        seen = {keys.OBSERVATION: self._without_option(observation)}
+        return self.greedy(TensorDict(seen, [len(observation)]), held)
 
     @torch.no_grad()
-    def greedy(self, td: TensorDictBase) -> Tensor:
-        """Return the selector's greedy options `[N]`, given what it reads of the states `[N]` but for `is_decision`."""
+    def greedy(self, td: TensorDictBase, held: Tensor) -> Tensor:
+        """Return the selector's greedy options `[N]`; where it decides so, the held ones `[N]` go on.
+
+        Args:
+            td: what it reads of the states `[N]` but for `is_decision`.
+            held: the options before.
+        """
         is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
+        td = td.copy().set(keys.IS_DECISION, is_decision).set(keys.OPTION, held)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            return self.selector.choose(td.copy().set(keys.IS_DECISION, is_decision))[keys.OPTION]
+            option = self.selector.choose(td)[keys.OPTION]
+            return torch.where(self.selector.ends(td), option, held) if self.decides_ends else option
+
+    def with_ends(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return a shallow copy of a batch `[*B, T]` with the ends that the selector decided on, a step later each.
+
+        Whether an option ends with the batch will be known with the next one. For learners it does (`option_ended`),
+        and may be followed by itself; for the selector it does not (`is_decision`).
+        """
+        done = batch.get(("next", keys.DONE))
+        is_ended = batch.get(keys.IS_DECISION).roll(-1, -2) & ~done
+        is_ended[..., -1, :] = False
+        batch = batch.copy()
+        batch.set(("next", keys.IS_DECISION), is_ended | done)
+        is_ended = is_ended.clone()
+        is_ended[..., -1, :] = True
+        return batch.set(("next", keys.OPTION_ENDED), is_ended)
 
     def with_next_option(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a shallow copy of a batch `[*B, T]` in which `("next", "option")` holds in the next state, `[*B, T]`.
@@ -140,7 +168,7 @@ class NextOptions:
         is_missing[..., -1] = is_ended[..., -1]
         following = torch.where(is_ended, option.roll(-1, -1), option)
         if is_missing.any():
-            following[is_missing] = self.greedy(batch.get("next")[is_missing])
+            following[is_missing] = self.greedy(batch.get("next")[is_missing], option[is_missing])
         return batch.copy().set(keys.NEXT_OPTION, following)
 
     def _without_option(self, observation: Tensor) -> Tensor:
@@ -159,6 +187,7 @@ class HierarchicalAgent(nn.Module):
         is_frozen: whether the learners stay as they are.
         uniform_option_frames: number of steps (of decisions, if the learners are frozen) at the beginning for which the
             selector's exploring choices are uniform. The selector learns from them.
+        selector_ends_options: whether the selector decides where options end.
 
     Attributes:
         policy: writes `option`, if there is a selector, and the action leaves.
@@ -176,6 +205,7 @@ class HierarchicalAgent(nn.Module):
         is_shared: bool = False,
         is_frozen: bool = False,
         uniform_option_frames: int = 0,
+        selector_ends_options: bool = False,
     ) -> None:
         super().__init__()
         self.selector = selector
@@ -190,6 +220,7 @@ class HierarchicalAgent(nn.Module):
         self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
         self.next_options: NextOptions | None = None
         if selector is not None:
+            selector.decides_ends = selector_ends_options
             self.next_options = NextOptions(selector, learners, is_shared)
             for learner in learners:
                 learner.following = self.next_options
@@ -203,10 +234,13 @@ class HierarchicalAgent(nn.Module):
         scalars: dict[str, float] = {}
         self.frames += batch.numel()
         if self.selector is not None:
+            if self.selector.decides_ends and self.next_options is not None:
+                batch = self.next_options.with_ends(batch)
             self._set_is_uniform()
             self._set_pending(self.selector, batch)
             decisions = _finished_decisions(batch)
             learned = self.selector.learn(decisions) if len(decisions) else {}
+            learned = {**learned, **self.selector.learn_from_steps(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars

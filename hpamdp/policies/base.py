@@ -22,7 +22,8 @@ def is_greedy() -> bool:
 
 def option_ends(batch: TensorDictBase) -> Tensor:
     """Return where an episode or an option ends, bool `[*B, T, 1]`; another option's rows may follow."""
-    return batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
+    is_end = batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
+    return is_end | batch.get(("next", keys.OPTION_ENDED), False)
 
 
 class Following(Protocol):
@@ -36,10 +37,20 @@ class Following(Protocol):
         """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen."""
         ...
 
-    def choose(self, observation: Tensor, option: Tensor) -> Tensor:
+    @property
+    def decides_ends(self) -> bool:
+        """Whether the selector decides where options end; otherwise they end where they did at the time."""
+        ...
+
+    def choose(self, observation: Tensor, option: Tensor, held: Tensor) -> Tensor:
         """Return the options `[N]` that the selector would now choose greedily in states `[N, observation_dim]`.
 
-        They are the given options `[N]`, which were chosen at the time, if it would need more than the observation.
+        Where it decides that the held option goes on, that is the held one.
+
+        Args:
+            observation: of the states in which an option has ended or may end.
+            option: chosen at the time, `[N]`. The result, if the selector would need more than the observation.
+            held: the options before, `[N]`.
         """
         ...
 
@@ -93,6 +104,8 @@ class Selector(TensorDictModuleBase):
             keys that `select` reads to `in_keys`. Environments without such an argument are refused.
         gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
             it, and so is the value of the next decision, see `next_discount`.
+        ends_options: whether the selector can decide where options end, by `ends`.
+        decides_ends: whether it does so in this run (`agent.option_length=learned`); the agent sets it.
         is_bandit: whether the selector takes what an option paid for all that its choice was worth. It then is for
             options that last as long as their episodes, after which nothing follows; others are refused.
         modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others
@@ -107,6 +120,8 @@ class Selector(TensorDictModuleBase):
 
     needs: ClassVar[tuple[str, ...]] = ()
     is_bandit: ClassVar[bool] = False
+    ends_options: ClassVar[bool] = False
+    decides_ends: bool = False
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0
     is_uniform: Tensor
@@ -140,6 +155,20 @@ class Selector(TensorDictModuleBase):
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return a uniformly random choice: a tensor `[*B]` for each of `out_keys`."""
         return {keys.OPTION: torch.randint(self.specs.num_options, td.batch_size, device=self.is_uniform.device)}
+
+    def ends(self, td: TensorDictBase) -> Tensor:
+        """Return where the held `option` `[*B]` of `td` ends, given `observation`, bool `[*B]`; greedily or exploring.
+
+        Asked at every step but those that begin an episode, if `decides_ends`. Override it if `ends_options`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not decide where options end")
+
+    def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learn from every step of a collected batch `[*B, T]`, as `Learner.learn` gets it; return scalars to log.
+
+        For selectors that learn within options; called after `learn`.
+        """
+        return {}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first, and return scalars to log as `high/<name>`.
@@ -198,6 +227,9 @@ class Selector(TensorDictModuleBase):
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         held = {key: td.get(key, None) for key in self.out_keys}
         nothing_held = any(value is None for value in held.values())
+        if self.decides_ends and not nothing_held:
+            is_decision = is_decision | self.ends(td)
+            td.set(keys.IS_DECISION, is_decision.unsqueeze(-1))
         if not nothing_held and not is_decision.any():
             return td
         explores_uniformly = bool(self.is_uniform) and not is_greedy()

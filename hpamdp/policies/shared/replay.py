@@ -148,6 +148,7 @@ class ReplayLearner(Learner):
         option_ended = batch.get(("next", keys.OPTION_ENDED), None)
         if option_ended is not None:
             rows["option_ended"] = option_ended.squeeze(-1)
+            rows["option"] = batch[keys.OPTION]
             rows["next_option"] = batch[keys.NEXT_OPTION]
         return rows
 
@@ -161,10 +162,10 @@ class ReplayLearner(Learner):
         value = self.value(state)
         if "option_ended" not in sample.keys():
             return value
-        is_ended = sample["option_ended"]
+        is_ended = sample["option_ended"] | self.following.decides_ends
         if is_ended.any():
             state = state[is_ended]
-            option = self.following.choose(state, sample["next_option"][is_ended])
+            option = self.following.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
             value[is_ended] = self.following.value(state, option)
         return value
 
