@@ -301,7 +301,7 @@ def test_global_generators_are_neither_moved_nor_read():
 
 @pytest.mark.slow
 def test_compiled_ticks_play_the_same_episodes():
-    envs = [GoalEnv(64, compile_physics=compiled, noise=0.0) for compiled in (False, True)]
+    envs = [GoalEnv(64, compile_rules=compiled, noise=0.0) for compiled in (False, True)]
     readings = []
     for env in envs:
         env.reset()
@@ -315,7 +315,7 @@ def test_the_yaml_makes_the_published_domain_and_names_a_wrong_repair(name):
     assert (made.max_steps, made.noise, made.repaired) == (100, 1.0, ())
     with pytest.raises(ConfigError, match="repaired"):
         make_config([f"env={name}", "high=none", "low=pdqn", "env.repaired=[kick]"])
-    assert compose_config([f"env={name}"]).env.compile_physics is False
+    assert compose_config([f"env={name}"]).env.compile_rules is False
 
 
 @pytest.mark.parametrize("env_id", ["hpamdp/Goal-v0", "hpamdp/HardGoal-v0"])

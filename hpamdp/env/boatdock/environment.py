@@ -58,7 +58,7 @@ class BoatDockEnv(PAMDPEnv):
             congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_physics: compile the pure step, reset and observation functions (takes about half a minute).
+        compile_rules: compile the pure step, reset and observation functions (takes about half a minute).
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
@@ -112,7 +112,7 @@ class BoatDockEnv(PAMDPEnv):
         motor_noise: float | Pair = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
-        compile_physics: bool = False,
+        compile_rules: bool = False,
         oracle: bool = False,
         human: bool = False,
         device: torch.device | str | None = "cpu",
@@ -131,7 +131,7 @@ class BoatDockEnv(PAMDPEnv):
         self._pure_step = episode.step
         self._pure_reset = episode.reset
         self._pure_read = episode.read
-        if compile_physics:
+        if compile_rules:
             arguments: Any = counter_rng.COMPILE_ARGUMENTS
             self._pure_step = torch.compile(episode.step, **arguments)
             self._pure_reset = torch.compile(episode.reset, **arguments)

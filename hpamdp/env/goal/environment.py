@@ -51,7 +51,7 @@ class GoalEnv(CounterEnv[GoalState]):
         observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
         noise: factor on the published noise of the motions; 0 is none. Starts are random all the same.
         repaired: the slips to take out.
-        compile_physics: compile the ticks: faster with many pitches, but the first action takes about a minute.
+        compile_rules: compile the ticks: faster with many pitches, but the first action takes about a minute.
         device: of the tensors.
         seed: of starts and noise; the global generators are neither read nor moved.
         first_env: number of the first pitch, where other processes have the pitches before it.
@@ -88,7 +88,7 @@ class GoalEnv(CounterEnv[GoalState]):
         observation: Literal["scaled", "raw"] = "scaled",
         noise: float = 1.0,
         repaired: Sequence[GoalSlip] = (),
-        compile_physics: bool = False,
+        compile_rules: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
@@ -107,7 +107,7 @@ class GoalEnv(CounterEnv[GoalState]):
         self.repaired = tuple(repaired)
         self._is_scaled = observation == "scaled"
         self._tick, self._random_numbers = rules.masked_tick, rules.random_numbers
-        if compile_physics:
+        if compile_rules:
             self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
             self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
 
@@ -216,7 +216,7 @@ class HardGoalEnv(GoalEnv):
         observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
         noise: factor on the published noise of the motions; 0 is none. Starts are random all the same.
         repaired: the slips to take out.
-        compile_physics: compile the ticks: faster with many pitches, but the first action takes about a minute.
+        compile_rules: compile the ticks: faster with many pitches, but the first action takes about a minute.
         device: of the tensors.
         seed: of starts and noise; the global generators are neither read nor moved.
         first_env: number of the first pitch, where other processes have the pitches before it.
@@ -239,7 +239,7 @@ class HardGoalEnv(GoalEnv):
         observation: Literal["scaled", "raw"] = "scaled",
         noise: float = 1.0,
         repaired: Sequence[HardGoalSlip] = (),
-        compile_physics: bool = False,
+        compile_rules: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
@@ -250,7 +250,7 @@ class HardGoalEnv(GoalEnv):
             observation=observation,
             noise=noise,
             repaired=repaired,  # type: ignore[arg-type]
-            compile_physics=compile_physics,
+            compile_rules=compile_rules,
             device=device,
             seed=seed,
             first_env=first_env,
