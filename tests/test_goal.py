@@ -278,6 +278,16 @@ def test_the_middle_shots_are_no_slip_of_goal():
         GoalEnv(repaired=["middle_shots"])
 
 
+def test_a_repair_of_the_middle_shots_is_refused_on_goal_in_one_line_and_made_on_hard_goal():
+    goal, hard_goal = (
+        make_config([f"env={name}", "high=none", "low=pdqn", "env.repaired=[middle_shots]"]).env
+        for name in ("goal", "hard_goal")
+    )
+    with pytest.raises(ConfigError, match=r"repaired=\['middle_shots'\], but may only have kick_to, .*goal\.yaml"):
+        goal.build(num_envs=2)
+    assert hard_goal.build(num_envs=2).repaired == ("middle_shots",)
+
+
 def test_repairs_change_what_is_done_and_seen():
     plain, repaired = (HardGoalEnv(200, repaired=slips) for slips in ((), HardGoalEnv.slips))
     for env in (plain, repaired):
