@@ -95,8 +95,6 @@ class PADDPGPolicy(TensorDictModuleBase):
 class PADDPG(ReplayLearner):
     """Deterministic policy gradients on scores and parameters together, from a replay buffer of its own."""
 
-    has_value: ClassVar[bool] = True
-
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no scores
 
     policy: PADDPGPolicy
@@ -153,10 +151,6 @@ class PADDPG(ReplayLearner):
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
-
-    def value(self, observation: Tensor) -> Tensor:
-        """Return Q of the actor's output, `[B]`."""
-        return self._q(self.critics, observation, self.actor(observation)).amin(0)
 
     def explore(self, frames: int) -> None:
         """Lower the fraction of random actions."""
