@@ -47,7 +47,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
-from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update
+from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
@@ -135,10 +135,7 @@ class LatentActor(nn.Module):
             noise: standard deviation of the Gaussian noise on what the actor gives.
             noise_clip: bound of this noise.
         """
-        output = self.net(state).tanh()
-        if noise > 0.0:
-            added = (noise * torch.randn_like(output)).clamp(-noise_clip, noise_clip)
-            output = (output + added).clamp(-1.0, 1.0)
+        output = with_clipped_noise(self.net(state).tanh(), noise, noise_clip)
         if not self.is_greedy:
             return output.unsqueeze(1)
         z = output.unflatten(-1, (-1, self.latent_dim))
@@ -365,7 +362,7 @@ class HyAR(ReplayLearner):
             new_e = self.codec.embeddings[discrete]
             new_z, log_variance = self.codec.encode(state, discrete, batch["unit"])
             if self.relabels_with_noise:
-                new_e = (new_e + (0.1 * torch.randn_like(new_e)).clamp(-0.5, 0.5)).clamp(-1.0, 1.0)
+                new_e = with_clipped_noise(new_e, 0.1, 0.5)
                 new_z = new_z + (0.5 * log_variance).exp() * torch.randn_like(new_z)
             e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
             z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(new_z))
