@@ -1,9 +1,10 @@
 """What the tests share."""
 
+import multiprocessing
 import random
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -61,6 +62,14 @@ def global_generators_unmoved() -> Iterator[None]:
     before = states()
     yield
     assert states() == before
+
+
+def forked(function: Callable[..., object], *arguments: object) -> int | None:
+    """Call a function in a process forked from this one, which has its imports done; return the exit code."""
+    child = multiprocessing.get_context("fork").Process(target=function, args=arguments)
+    child.start()
+    child.join()
+    return child.exitcode
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 import csv
 import itertools
-import multiprocessing
 import os
 import signal
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import TRAINED, compose_config
+from conftest import TRAINED, compose_config, forked
 from test_grid import SHORT
 
 from hpamdp.run import checkpoint
@@ -89,10 +88,7 @@ def interrupt(given: list[str], folder: Path) -> None:
 def kill(given: list[str], folder: Path) -> None:
     """Run in a process of its own that is killed; what it saved last is some batches old."""
     words = [*given, "checkpoint_every=96"]
-    child = multiprocessing.get_context("fork").Process(target=run, args=(compose_config(words), folder, words))
-    child.start()
-    child.join()
-    assert child.exitcode == -signal.SIGKILL
+    assert forked(run, compose_config(words), folder, words) == -signal.SIGKILL
 
 
 def words_of(high: str, low: str) -> list[str]:
