@@ -241,7 +241,7 @@ WRONG = {
     "tank": ("tank is not a number of frames", lambda v: v + 361),
     "boatchoice": ("boatchoice is not 0 or 1", lambda v: v + 2),
     "incongkm": ("incongkm is not 1 or 2", lambda v: v + 2),
-    "boatdir": ("boatdir are not the directions", lambda v: -v),
+    "boatdir": ("boatdir does not hold the directions", lambda v: -v),
     "center": ("not within 110 px", lambda v: v + 150),
     "SG": ("distance does not follow", lambda v: v + 0.01 * np.eye(4)[1]),
     "distance": ("distance does not follow", lambda v: v + 0.01),
