@@ -118,9 +118,8 @@ def test_a_killed_run_resumes_from_its_last_checkpoint_to_the_last_bit(tmp_path,
     stop_and_resume(words_of("ucb", "pdqn"), tmp_path, monkeypatch, signal.SIGKILL)
 
 
-@pytest.mark.parametrize(
-    "low", ["hppo", *(pytest.param(low, marks=pytest.mark.slow) for low in TRAINED if low != "hppo")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("low", TRAINED)
 def test_a_run_with_worker_processes_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
     stop_and_resume([*words_of("ucb", low), "collector=multi"], tmp_path, monkeypatch, signal.SIGTERM)
 
