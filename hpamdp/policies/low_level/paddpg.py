@@ -41,6 +41,7 @@ from hpamdp.policies.shared.networks import (
     InvertingGradients,
     mlp,
     polyak_update,
+    with_clipped_noise,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -155,11 +156,7 @@ class PADDPG(ReplayLearner):
     @torch.no_grad()
     def value(self, observation: Tensor) -> Tensor:
         """Return min Q'(s, a), `[B]`, with a the target actor's output, smoothed with `twin`."""
-        output = self.target_actor(observation)
-        if self.target_smoothing > 0.0:
-            bound = self.target_smoothing_clip
-            noise = (self.target_smoothing * torch.randn_like(output)).clamp(-bound, bound)
-            output = (output + noise).clamp(-1.0, 1.0)
+        output = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
         return self._q(self.target_critics, observation, output).amin(0)
 
     def explore(self, frames: int) -> None:
