@@ -93,7 +93,8 @@ class AgentConfig(BaseModel):
     model_config = _STRICT
 
     sharing: Literal["per_option", "shared"]
-    option_length: Literal["episode", "learned"] | PositiveInt
+    termination: Literal["episode", "steps", "learned"]
+    option_length: PositiveInt | None
     uniform_option_frames: NonNegativeInt
 
 
@@ -307,6 +308,15 @@ def job_overrides() -> list[str]:
 
 
 def _check_mode(run: RunConfig) -> None:
+    termination, length = run.agent.termination, run.agent.option_length
+    if termination == "steps" and length is None:
+        raise ConfigError(
+            "agent.option_length: missing; agent.termination=steps needs the number of steps of an option"
+        )
+    if termination != "steps" and length is not None:
+        raise ConfigError(
+            f"agent.option_length={length}: goes with agent.termination=steps only, not with {termination}"
+        )
     for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
         if value == "":
             raise ConfigError(f"{name}: empty; give the output folder of a run, or leave {name} out")
@@ -354,11 +364,21 @@ def compose_saved(saved: Mapping[str, Any]) -> tuple[DictConfig, dict[str, str]]
     """
     choices = {group: saved[group]["name"] for group in GROUPS}
     today = _compose([f"{group}={name}" for group, name in choices.items()])
-    values = dict(saved)
+    values = {**saved, "agent": _with_termination(saved["agent"])}
     for group in GROUPS:
         options = {_RENAMED.get(name, name): value for name, value in saved[group].items() if name != "name"}
         values[group] = {**{str(key): value for key, value in today[group].items()}, **options}
     return OmegaConf.create(values), choices
+
+
+def _with_termination(agent: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `agent` as it is set today; `option_length` used to say all by itself where options end."""
+    length = agent.get("option_length")
+    if "termination" in agent:
+        return dict(agent)
+    if isinstance(length, str):
+        return {**agent, "termination": length, "option_length": None}
+    return {**agent, "termination": "steps"}
 
 
 def _compose(overrides: list[str]) -> DictConfig:

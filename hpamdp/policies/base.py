@@ -105,7 +105,7 @@ class Selector(TensorDictModuleBase):
         gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
             it, and so is the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
-        decides_ends: whether it does so in this run (`agent.option_length=learned`); the agent sets it.
+        decides_ends: whether it does so in this run (`agent.termination=learned`); the agent sets it.
         is_bandit: whether the selector takes what an option paid for all that its choice was worth. It then is for
             options that last as long as their episodes, after which nothing follows; others are refused.
         modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others

@@ -124,7 +124,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         is_shared=is_shared,
         is_frozen=config.run.low.freeze,
         uniform_option_frames=config.run.agent.uniform_option_frames,
-        selector_ends_options=config.run.agent.option_length == "learned" and selector is not None,
+        selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
     )
     return agent.to(device)
 
@@ -161,10 +161,8 @@ def _gamma(agent: HierarchicalAgent) -> float:
 
 
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
-    length = config.run.agent.option_length
-    if length == "learned":
-        return with_decisions(env, gamma, math.inf)
-    return with_decisions(env, gamma, None if length == "episode" else length)
+    is_learned = config.run.agent.termination == "learned"
+    return with_decisions(env, gamma, math.inf if is_learned else config.run.agent.option_length)
 
 
 def check_classes(config: Config) -> None:
@@ -263,12 +261,12 @@ def memory_errors_explained(config: Config) -> Iterator[None]:
 
 
 def check_choice(config: Config, env: PAMDPEnv) -> None:
-    """Refuse a needless or a missing selector, and options of a length that the environment does not allow.
+    """Refuse a needless or a missing selector, and options that end where they must not.
 
     Raises:
         ConfigError: with the settings to change.
     """
-    length, freeze = config.run.agent.option_length, config.run.low.freeze
+    termination, freeze = config.run.agent.termination, config.run.low.freeze
     has_selector = config.high.cls is not None
     if has_selector and not env.option_names:
         raise ConfigError(f"{config.high}: {config.env} has no options to choose; use high=none")
@@ -279,24 +277,24 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
     if not has_selector and env.has_choice:
         without = f" or {env.no_choice_setting}" if env.no_choice_setting else ""
         raise ConfigError(f"high=none: {config.env} needs a selector; use another high{without}")
-    if length != "episode" and not (env.has_choice and env.can_change_option):
+    if termination != "episode" and not (env.has_choice and env.can_change_option):
         why = "keeps an option for an episode" if env.has_choice else "has no options"
-        raise ConfigError(f"agent.option_length={length}: {config.env} {why}; use agent.option_length=episode")
+        raise ConfigError(f"agent.termination={termination}: {config.env} {why}; use agent.termination=episode")
     if freeze and not env.has_choice:
         raise ConfigError("low.freeze=true: there is no choice left to learn; use low.freeze=false")
-    if freeze and length != "episode":
+    if freeze and termination != "episode":
         raise ConfigError(
-            f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
+            f"agent.termination={termination}: low.freeze=true plays whole episodes; use agent.termination=episode"
         )
-    if length != "episode" and getattr(config.high.cls, "is_bandit", False):
+    if termination != "episode" and getattr(config.high.cls, "is_bandit", False):
         raise ConfigError(
-            f"agent.option_length={length}: {config.high} is a bandit, which counts what an option pays and nothing of "
-            "what follows it; use agent.option_length=episode, high=meta_critic or high=actor"
+            f"agent.termination={termination}: {config.high} is a bandit, which counts what an option pays and nothing "
+            "of what follows it; use agent.termination=episode, high=meta_critic or high=actor"
         )
-    if length == "learned" and not getattr(config.high.cls, "ends_options", False):
+    if termination == "learned" and not getattr(config.high.cls, "ends_options", False):
         raise ConfigError(
-            f"agent.option_length=learned: {config.high} does not decide where options end; use high=option_critic, "
-            "high=meta_critic or a number of steps"
+            f"agent.termination=learned: {config.high} does not decide where options end; use high=option_critic, "
+            "high=meta_critic or agent.termination=steps"
         )
 
 

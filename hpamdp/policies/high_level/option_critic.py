@@ -1,6 +1,6 @@
 """Option-critic: values of options, learned within them, and terminations that follow the gradient of these values.
 
-With `agent.option_length=learned`, the held option o ends in state s with the learned probability beta(s, o), and the
+With `agent.termination=learned`, the held option o ends in state s with the learned probability beta(s, o), and the
 next one is chosen epsilon-greedily by Q(s, o). Any learner can be the policy within the options.
 
 Source: Bacon, Harb and Precup 2017, *The Option-Critic Architecture*, arXiv 1609.05140, algorithm 1 and theorem 2;
