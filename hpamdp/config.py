@@ -56,8 +56,8 @@ _TARGET = "_target_"
 _MOST_COMPLAINTS = 3
 # Larger numbers leave those that a computation can hold; infinity is refused as well.
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
-# Entries of a learner's yaml that are not options of its class.
-_NO_OPTIONS = ("budget", "checkpoint", "freeze")
+# Entries of a group that are not options of its class.
+_NO_OPTIONS = {"low": ("budget", "checkpoint", "freeze"), "env": ("options",)}
 # Options whose names have changed since a config may have been saved: old name to new.
 _RENAMED = {"compile_physics": "compile_rules"}
 
@@ -116,6 +116,14 @@ class StartConfig(BaseModel):
     freeze: bool
 
 
+class EnvConfig(BaseModel):
+    """What can be made of any problem."""
+
+    model_config = _STRICT
+
+    options: Literal["default"] | dict[str, list[int | str]] | None
+
+
 class BudgetConfig(BaseModel):
     """What a learner's yaml recommends; the values of a run take what is there."""
 
@@ -137,6 +145,7 @@ class RunConfig(BaseModel):
     device: Annotated[str, AfterValidator(_check_device)]
     threads: Annotated[int, Field(ge=1, le=1024)]
     agent: AgentConfig
+    env: EnvConfig
     low: StartConfig
     total_frames: PositiveInt
     num_envs: PositiveInt
@@ -282,6 +291,7 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     own.pop("hydra", None)
     plain = _plain(own)
     values = {name: value for name, value in plain.items() if name not in GROUPS}
+    values["env"] = {name: plain["env"].get(name) for name in EnvConfig.model_fields}
     values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
     if "budget" in plain["low"]:
@@ -345,7 +355,7 @@ def component(group: str, name: str, node: Any) -> Component:
         ConfigError: all that is wrong with this group, in one line.
     """
     options = _plain(node, group)
-    for entry in _NO_OPTIONS:
+    for entry in _NO_OPTIONS.get(group, ()):
         options.pop(entry, None)
     target = options.pop(_TARGET, None)
     file = _file(group, name)

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.shared.masks import allowed_or_first
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -43,7 +44,8 @@ class OptionRouter(TensorDictModuleBase):
         self.specs = specs
         self.is_shared = is_shared
         in_keys = {key for learner in learners for key in learner.policy.in_keys}
-        self.in_keys = [*in_keys, *([keys.OPTION] if specs.num_options else [])]
+        masks = [keys.ACTION_MASK] if specs.has_action_mask else []
+        self.in_keys = [*in_keys, *masks, *([keys.OPTION] if specs.num_options else [])]
         self.out_keys = list(learners[0].policy.out_keys)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -72,7 +74,7 @@ class OptionRouter(TensorDictModuleBase):
 
 
 class HeldOption(TensorDictModuleBase):
-    """The same option in every environment at every step."""
+    """The same option in every environment at every step; the first allowed one where it is forbidden."""
 
     def __init__(self, option: int) -> None:
         super().__init__()
@@ -82,8 +84,9 @@ class HeldOption(TensorDictModuleBase):
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write `option` int64 `[*B]`."""
-        observation = td.get(keys.OBSERVATION)
-        return td.set(keys.OPTION, torch.full(td.batch_size, self.option, device=observation.device))
+        option = torch.full(td.batch_size, self.option, device=td.get(keys.OBSERVATION).device)
+        mask = td.get(keys.OPTION_MASK, None)
+        return td.set(keys.OPTION, option if mask is None else allowed_or_first(option, mask))
 
 
 class NextOptions:
@@ -103,16 +106,23 @@ class NextOptions:
         self.sees_observation_alone = {*selector.in_keys} <= {keys.OBSERVATION, keys.IS_DECISION}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, option: Tensor) -> Tensor:
-        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen."""
+    def value(self, observation: Tensor, option: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen.
+
+        Args:
+            observation: of the states.
+            option: chosen there, `[N]`.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+        """
+        masks = () if action_mask is None else (action_mask,)
         if self.is_shared:
             one_hot = F.one_hot(option, self.num_options).to(observation)
-            return self.learners[0].value(torch.cat([self._without_option(observation), one_hot], -1))
+            return self.learners[0].value(torch.cat([self._without_option(observation), one_hot], -1), *masks)
         value = observation.new_zeros(len(observation))
         for i, learner in enumerate(self.learners):
             rows = option == i
             if rows.any():
-                value[rows] = learner.value(observation[rows])
+                value[rows] = learner.value(observation[rows], *(mask[rows] for mask in masks))
         return value
 
     @property

@@ -103,7 +103,30 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
             needs[name] = True
     if first_env > 0 and "first_env" not in arguments:
         seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
-    return config.env.build(num_envs=num_envs, device=device, seed=seed, first_env=first_env, **needs)
+    env: PAMDPEnv = config.env.build(num_envs=num_envs, device=device, seed=seed, first_env=first_env, **needs)
+    if config.run.env.options is not None:
+        _group_actions(env, config)
+    return env
+
+
+def _group_actions(env: PAMDPEnv, config: Config) -> None:
+    """Make options of the problem's discrete actions.
+
+    Raises:
+        ConfigError: the problem has no such actions, or options of its own.
+    """
+    options = config.run.env.options
+    if options == "default":
+        options = dict(env.default_options)
+        if not options:
+            raise ConfigError(f"env.options=default: {config.env} suggests none; name the actions of each option")
+    for level in (config.high, config.low):
+        if getattr(level.cls, "needs", ()):
+            raise ConfigError(f"env.options: {level} knows nothing of them; use another {level.group}")
+    try:
+        env.group_actions(options)
+    except ValueError as error:
+        raise ConfigError(f"env.options: {first_line(error)} ({config.env})") from error
 
 
 def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:
@@ -114,9 +137,11 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     """
     selector = config.high.build(specs=specs, device=device) if specs.num_options else None
     is_shared = config.run.agent.sharing == "shared" and specs.num_options > 0
-    learner_specs = specs.with_option_observed() if is_shared else specs
-    num_learners = 1 if is_shared else max(1, specs.num_options)
-    learners = [config.low.build(specs=learner_specs, device=device) for _ in range(num_learners)]
+    if is_shared:
+        learner_specs = [specs.with_option_observed()]
+    else:
+        learner_specs = [specs.of_option(i) for i in range(specs.num_options)] or [specs]
+    learners = [config.low.build(specs=each, device=device) for each in learner_specs]
     agent = HierarchicalAgent(
         selector,
         learners,

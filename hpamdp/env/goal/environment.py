@@ -159,6 +159,11 @@ class GoalEnv(CounterEnv[GoalState]):
             weights = 2.0 * weights / (high - low)
         return weights, bias
 
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """Carry: the kick to a point; shoot: all shots."""
+        return {"carry": self.discrete_names[:1], "shoot": self.discrete_names[1:]}
+
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return how episodes `[M]` ended: `success` (a goal), `caught`, `out` and `time_limit`, all bool.
 

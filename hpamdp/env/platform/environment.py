@@ -71,6 +71,11 @@ class PlatformEnv(CounterEnv[PlatformState]):
         )
         self.noise = noise
 
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """Run and jump."""
+        return {"run": ["run"], "jump": ["hop", "leap"]}
+
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return constants: run 3, hop 10, leap 400."""
         bias = 2.0 * torch.tensor(rules.INITIAL_PARAMETERS) / torch.tensor(rules.PARAMETER_HIGH) - 1.0
