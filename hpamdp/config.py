@@ -14,7 +14,7 @@ import linecache
 import re
 import traceback
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -57,7 +57,7 @@ _MOST_COMPLAINTS = 3
 # Larger numbers leave those that a computation can hold; infinity is refused as well.
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
 # Entries of a group that are not options of its class.
-_NO_OPTIONS = {"low": ("budget", "checkpoint", "freeze"), "env": ("options",)}
+_NO_OPTIONS = {"low": ("budget", "checkpoint", "freeze", "per_option"), "env": ("options",)}
 # Options whose names have changed since a config may have been saved: old name to new.
 _RENAMED = {"compile_physics": "compile_rules"}
 
@@ -108,12 +108,16 @@ class OfflineConfig(BaseModel):
 
 
 class StartConfig(BaseModel):
-    """The learners that a run starts with."""
+    """The learners that a run starts with, and which of them are of another class than `low`.
+
+    `per_option` maps the name of an option to the name of a learner, or to its `name` and options.
+    """
 
     model_config = _STRICT
 
     checkpoint: str | None
     freeze: bool
+    per_option: dict[str, str | dict[str, Any]] | None
 
 
 class EnvConfig(BaseModel):
@@ -250,6 +254,12 @@ class Config:
     data: Component
     logger: Component
     collector: Component
+    low_of: Mapping[str, Component] = field(default_factory=dict)
+
+    @property
+    def learners(self) -> list[Component]:
+        """The learner that was chosen and those of single options."""
+        return [self.low, *self.low_of.values()]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as plain values, with the classes by their names: what a run saves and is resumed from."""
@@ -301,7 +311,25 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
             raise ConfigError(f"low.budget={_as_json(budget)}: must be a mapping ({file})")
         _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
-    return Config(run, **{group: component(group, names[group], plain[group]) for group in GROUPS})
+    components = {group: component(group, names[group], plain[group]) for group in GROUPS}
+    return Config(run, **components, low_of=_learners_of_options(run.low.per_option or {}))
+
+
+def _learners_of_options(choices: Mapping[str, str | Mapping[str, Any]]) -> dict[str, Component]:
+    """Return the learner of each of these options: its yaml with the given options."""
+    learners = {}
+    for option, choice in choices.items():
+        given = {"name": choice} if isinstance(choice, str) else dict(choice)
+        name = str(given.pop("name", ""))
+        if not re.fullmatch(r"\w+", name):
+            given_choice = f"low.per_option.{option}={_as_json(choice)}"
+            raise ConfigError(f"{given_choice}: must be the name of a learner, or its name and options")
+        try:
+            node = _compose([f"low={name}"]).low
+        except ConfigError as error:
+            raise ConfigError(f"low.per_option.{option}={name}: there is no {_file('low', name)}") from error
+        learners[option] = component("low", name, {**_plain(node, "low"), **given})
+    return learners
 
 
 def chosen_names(cfg: DictConfig) -> Mapping[str, str]:

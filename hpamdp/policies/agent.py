@@ -46,7 +46,8 @@ class OptionRouter(TensorDictModuleBase):
         in_keys = {key for learner in learners for key in learner.policy.in_keys}
         masks = [keys.ACTION_MASK] if specs.has_action_mask else []
         self.in_keys = [*in_keys, *masks, *([keys.OPTION] if specs.num_options else [])]
-        self.out_keys = list(learners[0].policy.out_keys)
+        # Learners of several classes may write keys of their own.
+        self.out_keys = list(dict.fromkeys(key for learner in learners for key in learner.policy.out_keys))
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action leaves and the other `out_keys` of the learners' policies."""
@@ -62,7 +63,7 @@ class OptionRouter(TensorDictModuleBase):
             if not rows.any():
                 continue
             acted = policy(seen[rows])
-            for key in self.out_keys:
+            for key in policy.out_keys:
                 value = acted.get(key)
                 written = td.get(key, None)
                 if written is None:
@@ -70,7 +71,19 @@ class OptionRouter(TensorDictModuleBase):
                 written = written.clone()
                 written[rows] = value
                 td.set(key, written)
+        for policy in self.policies:
+            if any(td.get(key, None) is None for key in policy.out_keys):
+                self._fill(td, policy)
         return td
+
+    def _fill(self, td: TensorDictBase, policy: TensorDictModuleBase) -> None:
+        """Write zeros under the keys of a policy that acts in none of the environments, so that all steps have them."""
+        with torch.random.fork_rng():
+            acted = policy(td.select(*self.in_keys).reshape(-1)[:1])
+        for key in policy.out_keys:
+            if td.get(key, None) is None:
+                value = acted.get(key)
+                td.set(key, value.new_zeros(*td.batch_size, *value.shape[1:]))
 
 
 class HeldOption(TensorDictModuleBase):

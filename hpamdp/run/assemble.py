@@ -69,6 +69,7 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     check_run_memory(config, device)
     env = make_env(config, config.run.num_envs, device, config.run.seed)
     check_choice(config, env)
+    check_learners_of_options(config, env)
     check_collector(config, env)
     check_modes(config)
     specs = PAMDPSpecs.from_env(env)
@@ -95,7 +96,7 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
     assert config.env.cls is not None
     arguments = constructor_arguments(config.env.cls)
     needs = {}
-    for level in (config.high, config.low):
+    for level in (config.high, *config.learners):
         for name in getattr(level.cls, "needs", ()):
             if name not in arguments:
                 lacks = {"oracle": "has no planner to ask", "human": "has no human data"}[name]
@@ -120,7 +121,7 @@ def _group_actions(env: PAMDPEnv, config: Config) -> None:
         options = dict(env.default_options)
         if not options:
             raise ConfigError(f"env.options=default: {config.env} suggests none; name the actions of each option")
-    for level in (config.high, config.low):
+    for level in (config.high, *config.learners):
         if getattr(level.cls, "needs", ()):
             raise ConfigError(f"env.options: {level} knows nothing of them; use another {level.group}")
     try:
@@ -141,7 +142,8 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         learner_specs = [specs.with_option_observed()]
     else:
         learner_specs = [specs.of_option(i) for i in range(specs.num_options)] or [specs]
-    learners = [config.low.build(specs=each, device=device) for each in learner_specs]
+    chosen = [config.low] if is_shared else _learners_of(config, specs)
+    learners = [low.build(specs=each, device=device) for low, each in zip(chosen, learner_specs, strict=True)]
     agent = HierarchicalAgent(
         selector,
         learners,
@@ -152,6 +154,11 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
     )
     return agent.to(device)
+
+
+def _learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:
+    """Return the component of each option's learner; of the only one where there is no choice."""
+    return [config.low_of.get(name, config.low) for name in specs.option_names] or [config.low]
 
 
 def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | None:
@@ -196,7 +203,8 @@ def check_classes(config: Config) -> None:
     Raises:
         ConfigError: with the class that it would have to be derived from.
     """
-    bases: tuple[tuple[Component, type], ...] = ((config.env, PAMDPEnv), (config.high, Selector), (config.low, Learner))
+    bases: list[tuple[Component, type]] = [(config.env, PAMDPEnv), (config.high, Selector)]
+    bases += [(low, Learner) for low in config.learners]
     for component, base in bases:
         if component.cls is not None and not issubclass(component.cls, base):
             raise ConfigError(f"{component}: {component.cls.__name__} is no {base.__name__} ({base.__module__})")
@@ -240,7 +248,8 @@ def check_agent_memory(config: Config, specs: PAMDPSpecs, device: torch.device) 
     row = 4 * (2 * specs.observation_dim + specs.num_parameters + 2)
     is_shared = config.run.agent.sharing == "shared"
     needs = {}
-    for component, num in ((config.high, 1), (config.low, 1 if is_shared else max(1, specs.num_options))):
+    lows = [config.low] if is_shared else _learners_of(config, specs)
+    for component, num in ((config.high, 1), *((low, lows.count(low)) for low in lows)):
         for name, value in component.options.items():
             setting = f"{component.group}.{name}={value}"
             if name == "buffer_size":
@@ -323,6 +332,20 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
         )
 
 
+def check_learners_of_options(config: Config, env: PAMDPEnv) -> None:
+    """Refuse learners of options that do not exist, or that share a learner.
+
+    Raises:
+        ConfigError: with the options that there are, or the setting to change.
+    """
+    unknown = [name for name in config.low_of if not env.has_choice or name not in env.option_names]
+    if unknown:
+        known = ", ".join(env.option_names) if env.has_choice else "none to choose"
+        raise ConfigError(f"low.per_option: {config.env} has no option {unknown[0]}; it has {known}")
+    if config.low_of and config.run.agent.sharing == "shared":
+        raise ConfigError("low.per_option: agent.sharing=shared has one learner for all; use agent.sharing=per_option")
+
+
 def check_modes(config: Config) -> None:
     """Refuse a run whose agent cannot learn from what there is: steps of its own, a data set or both.
 
@@ -330,18 +353,19 @@ def check_modes(config: Config) -> None:
         ConfigError: with the settings to change.
     """
     mode, has_data = config.run.mode, config.data.cls is not None
-    modes: tuple[str, ...] = getattr(config.low.cls, "modes", ())
     sources = {"train": "its own steps", "offline": "data sets"}
-    learns = f"{config.low} learns from {' and '.join(sources[known] for known in modes)}"
-    if mode == "train" and "train" not in modes:
-        raise ConfigError(f"mode=train: {learns} only; use mode=offline and a data set, or another low")
     if mode == "offline" and not has_data:
         raise ConfigError("mode=offline: data=none leaves nothing to learn from; choose a data set")
-    if mode != "eval" and has_data and "offline" not in modes:
-        raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
+    for low in config.learners:
+        modes: tuple[str, ...] = getattr(low.cls, "modes", ())
+        learns = f"{low} learns from {' and '.join(sources[known] for known in modes)}"
+        if mode == "train" and "train" not in modes:
+            raise ConfigError(f"mode=train: {learns} only; use mode=offline and a data set, or another low")
+        if mode != "eval" and has_data and "offline" not in modes:
+            raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
     if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
         raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
-    n_step = config.low.options.get("n_step", 1)
+    n_step = max(low.options.get("n_step", 1) for low in config.learners)
     if mode == "train" and n_step > config.run.steps_per_batch:
         raise ConfigError(
             f"low.n_step={n_step}: must be at most steps_per_batch={config.run.steps_per_batch}, as sums of rewards "
