@@ -39,7 +39,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
-from hpamdp.policies.shared.frame import CanonicalFrame, RandomSymmetry
+from hpamdp.policies.shared.frame import CanonicalFrame
 from hpamdp.policies.shared.networks import EnsembleLinear
 from hpamdp.policies.shared.planning import Found, Prediction, SequenceSearch, discounted_return
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -124,7 +124,7 @@ class PETSModel(nn.Module):
         feature_dim = 4 * num_vectors if num_vectors else 2 * dim
         in_dim = dim + action_dim
         self.transition = MemberNet(num_members, in_dim, transition_dims, dim * (2 if is_probabilistic else 1))
-        self.outcome = MemberNet(num_members, in_dim + 2 * dim + feature_dim, outcome_dims, 3)
+        self.outcome = MemberNet(num_members, in_dim + dim + feature_dim, outcome_dims, 3)
         buffers = {
             "state_mean": torch.zeros(dim),
             "state_scale": torch.ones(dim),
@@ -195,7 +195,7 @@ class PETSModel(nn.Module):
         next_turned = turned + change
         next_x = (next_turned - self.state_mean) / self.state_scale * self.is_changing
         features = (self.features(turned, next_turned) - self.feature_mean) / self.feature_scale
-        return transition, change, self.outcome(torch.cat([x, next_x, scaled, features], -1), members)
+        return transition, change, self.outcome(torch.cat([x, next_x, features], -1), members)
 
     def moments(self, transition: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance of the scaled change, from what the transition networks say."""
@@ -418,10 +418,9 @@ class PETS(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=specs.symmetries is not None if augment == "auto" else augment,
         )
         self.transition_weight = transition_weight
-        is_declared = specs.symmetries is not None
-        self.symmetry = RandomSymmetry(specs, device) if augment is True or (augment and is_declared) else None
         self.model = PETSModel(
             specs,
             num_members,

@@ -24,8 +24,10 @@ class CanonicalFrame(nn.Module):
     kind: Tensor
     x: Tensor
     y: Tensor
-    origin_x: Tensor
-    origin_y: Tensor
+    origin: Tensor
+    is_vector: Tensor
+    is_y: Tensor
+    quarter_turn: Tensor
 
     def __init__(self, specs: PAMDPSpecs, *, is_used: bool = True) -> None:
         super().__init__()
@@ -41,13 +43,22 @@ class CanonicalFrame(nn.Module):
             kind = torch.tensor(geometry.kinds) if geometry.kinds else kind
         nowhere = directions.norm(dim=-1, keepdim=True) < 1e-6
         directions = torch.where(nowhere, torch.tensor([1.0, 0.0]), directions)  # along +x already
+        x = torch.tensor([pair[0] for pair in pairs], dtype=torch.long)
+        y = torch.tensor([pair[1] for pair in pairs], dtype=torch.long)
+        zeros = torch.zeros(specs.observation_dim)
+        quarter_turn = torch.zeros(specs.observation_dim, specs.observation_dim)
+        quarter_turn[y, x], quarter_turn[x, y] = 1.0, -1.0
+        origin = zeros.clone()
+        origin[x], origin[y] = torch.tensor(origins).reshape(-1, 2).unbind(-1)
         buffers = {
             "directions": directions,
             "kind": kind,
-            "x": torch.tensor([pair[0] for pair in pairs], dtype=torch.long),
-            "y": torch.tensor([pair[1] for pair in pairs], dtype=torch.long),
-            "origin_x": torch.tensor([origin[0] for origin in origins]),
-            "origin_y": torch.tensor([origin[1] for origin in origins]),
+            "x": x,
+            "y": y,
+            "origin": origin,
+            "is_vector": zeros.index_fill(0, torch.cat([x, y]), 1.0),
+            "is_y": zeros.index_fill(0, y, 1.0),
+            "quarter_turn": quarter_turn,
         }
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
@@ -79,21 +90,18 @@ class CanonicalFrame(nn.Module):
     def _turned(self, state: Tensor, cos: Tensor, sin: Tensor) -> Tensor:
         if not self.turns:
             return state
-        x, y = self.vectors(state)
-        turned = state.clone()
-        turned[..., self.x] = cos * x + sin * y + self.origin_x
-        turned[..., self.y] = cos * y - sin * x + self.origin_y
-        return turned
+        # A product with a small matrix is several times as fast as picking entries and putting them back.
+        relative = state - self.origin
+        return state + (cos - 1.0) * (relative * self.is_vector) + sin * (relative @ self.quarter_turn)
 
     def mirror(self, state: Tensor) -> Tensor:
         """Return states mirrored at the x axis."""
-        mirrored = state.clone()
-        mirrored[..., self.y] = 2.0 * self.origin_y - state[..., self.y]
-        return mirrored
+        return state - 2.0 * (state - self.origin) * self.is_y
 
     def vectors(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Return x and y of all vectors in states `[*B, observation_dim]`, `[*B, num_vectors]` each."""
-        return state[..., self.x] - self.origin_x, state[..., self.y] - self.origin_y
+        relative = state - self.origin
+        return relative[..., self.x], relative[..., self.y]
 
 
 class RandomSymmetry:
