@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -37,6 +37,13 @@ class Contexts:
         return observation[..., self.context_entry].round().long().clamp(0, self.num_contexts - 1)
 
 
+    def _entries_in(self, place: Mapping[int, int]) -> dict[str, int | None]:
+        """Return where the context lies among other entries, by their places."""
+        names = ("context_entry", "one_hot_entry")
+        entries = {name: getattr(self, name) for name in names}
+        return {name: None if entry is None else place.get(entry) for name, entry in entries.items()}
+
+
 @dataclass(frozen=True, eq=False)
 class PlaneGeometry(Contexts):
     """Where vectors of the plane lie in an observation, and where the discrete actions point.
@@ -52,6 +59,8 @@ class PlaneGeometry(Contexts):
         kinds: the kind of each discrete action, `num_discrete` numbers from 0 on; () if each is a kind of its own.
         has_mirror: whether a plane that is mirrored at an action's direction gives the same change, mirrored, and the
             same reward.
+        redundant: entries of the observation that a model can do without: nothing that follows depends on them, or
+            other entries tell as much. None of them shares a vector with an entry that is not.
     """
 
     vectors: tuple[tuple[int, int], ...] = ()
@@ -59,6 +68,7 @@ class PlaneGeometry(Contexts):
     directions: Tensor | None = None
     kinds: tuple[int, ...] = ()
     has_mirror: bool = False
+    redundant: tuple[int, ...] = ()
 
     def of_option(self, option: int) -> PlaneGeometry:
         """Return the geometry of a learner that serves one option."""
@@ -71,11 +81,27 @@ class PlaneGeometry(Contexts):
         """Return the geometry of observations that end in the one-hot option after `observation_dim` entries."""
         return self if self.num_contexts == 1 else replace(self, one_hot_entry=observation_dim)
 
+    def with_entries(self, entries: Sequence[int]) -> PlaneGeometry:
+        """Return the geometry of observations that have these entries alone."""
+        place = {entry: number for number, entry in enumerate(entries)}
+        kept = [number for number, pair in enumerate(self.vectors) if pair[0] in place and pair[1] in place]
+        return replace(
+            self,
+            vectors=tuple((place[self.vectors[number][0]], place[self.vectors[number][1]]) for number in kept),
+            origins=tuple(self.origins[number] for number in kept) if self.origins else (),
+            redundant=(),
+            **self._entries_in(place),
+        )
+
     def fits(self, observation_dim: int, parameter_dims: Sequence[int]) -> str:
         """Return in words what does not fit a problem of this size, empty if all does."""
         entries = [entry for pair in self.vectors for entry in pair]
         if any(not 0 <= entry < observation_dim for entry in entries) or len(set(entries)) < len(entries):
             return f"vectors {self.vectors}, but must be different entries of {observation_dim}"
+        if any(not 0 <= entry < observation_dim for entry in self.redundant):
+            return f"redundant entries {self.redundant}, but there are {observation_dim}"
+        if any((x in self.redundant) != (y in self.redundant) for x, y in self.vectors):
+            return f"redundant entries {self.redundant}, which leave half of a vector"
         if self.origins and len(self.origins) != len(self.vectors):
             return f"{len(self.origins)} origins for {len(self.vectors)} vectors"
         if self.kinds and len(self.kinds) != len(parameter_dims):
@@ -173,6 +199,13 @@ class Symmetries(Contexts):
         weight[:, :observation_dim, :observation_dim] = self.weight
         entry = observation_dim if self.num_contexts > 1 else None
         return replace(self, weight=weight, offset=F.pad(self.offset, (0, num_options)), one_hot_entry=entry)
+
+    def with_entries(self, entries: Sequence[int]) -> Symmetries:
+        """Return the maps of observations that have these entries alone, which no map mixes with the others."""
+        kept = torch.tensor(entries)
+        place = {entry: number for number, entry in enumerate(entries)}
+        weight = self.weight[:, kept][:, :, kept]
+        return replace(self, weight=weight, offset=self.offset[:, kept], **self._entries_in(place))
 
     def fits(self, observation_dim: int, num_discrete: int, num_parameters: int) -> str:
         """Return in words what does not fit a problem of this size, empty if all does."""

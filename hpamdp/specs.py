@@ -106,6 +106,25 @@ class PAMDPSpecs:
             geometry=None if geometry is None else geometry.of_option(option),
         )
 
+    @property
+    def telling_entries(self) -> list[int]:
+        """The entries of the observation that are not redundant, all of them where nothing is declared."""
+        redundant = () if self.geometry is None else self.geometry.redundant
+        return [entry for entry in range(self.observation_dim) if entry not in redundant]
+
+    def with_telling_entries(self) -> PAMDPSpecs:
+        """Return the specs of observations that have the `telling_entries` alone."""
+        entries = self.telling_entries
+        symmetries, geometry = self.symmetries, self.geometry
+        weight = self.initial_weight
+        return replace(
+            self,
+            observation_dim=len(entries),
+            initial_weight=None if weight is None else tuple(tuple(row[entry] for entry in entries) for row in weight),
+            symmetries=None if symmetries is None else symmetries.with_entries(entries),
+            geometry=None if geometry is None else geometry.with_entries(entries),
+        )
+
     @classmethod
     def from_env(cls, env: EnvBase) -> PAMDPSpecs:
         """Read the sizes off a `PAMDPEnv`.

@@ -204,7 +204,14 @@ class BoatDockEnv(PAMDPEnv):
 
     @property
     def geometry(self) -> PlaneGeometry:
-        """The places and the velocity, and where the keys point, unless a random key map leaves that open."""
+        """The places and the velocity, and where the keys point, unless a random key map leaves that open.
+
+        Every press begins at rest, so that the velocity tells nothing; where the start was shows in the distances
+        alone. The harbour is always the same. With the goal's offset, the goal itself is known, too.
+        """
+        names = ["start_x", "start_y", "centre_x", "centre_y", "radius", "velocity_x", "velocity_y"]
+        if self.rules.observation == "scaled" and self.rules.sensor_noise == 0.0:
+            names += ["goal_x", "goal_y"]
         tables = self._directions()
         vectors, origins = self._vectors()
         is_known = all(len(table) == 1 for table in tables)
@@ -216,6 +223,7 @@ class BoatDockEnv(PAMDPEnv):
             directions=torch.stack([table[0] for table in tables]).float() if is_known else None,
             kinds=(0,) * harbour.NUM_KEYS if is_known else (),
             has_mirror=True,
+            redundant=tuple(episode.OBSERVATION_NAMES.index(name) for name in names),
         )
 
     def _directions(self) -> list[list[Tensor]]:

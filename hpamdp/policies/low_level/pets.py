@@ -205,16 +205,20 @@ class PETSModel(nn.Module):
     def features(self, turned: Tensor, next_turned: Tensor) -> Tensor:
         """Return what helps to tell where a step ends, of states before and after it in the canonical frame.
 
-        With vectors of the plane, their lengths before and after and how far off the x axis they were, `[*B, 4 V]`;
-        else the squares of all entries, of which lengths are made, `[*B, 2 observation_dim]`.
+        With vectors of the plane, their lengths before and after the step, the smallest length on the straight way
+        between the two, and how far off the x axis they were, `[*B, 4 V]`; else the squares of all entries, of which
+        lengths are made, `[*B, 2 observation_dim]`.
         """
         if not self.frame.num_vectors:
             both = [(state - self.state_mean) / self.state_scale for state in (turned, next_turned)]
             return torch.cat([both[0], both[1] * self.is_changing], -1).square()
         x, y = self.frame.vectors(turned)
         next_x, next_y = self.frame.vectors(next_turned)
-        off = y.square()
-        return torch.cat([(x.square() + off).sqrt(), (next_x.square() + next_y.square()).sqrt(), y.abs(), off], -1)
+        way_x, way_y = next_x - x, next_y - y
+        along = -(x * way_x + y * way_y) / (way_x.square() + way_y.square()).clamp(min=1e-12)
+        along = along.clamp(0.0, 1.0)
+        lengths = [torch.hypot(x + share * way_x, y + share * way_y) for share in (0.0, 1.0, along)]
+        return torch.cat([*lengths, y.abs()], -1)
 
     @torch.no_grad()
     def fit_scales(self, turned: Tensor, next_turned: Tensor, reward: Tensor, terminated: Tensor) -> None:
@@ -284,6 +288,7 @@ class PETSPolicy(TensorDictModuleBase):
         model: PETSModel,
         search: SequenceSearch,
         specs: PAMDPSpecs,
+        entries: list[int],
         *,
         gamma: float,
         noise: float,
@@ -292,6 +297,7 @@ class PETSPolicy(TensorDictModuleBase):
         super().__init__()
         self.in_keys = [keys.OBSERVATION, keys.DONE, keys.IS_DECISION, MEMBER]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, MEMBER]
+        self.entries = entries
         self.model = model
         self.search = search
         self.specs = specs
@@ -304,7 +310,7 @@ class PETSPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action, the member `[*B]` and the parameters `[*B, num_parameters]`."""
-        state = td.get(keys.OBSERVATION).flatten(0, -2)
+        state = td.get(keys.OBSERVATION)[..., self.entries].flatten(0, -2)
         num, device = len(state), state.device
         member = self._members(td, num, device)
         discrete = torch.randint(self.specs.num_discrete, (num,), device=device)
@@ -410,6 +416,10 @@ class PETS(ReplayLearner):
         min_deviation: NonNegativeFloat,
         planning_precision: Literal["float32", "bfloat16"],
     ) -> None:
+        uses_geometry = augment is not False
+        self.entries = list(range(specs.observation_dim))
+        if uses_geometry:
+            self.entries, specs = specs.telling_entries, specs.with_telling_entries()
         super().__init__(
             specs,
             device,
@@ -427,7 +437,7 @@ class PETS(ReplayLearner):
             transition_dims,
             outcome_dims,
             is_probabilistic=probabilistic,
-            uses_geometry=augment is not False,
+            uses_geometry=uses_geometry,
         )
         search = SequenceSearch(
             specs.parameter_dims,
@@ -441,7 +451,7 @@ class PETS(ReplayLearner):
             min_deviation=min_deviation,
         )
         self.policy = PETSPolicy(
-            self.model, search, specs, gamma=gamma, noise=parameter_noise, precision=planning_precision
+            self.model, search, specs, self.entries, gamma=gamma, noise=parameter_noise, precision=planning_precision
         )
         self.to(device)
         self.optimizers = {
@@ -451,6 +461,8 @@ class PETS(ReplayLearner):
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated."""
         rows = super().transitions(batch).exclude("discount")
+        for name in ("state", "next_state"):
+            rows.set(name, rows[name][..., self.entries])
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def explore(self, frames: int) -> None:
