@@ -26,6 +26,11 @@ SHORT = {
     "hsac": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "hyar": ["low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "paddpg": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
+    "pets": [
+        *("low.warmup_frames=64", "low.updates_per_frame=0.1", "low.batch_size=16", "low.transition_dims=[16]"),
+        *("low.outcome_dims=[16]", "low.num_members=2", "low.num_samples=4", "low.num_elites=2", "low.num_iterations=2"),
+        "low.max_sequences=8",
+    ],
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "pdqn_published": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
