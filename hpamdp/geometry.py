@@ -36,8 +36,7 @@ class Contexts:
             return observation.new_zeros(observation.shape[:-1], dtype=torch.long)
         return observation[..., self.context_entry].round().long().clamp(0, self.num_contexts - 1)
 
-
-    def _entries_in(self, place: Mapping[int, int]) -> dict[str, int | None]:
+    def _entries_in(self, place: Mapping[int, int]) -> dict[str, Any]:
         """Return where the context lies among other entries, by their places."""
         names = ("context_entry", "one_hot_entry")
         entries = {name: getattr(self, name) for name in names}
@@ -96,27 +95,32 @@ class PlaneGeometry(Contexts):
     def fits(self, observation_dim: int, parameter_dims: Sequence[int]) -> str:
         """Return in words what does not fit a problem of this size, empty if all does."""
         entries = [entry for pair in self.vectors for entry in pair]
-        if any(not 0 <= entry < observation_dim for entry in entries) or len(set(entries)) < len(entries):
-            return f"vectors {self.vectors}, but must be different entries of {observation_dim}"
-        if any(not 0 <= entry < observation_dim for entry in self.redundant):
-            return f"redundant entries {self.redundant}, but there are {observation_dim}"
-        if any((x in self.redundant) != (y in self.redundant) for x, y in self.vectors):
-            return f"redundant entries {self.redundant}, which leave half of a vector"
-        if self.origins and len(self.origins) != len(self.vectors):
-            return f"{len(self.origins)} origins for {len(self.vectors)} vectors"
-        if self.kinds and len(self.kinds) != len(parameter_dims):
-            return f"{len(self.kinds)} kinds, but must be {len(parameter_dims)}"
-        for kind in set(self.kinds):
-            dims = {dim for dim, own in zip(parameter_dims, self.kinds, strict=True) if own == kind}
-            if len(dims) > 1:
-                return f"actions of kind {kind} with {sorted(dims)} parameters"
         expected = [self.num_contexts, len(parameter_dims), 2]
-        if self.directions is not None and list(self.directions.shape) != expected:
-            return f"directions of shape {list(self.directions.shape)}, but must be {expected}"
-        return ""
+        shape = expected if self.directions is None else list(self.directions.shape)
+        dims_of_kinds = set(zip(self.kinds, parameter_dims, strict=False))
+        misfits = {
+            f"vectors {self.vectors}, but must be different entries of {observation_dim}": (
+                any(not 0 <= entry < observation_dim for entry in entries) or len(set(entries)) < len(entries)
+            ),
+            f"redundant entries {self.redundant}, but must be whole vectors and other entries of {observation_dim}": (
+                any(not 0 <= entry < observation_dim for entry in self.redundant)
+                or any((x in self.redundant) != (y in self.redundant) for x, y in self.vectors)
+            ),
+            f"{len(self.origins)} origins for {len(self.vectors)} vectors": (
+                len(self.origins) not in (0, len(self.vectors))
+            ),
+            f"{len(self.kinds)} kinds, but must be {len(parameter_dims)}": (
+                len(self.kinds) not in (0, len(parameter_dims))
+            ),
+            f"kinds {self.kinds} with {tuple(parameter_dims)} parameters, but those of a kind must have as many": (
+                len(dims_of_kinds) > len(set(self.kinds))
+            ),
+            f"directions have shape {shape}, but must be {expected}": shape != expected,
+        }
+        return next((text for text, is_wrong in misfits.items() if is_wrong), "")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Symmetries(Contexts):
     """Maps of (observation, discrete action, parameters) under which neither the dynamics nor the reward change.
 
@@ -135,14 +139,14 @@ class Symmetries(Contexts):
         contexts: int64 `[G, num_contexts]`: what each context becomes.
     """
 
-    weight: Tensor = torch.empty(0)
-    offset: Tensor = torch.empty(0)
-    discrete: Tensor = torch.empty(0)
-    source: Tensor = torch.empty(0)
-    sign: Tensor = torch.empty(0)
-    shift: Tensor = torch.empty(0)
-    is_periodic: Tensor = torch.empty(0)
-    contexts: Tensor = torch.empty(0)
+    weight: Tensor
+    offset: Tensor
+    discrete: Tensor
+    source: Tensor
+    sign: Tensor
+    shift: Tensor
+    is_periodic: Tensor
+    contexts: Tensor
 
     def __len__(self) -> int:
         return len(self.weight)
@@ -167,9 +171,7 @@ class Symmetries(Contexts):
             mapped[..., self.one_hot_entry : end] = F.one_hot(new, self.num_contexts).to(mapped)
         return mapped
 
-    def map_action(
-        self, number: Tensor, context: Tensor, discrete: Tensor, unit: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def map_action(self, number: Tensor, context: Tensor, discrete: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
         """Return discrete actions `[*B]` and parameters `[*B, num_parameters]` under the maps int64 `[*B]`.
 
         Args:
@@ -253,6 +255,7 @@ def make_symmetries(
     if source.ndim == 2:
         source = source.unsqueeze(1)
     plain = torch.zeros(num, num_parameters)
+    periodic = torch.zeros(num_parameters, dtype=torch.bool) if is_periodic is None else torch.tensor(is_periodic)
     tables: dict[str, Any] = {
         "weight": weight.float(),
         "offset": torch.zeros(num, weight.shape[-1]) if offset is None else offset.float(),
@@ -260,7 +263,7 @@ def make_symmetries(
         "source": source.expand(num, num_contexts, -1).long(),
         "sign": plain + 1.0 if sign is None else sign.float(),
         "shift": plain if shift is None else shift.float(),
-        "is_periodic": torch.zeros(num_parameters, dtype=torch.bool) if is_periodic is None else torch.tensor(is_periodic),
+        "is_periodic": periodic,
         "contexts": torch.arange(num_contexts).expand(num, -1) if contexts is None else contexts.long(),
     }
     return Symmetries(num_contexts=num_contexts, context_entry=context_entry, **tables)
@@ -296,6 +299,6 @@ def on_observations(
 
 
 def as_directions(plane: Tensor, directions: Tensor, targets: Tensor) -> Tensor:
-    """Return for maps `plane` `[G, 2, 2]` which of `targets` `[K, 2]` each of `directions` `[K, 2]` becomes, `[G, K]`."""
+    """Return which of `targets` `[K, 2]` the `directions` `[K, 2]` become under maps `[G, 2, 2]`, int64 `[G, K]`."""
     mapped = torch.einsum("gij,kj->gki", plane.to(directions), directions)
     return (mapped.unsqueeze(2) - targets).square().sum(-1).argmin(-1)

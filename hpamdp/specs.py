@@ -146,10 +146,12 @@ class PAMDPSpecs:
             weight = tuple(tuple(row) for row in initial[0].tolist())
             bias = tuple(initial[1].tolist())
         symmetries, geometry = env.symmetries, env.geometry
-        misfits = {
-            "symmetries": "" if symmetries is None else symmetries.fits(observation_dim, len(env.parameter_dims), num_parameters),
-            "geometry": "" if geometry is None else geometry.fits(observation_dim, env.parameter_dims),
-        }
+        num_discrete = len(env.parameter_dims)
+        misfits: dict[str, str] = {}
+        if symmetries is not None:
+            misfits["symmetries"] = symmetries.fits(observation_dim, num_discrete, num_parameters)
+        if geometry is not None:
+            misfits["geometry"] = geometry.fits(observation_dim, env.parameter_dims)
         for name, misfit in misfits.items():
             if misfit:
                 raise ValueError(f"{name}: {misfit}")

@@ -23,8 +23,8 @@ SEARCH = dict(
 )  # fmt: skip
 OPTIONS = dict(
     form="masking", hidden_dims=[64, 64], num_members=2, lr=2e-3, state_weight=2.0, reward_weight=0.5,
-    termination_weight=0.5, rho=0.5, buffer_size=5000, batch_size=64, updates_per_frame=0.5, augment=False, warmup_frames=500,
-    epsilon=0.05, planning_precision="float32", **SEARCH,
+    termination_weight=0.5, rho=0.5, buffer_size=5000, batch_size=64, updates_per_frame=0.5, warmup_frames=500,
+    augment=False, epsilon=0.05, planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 

@@ -28,7 +28,13 @@ SHORT = {
     "paddpg": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "pets": [
         *("low.warmup_frames=64", "low.updates_per_frame=0.1", "low.batch_size=16", "low.transition_dims=[16]"),
-        *("low.outcome_dims=[16]", "low.num_members=2", "low.num_samples=4", "low.num_elites=2", "low.num_iterations=2"),
+        *(
+            "low.outcome_dims=[16]",
+            "low.num_members=2",
+            "low.num_samples=4",
+            "low.num_elites=2",
+            "low.num_iterations=2",
+        ),
         "low.max_sequences=8",
     ],
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],

@@ -201,7 +201,8 @@ class Learner(nn.Module):
 
     Constructor: `specs` holds the sizes and bounds of the problem, with the symmetries and the geometry that it
     declares, and `device`, if it is an argument, says where tensors live. All other arguments are keyword-only; their
-    names and type annotations are the schema of the learner's yaml in `conf/low`. A learner never sees the environment, the config, the agent or another learner.
+    names and type annotations are the schema of the learner's yaml in `conf/low`. A learner never sees the environment,
+    the config, the agent or another learner.
 
     Policy: `policy` reads its `in_keys`, usually `observation` `[*B, observation_dim]`, and writes its `out_keys`:
     `("action", "discrete")` int64 `[*B]` and `("action", "parameters")` `[*B, num_parameters]`, within their bounds.

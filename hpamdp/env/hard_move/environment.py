@@ -121,7 +121,7 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
         """Where each set pushes; sets that push equally strongly are of one kind, to the rounding of the directions."""
         strength = self._motions.norm(dim=-1, keepdim=True)
         directions = torch.where(strength > 1e-6, self._motions / strength.clamp(min=1e-6), 0.0)
-        different, kinds = strength.squeeze(-1).round(decimals=2).unique(return_inverse=True)
+        kinds = strength.squeeze(-1).round(decimals=2).unique(return_inverse=True)[1]
         return PlaneGeometry(
             vectors=point_agent.VECTORS,
             directions=directions.unsqueeze(0).cpu(),

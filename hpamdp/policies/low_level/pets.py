@@ -41,7 +41,7 @@ from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.frame import CanonicalFrame
 from hpamdp.policies.shared.networks import EnsembleLinear
-from hpamdp.policies.shared.planning import Found, Prediction, SequenceSearch, discounted_return
+from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, discounted_return
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -59,15 +59,16 @@ class MemberNet(nn.Module):
     def __init__(self, num_members: int, in_dim: int, hidden_dims: list[int], out_dim: int) -> None:
         super().__init__()
         dims = [in_dim, *hidden_dims, out_dim]
-        self.layers = nn.ModuleList(EnsembleLinear(num_members, size, next_size) for size, next_size in pairwise(dims))
-        with torch.no_grad():
-            for layer in self.layers:
-                layer.weight.normal_(0.0, 0.7 * (2.0 / layer.weight.shape[1]) ** 0.5)
-                layer.bias.zero_()
+        layers = [EnsembleLinear(num_members, size, next_size) for size, next_size in pairwise(dims)]
+        for layer in layers:
+            nn.init.normal_(layer.weight, 0.0, 0.7 * (2.0 / layer.weight.shape[1]) ** 0.5)
+            nn.init.zeros_(layer.bias)
+        self.layers = nn.ModuleList(layers)
 
     def forward(self, x: Tensor, members: slice) -> Tensor:
         """Apply the given members, each to its own slice of `x`."""
         for place, layer in enumerate(self.layers):
+            assert isinstance(layer, EnsembleLinear)
             x = torch.baddbmm(layer.bias[members], x, layer.weight[members])
             if place < len(self.layers) - 1:
                 x = F.silu(x)
@@ -115,9 +116,11 @@ class PETSModel(nn.Module):
         self.is_probabilistic = is_probabilistic
         self.frame = CanonicalFrame(specs, is_used=uses_geometry)
         kinds = self.frame.kind.tolist()
-        slots = sorted({(kind, slot) for kind, num in zip(kinds, specs.parameter_dims, strict=True) for slot in range(num)})
-        self.register_buffer("slot_kind", torch.tensor([kind for kind, _ in slots], dtype=torch.long), persistent=False)
-        self.register_buffer("slot_number", torch.tensor([slot for _, slot in slots], dtype=torch.long), persistent=False)
+        of_kinds = zip(kinds, specs.parameter_dims, strict=True)
+        slots = sorted({(kind, slot) for kind, num_slots in of_kinds for slot in range(num_slots)})
+        places = torch.tensor(slots, dtype=torch.long).reshape(-1, 2)
+        self.register_buffer("slot_kind", places[:, 0], persistent=False)
+        self.register_buffer("slot_number", places[:, 1], persistent=False)
         self.has_kinds = self.frame.num_kinds > 1
         action_dim = 2 * len(slots) + (self.frame.num_kinds if self.has_kinds else 0)
         num_vectors = self.frame.num_vectors
@@ -258,7 +261,8 @@ class PETSModel(nn.Module):
             column = columns[:, entry]
             basis = [place for place in range(dim) if is_predicted[place]]
             if basis:
-                weight = torch.linalg.lstsq(columns[:, basis], column.unsqueeze(-1), driver="gelsd").solution.squeeze(-1)
+                solved = torch.linalg.lstsq(columns[:, basis], column.unsqueeze(-1), driver="gelsd")
+                weight = solved.solution.squeeze(-1)
                 if (columns[:, basis] @ weight - column).abs().amax() < 1e-3:
                     derivation[basis, entry] = weight
                     continue
@@ -356,7 +360,7 @@ class PETSPolicy(TensorDictModuleBase):
         found = [self.search(self._returns(piece, members), len(piece), state.device) for piece in pieces]
         return Found(*(torch.cat(part) for part in zip(*found, strict=True)))
 
-    def _returns(self, state: Tensor, members: slice):
+    def _returns(self, state: Tensor, members: slice) -> Returns:
         num_members = self.model.num_members if members == _ALL else 1
 
         def returns(discrete: Tensor, unit: Tensor) -> Tensor:
@@ -493,7 +497,7 @@ class PETS(ReplayLearner):
         if frame.turns and frame.geometry is not None and frame.geometry.has_mirror:
             turned = [torch.cat([state, frame.mirror(state)]) for state in turned]
             kind, own, reward, terminated = (torch.cat([part, part]) for part in (kind, own, reward, terminated))
-        self.model.fit_scales(*turned, reward, terminated)
+        self.model.fit_scales(turned[0], turned[1], reward, terminated)
         mean, scale = self.model.reward_mean, self.model.reward_scale
         which = terminated.long()
         return TensorDict(
@@ -515,7 +519,7 @@ class PETS(ReplayLearner):
         number = torch.arange(copies, device=stored.device).repeat_interleave(len(stored))
         if copies < num_maps:
             number = torch.randint(num_maps, number.shape, device=stored.device)
-        rows = torch.cat([stored] * copies)
+        rows = stored.repeat(copies)
         rows = rows.set("unit", self._all_parameters(rows["discrete"], rows["unit"]))
         rows = self.symmetry.mapped(number, rows)
         return rows.set("unit", rows["unit"].gather(-1, self.slots[rows["discrete"]]))
