@@ -329,6 +329,13 @@ def test_nothing_is_planned_before_the_first_update_or_for_finished_episodes(mon
     assert asked == [5]
 
 
+def test_actions_are_random_as_long_as_all_rewards_are_the_same():
+    learner = make()
+    for reward, is_trained in ((torch.zeros(64), False), (torch.arange(64.0), True)):
+        learn(learner, random_batch(64, reward=reward))
+        assert bool(learner.policy.is_trained) == is_trained
+
+
 def test_actions_lie_in_their_bounds():
     td = acting(make(parameter_noise=1.0), TensorDict({keys.OBSERVATION: 3 * torch.randn(50, 4)}, [50]))
     low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)

@@ -281,7 +281,7 @@ def _scale_of(rows: Tensor) -> Tensor:
 class PETSPolicy(TensorDictModuleBase):
     """The first action of a plan; exploring, of one with the member that the environment follows in this episode.
 
-    Acts uniformly at random until the model has been trained. Nothing is planned for finished episodes: their action is
+    Acts uniformly at random until the model has been trained on different rewards. Nothing is planned for finished episodes: their action is
     random, too, and is ignored.
     """
 
@@ -470,8 +470,9 @@ class PETS(ReplayLearner):
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def explore(self, frames: int) -> None:
-        """Let the policy plan."""
-        self.policy.is_trained.fill_(True)
+        """Let the policy plan, as soon as there are different rewards to plan for."""
+        reward = self.buffer[:]["reward"]
+        self.policy.is_trained.fill_(bool((reward != reward[0]).any()))
 
     def updates_due(self, before: int, frames: int) -> int:
         """Return how many updates to make; the first ones make up for the warm-up."""
