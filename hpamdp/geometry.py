@@ -153,7 +153,8 @@ class Symmetries(Contexts):
 
     def to(self, device: torch.device | None) -> Symmetries:
         """Return the maps on a device."""
-        return replace(self, **{name: value.to(device) for name, value in self._tensors().items()})
+        moved: dict[str, Any] = {name: value.to(device) for name, value in self._tensors().items()}
+        return replace(self, **moved)
 
     def _tensors(self) -> dict[str, Tensor]:
         return {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}

@@ -91,7 +91,7 @@ class OptionChoiceEnv(PAMDPEnv):
         td = self._observed(tensordict)
         total = torch.zeros(*self.batch_size, 1, device=self.device)
         # What the policy carries from step to step, as a step of the environment alone keeps nothing.
-        state_keys = [key for key in self._low_policy.out_keys if key in self._low_policy.in_keys]
+        state_keys = getattr(self._low_policy, "state_keys", [])
         # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
             for step in range(self._inner_env.max_steps):

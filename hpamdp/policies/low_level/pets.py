@@ -281,8 +281,8 @@ def _scale_of(rows: Tensor) -> Tensor:
 class PETSPolicy(TensorDictModuleBase):
     """The first action of a plan; exploring, of one with the member that the environment follows in this episode.
 
-    Acts uniformly at random until the model has been trained on different rewards. Nothing is planned for finished episodes: their action is
-    random, too, and is ignored.
+    Acts uniformly at random until the model has been trained on different rewards. Nothing is planned for finished
+    episodes: their action is random, too, and is ignored.
     """
 
     is_trained: Tensor
@@ -339,8 +339,10 @@ class PETSPolicy(TensorDictModuleBase):
         """Return the members that environments follow: a random one where an episode or an option begins."""
         fresh = torch.randint(self.model.num_members, (num,), device=device)
         held, begins = td.get(MEMBER, None), td.get(keys.IS_DECISION, None)
-        if held is None or begins is None:
+        if held is None:
             return fresh
+        if begins is None:
+            return held.flatten()
         return torch.where(begins.flatten(), fresh, held.flatten())
 
     def plan(self, state: Tensor, member: Tensor | None = None) -> Found:
