@@ -21,8 +21,10 @@ from typing import Any
 import numpy as np
 from numba import int32, njit, uint32
 
-# As in `counter_rng`, whose text has the reasons; modulo 2^32.
-_STREAM_STEPS = (0x85EBCA6B, 0x9E3779B9, 0x27D4EB2F, 0x165667BD)
+from hpamdp.env.streams import STEPS
+
+_STREAM_STEPS = tuple(step & 0xFFFFFFFF for step in STEPS)
+# The multipliers of `counter_rng`.
 _FIRST, _SECOND = np.uint32(0x7FEB352D), np.uint32(0x846CA68B)
 _MASK = 0xFFFFFFFF
 

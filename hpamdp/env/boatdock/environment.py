@@ -22,6 +22,7 @@ from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.episode import BoatState, Rules
+from hpamdp.env.boatdock.fleet import Fleet, Readings
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
@@ -34,6 +35,17 @@ if TYPE_CHECKING:
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
+# What a tensordict has whose next root holds nothing else.
+_PLAIN_KEYS = {
+    keys.OBSERVATION,
+    keys.OUTCOME,
+    episode.FUEL,
+    keys.DONE,
+    keys.TERMINATED,
+    keys.TRUNCATED,
+    keys.OPTION,
+    keys.ACTION,
+}
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 
 
@@ -58,13 +70,18 @@ class BoatDockEnv(PAMDPEnv):
             congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_rules: compile the pure step, reset and observation functions (takes about half a minute).
+        compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU; on the CPU
+            the kernel is as fast.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
         first_env: number of the first boat, where other processes have those before.
+
+    On the CPU the boats are moved by the kernel of `hpamdp.env.boatdock.kernel`; other devices, compiled rules, and
+    gradients (from the first durations that require them on) have the tensor functions of `episode`. Numbers agree to
+    rounding.
 
     `reset` also takes layouts to play: a tensordict with `start` and `goal` `[N, 2]` in screen px and, optionally,
     `controller` and `keymap` int `[N]`.
@@ -129,6 +146,8 @@ class BoatDockEnv(PAMDPEnv):
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
+        is_on_cpu = self.device is None or self.device.type == "cpu"
+        self._fleet = Fleet(num_envs, rules, first_env) if is_on_cpu and not compile_rules else None
         self._pure_step = episode.step
         self._pure_reset = episode.reset
         self._pure_read = episode.read
@@ -155,12 +174,26 @@ class BoatDockEnv(PAMDPEnv):
     @property
     def state(self) -> BoatState:
         """The boats as they are; assign a state to put them elsewhere (checkpoints do)."""
-        return self._state
+        return self._columns if self._fleet is None else BoatState(*(column.clone() for column in self._state))
 
     @state.setter
     def state(self, state: BoatState) -> None:
-        self._state = BoatState(*(column.to(self.device) for column in state))
+        self._put(BoatState(*(column.to(self.device) for column in state)))
         self._has_layouts = True
+
+    @property
+    def _state(self) -> BoatState:
+        """The boats as they are; where the kernel moves them, the columns change with them."""
+        if self._fleet is None:
+            return self._columns
+        return BoatState(*(torch.from_numpy(column) for column in self._fleet.columns()))
+
+    def _put(self, state: BoatState) -> None:
+        if self._fleet is None:
+            self._columns = state
+            return
+        for column, new in zip(self._state, state, strict=True):
+            column.copy_(new)
 
     @property
     def position(self) -> Tensor:
@@ -178,6 +211,8 @@ class BoatDockEnv(PAMDPEnv):
         """Seed episodes and noise as `set_seed` does, but from streams that training never meets, whatever its seed."""
         self.set_seed(seed)
         self.rules = self.rules._replace(is_evaluation=True)
+        if self._fleet is not None:
+            self._fleet.set_streams(is_evaluation=True)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `outcome`, `fuel` (fraction), `score` and `success` `[M]` of finished (or abandoned) episodes."""
@@ -191,7 +226,7 @@ class BoatDockEnv(PAMDPEnv):
         `start`, `goal` `[N, 2]`, `bearing_offset` `[N]` (degrees) and `optimum` `[N, 2]`: the best possible score with
         the incongruent and the congruent boat from a full tank; `controller` `[N]` where it is not chosen.
         """
-        state = self._state
+        state = self.state
         layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
         known = {
             "start": torch.stack(layout[:2], -1),
@@ -232,7 +267,7 @@ class BoatDockEnv(PAMDPEnv):
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
         plans = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
-        return {**self._state._asdict(), **plans}
+        return {**self.state._asdict(), **plans}
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`.
@@ -265,24 +300,33 @@ class BoatDockEnv(PAMDPEnv):
     def _set_seed(self, seed: int | None) -> None:
         self.rules = self.rules._replace(is_evaluation=False)
         self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
+        self._has_layouts = False
+        if self._fleet is not None:
+            self._fleet.set_seed(0 if seed is None else seed, is_evaluation=False)
+            return
         floats = torch.zeros(self.num_envs, device=self.device)
         integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
         columns = [floats] * 9 + [integers] * 4 + [integers - 1]
-        self._state = BoatState(*columns)
-        self._has_layouts = False
+        self._columns = BoatState(*columns)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = self.reset_mask(tensordict)
         given = None
         if tensordict is not None and _LAYOUT_KEYS & set(tensordict.keys()):
             given = self._given_layout(tensordict)
-        self._state = self._pure_reset(self._state, mask, self._seed, self._environment, self.rules)
+        readings = None
+        if self._fleet is None:
+            self._columns = self._pure_reset(self._columns, mask, self._seed, self._environment, self.rules)
+        else:
+            readings = self._fleet.restart(mask.numpy())
         if given is not None:
-            self._state = where(mask, self._state._replace(**given), self._state)
+            state = self._state
+            self._put(where(mask, state._replace(**given), state))
+            readings = None
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)
         self._has_layouts = True
-        return self._read()
+        return self._read() if readings is None else self._reading(readings)
 
     def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
         """Check a user's layout and return the state's columns that it sets."""
@@ -313,37 +357,102 @@ class BoatDockEnv(PAMDPEnv):
         return columns
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        key, durations, option = self._read_action(tensordict)
+        mask = tensordict.get("_step", None)
+        mask = None if mask is None else mask.reshape(self.num_envs)
+        if self._fleet is not None:
+            readings, rewards = self._press(key, durations, option, mask)
+            return self._reading(readings).set(keys.REWARD, torch.from_numpy(rewards).unsqueeze(-1))
+        chosen = self._columns.controller if option is None else option
+        state, reward, is_action = self._pure_step(
+            self._columns, chosen, key, durations, self._seed, self._environment, self.rules
+        )
+        if not is_action.all():
+            raise _invalid(int((~is_action).nonzero()[0]), key, durations, chosen)
+        if mask is not None:
+            state, reward = where(mask, state, self._columns), torch.where(mask, reward, 0.0)
+        self._columns = state
+        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        is_plain = self._fleet is not None and self._oracle is None and not self._has_human
+        if not is_plain or tensordict.device != self.device or not _PLAIN_KEYS.issuperset(tensordict.keys()):
+            return super()._step_and_maybe_reset(tensordict)
+        # The same in one pass: TorchRL's own steps between ours take longer than the boats.
+        key, durations, option = self._read_action(tensordict)
+        if self._fleet is None:  # the durations require gradients
+            return super()._step_and_maybe_reset(tensordict)
+        readings, rewards = self._press(key, durations, option, None, restarts=True)
+        after = self._reading(readings).set(keys.REWARD, torch.from_numpy(rewards).unsqueeze(-1))
+        return tensordict.set("next", after), self._reading(readings, 1)
+
+    def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return keys, durations and, where the agent chooses, options; their values are still to be checked."""
         if not self._has_layouts:
             raise RuntimeError("BoatDockEnv: the boats have no layouts yet; call reset before step")
         self.check_action(tensordict)
         key, durations = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS).float()
-        option = tensordict.get(keys.OPTION) if self.has_choice else self._state.controller
-        state, reward, is_action = self._pure_step(
-            self._state, option, key, durations, self._seed, self._environment, self.rules
+        if self._fleet is not None and durations.requires_grad and torch.is_grad_enabled():
+            self._columns, self._fleet = self.state, None
+        return key, durations, tensordict.get(keys.OPTION) if self.has_choice else None
+
+    def _press(
+        self, key: Tensor, durations: Tensor, option: Tensor | None, mask: Tensor | None, *, restarts: bool = False
+    ) -> tuple[Readings, np.ndarray]:
+        """Press a key with the kernel."""
+        assert self._fleet is not None
+        result = self._fleet.press(
+            None if option is None else _array(option.long()),
+            _array(key.long()),
+            _array(durations),
+            mask=None if mask is None else _array(mask),
+            restarts=restarts,
         )
-        if not is_action.all():
-            row = int((~is_action).nonzero()[0])
-            raise invalid_action(
-                row,
-                {
-                    "option": (option[row].item(), "allowed 0 to 1"),
-                    "key": (key[row].item(), "allowed 0 to 2"),
-                    "durations": (durations[row].tolist(), "the pressed key's must be finite"),
-                },
-            )
-        mask = tensordict.get("_step", None)
-        if mask is not None:
-            mask = mask.reshape(self.num_envs)
-            state, reward = where(mask, state, self._state), torch.where(mask, reward, 0.0)
-        self._state = state
-        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+        if isinstance(result, int):
+            raise _invalid(result, key, durations, self._state.controller if option is None else option)
+        return result
 
     def _read(self) -> TensorDict:
-        reading = self._pure_read(self._state, self._seed, self._environment, self.rules)
-        seen = TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device)
+        if self._fleet is not None:
+            return self._reading(self._fleet.read())
+        reading = self._pure_read(self._columns, self._seed, self._environment, self.rules)
+        return self._with_knowledge(TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device))
+
+    def _reading(self, readings: Readings, number: int = 0) -> TensorDict:
+        """Return one of the kernel's readings."""
+        observation, outcome, fuel = (torch.from_numpy(column[number]) for column in readings[:3])
+        done, terminated, truncated = torch.from_numpy(readings.flags[number]).unsqueeze(-1).unbind()
+        leaves = {
+            keys.OBSERVATION: observation,
+            keys.OUTCOME: outcome,
+            episode.FUEL: fuel.unsqueeze(-1),
+            keys.DONE: done,
+            keys.TERMINATED: terminated,
+            keys.TRUNCATED: truncated,
+        }
+        return self._with_knowledge(TensorDict(leaves, batch_size=self.batch_size, device=self.device))
+
+    def _with_knowledge(self, seen: TensorDict) -> TensorDict:
+        """Add what people and the planner know."""
         if self._has_human:
             seen.set(keys.HUMAN_OPTION, human_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def _invalid(row: int, key: Tensor, durations: Tensor, option: Tensor) -> ValueError:
+    """Return the error for a boat's invalid action."""
+    return invalid_action(
+        row,
+        {
+            "option": (option[row].item(), "allowed 0 to 1"),
+            "key": (key[row].item(), "allowed 0 to 2"),
+            "durations": (durations[row].tolist(), "the pressed key's must be finite"),
+        },
+    )
 
 
 def _check_arguments(num_envs: int, rules: Rules) -> None:

@@ -99,7 +99,7 @@ def _pressed_distance(duration: Any) -> Any:
 
 @inlined
 def _duration_for(distance: Any) -> Any:
-    """Invert the distance by Newton's method, from a root that is right to 4 % and one step of Halley's for the root."""
+    """Invert the distance by Newton's method, from a rough root that Halley's method refines."""
     cubed = np.float32(_F(0.03) * distance + _F(1e-12))
     root = np.int32(cubed.view(np.int32) // np.int32(3) + _ROOT_BITS).view(np.float32)
     power = root * root * root
@@ -199,9 +199,7 @@ def _mark_over(count: Any, numbers: Any) -> None:
 
 
 @part
-def _load_actions(
-    option: Any, key: Any, durations: Any, first: Any, count: Any, scratch: Any, numbers: Any
-) -> None:
+def _load_actions(option: Any, key: Any, durations: Any, first: Any, count: Any, scratch: Any, numbers: Any) -> None:
     for j in range(count):
         # An action that is ignored may have any key.
         pressed = int32(min(max(key[first + j], 0), task.NUM_KEYS - 1))
