@@ -361,8 +361,7 @@ class BoatDockEnv(PAMDPEnv):
         mask = tensordict.get("_step", None)
         mask = None if mask is None else mask.reshape(self.num_envs)
         if self._fleet is not None:
-            readings, rewards = self._press(key, durations, option, mask)
-            return self._reading(readings).set(keys.REWARD, torch.from_numpy(rewards).unsqueeze(-1))
+            return self._reading(*self._press(key, durations, option, mask))
         chosen = self._columns.controller if option is None else option
         state, reward, is_action = self._pure_step(
             self._columns, chosen, key, durations, self._seed, self._environment, self.rules
@@ -383,15 +382,16 @@ class BoatDockEnv(PAMDPEnv):
         if self._fleet is None:  # the durations require gradients
             return super()._step_and_maybe_reset(tensordict)
         readings, rewards = self._press(key, durations, option, None, restarts=True)
-        after = self._reading(readings).set(keys.REWARD, torch.from_numpy(rewards).unsqueeze(-1))
-        return tensordict.set("next", after), self._reading(readings, 1)
+        after, root = self._reading(readings, rewards), self._reading(readings, number=1)
+        return tensordict.set("next", after), root
 
     def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return keys, durations and, where the agent chooses, options; their values are still to be checked."""
         if not self._has_layouts:
             raise RuntimeError("BoatDockEnv: the boats have no layouts yet; call reset before step")
         self.check_action(tensordict)
-        key, durations = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS).float()
+        action = tensordict.get(keys.ACTION)
+        key, durations = action.get("discrete"), action.get("parameters").float()
         if self._fleet is not None and durations.requires_grad and torch.is_grad_enabled():
             self._columns, self._fleet = self.state, None
         return key, durations, tensordict.get(keys.OPTION) if self.has_choice else None
@@ -418,19 +418,21 @@ class BoatDockEnv(PAMDPEnv):
         reading = self._pure_read(self._columns, self._seed, self._environment, self.rules)
         return self._with_knowledge(TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device))
 
-    def _reading(self, readings: Readings, number: int = 0) -> TensorDict:
+    def _reading(self, readings: Readings, rewards: np.ndarray | None = None, number: int = 0) -> TensorDict:
         """Return one of the kernel's readings."""
-        observation, outcome, fuel = (torch.from_numpy(column[number]) for column in readings[:3])
-        done, terminated, truncated = torch.from_numpy(readings.flags[number]).unsqueeze(-1).unbind()
+        flags = torch.from_numpy(readings.flags[number]).unsqueeze(-1)
         leaves = {
-            keys.OBSERVATION: observation,
-            keys.OUTCOME: outcome,
-            episode.FUEL: fuel.unsqueeze(-1),
-            keys.DONE: done,
-            keys.TERMINATED: terminated,
-            keys.TRUNCATED: truncated,
+            keys.OBSERVATION: torch.from_numpy(readings.observations[number]),
+            keys.OUTCOME: torch.from_numpy(readings.outcomes[number]),
+            episode.FUEL: torch.from_numpy(readings.fuel[number]).unsqueeze(-1),
+            keys.DONE: flags[0],
+            keys.TERMINATED: flags[1],
+            keys.TRUNCATED: flags[2],
         }
-        return self._with_knowledge(TensorDict(leaves, batch_size=self.batch_size, device=self.device))
+        if rewards is not None:
+            leaves[keys.REWARD] = torch.from_numpy(rewards).unsqueeze(-1)
+        # The checks of the constructor would take longer than a hundred boats.
+        return self._with_knowledge(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
 
     def _with_knowledge(self, seen: TensorDict) -> TensorDict:
         """Add what people and the planner know."""
