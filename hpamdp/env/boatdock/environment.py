@@ -18,15 +18,16 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.episode import BoatState, Rules
 from hpamdp.env.boatdock.fleet import Fleet, Readings
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
+from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
+from hpamdp.env.boatdock.task import check_arguments, invalid_press, one_or_two
 from hpamdp.env.columns import where
 
 if TYPE_CHECKING:
@@ -137,12 +138,8 @@ class BoatDockEnv(PAMDPEnv):
         seed: int = 0,
         first_env: int = 0,
     ) -> None:
-        motor_noises = [motor_noise, motor_noise] if isinstance(motor_noise, int | float) else motor_noise
-        if len(motor_noises) != 2:
-            raise ValueError(f"BoatDockEnv: motor_noise={motor_noises}, but must be one number or two")
-        incongruent, congruent = motor_noises
-        rules = Rules(controller, keymap, reward, observation, (incongruent, congruent), sensor_noise, slip)
-        _check_arguments(num_envs, rules)
+        rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
+        check_arguments(num_envs, rules)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
@@ -330,31 +327,9 @@ class BoatDockEnv(PAMDPEnv):
 
     def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
         """Check a user's layout and return the state's columns that it sets."""
-        centre = torch.tensor(harbour.CENTRE, device=self.device)
-        points = {}
-        for name in ("start", "goal"):
-            point = given.get(name, None)
-            if point is None or point.shape != (self.num_envs, 2):
-                shape = None if point is None else list(point.shape)
-                raise ValueError(f"reset: {name} has shape {shape}, but must be [{self.num_envs}, 2] (screen px)")
-            points[name] = point.to(self.device, torch.float32) - centre
-            if not (points[name].norm(dim=-1) < physics.HARBOUR_RADIUS).all():
-                radius = f"{physics.HARBOUR_RADIUS:g} px"
-                raise ValueError(f"reset: a {name} lies outside the harbour: centre {harbour.CENTRE}, radius {radius}")
-        if not ((points["start"] - points["goal"]).norm(dim=-1) > physics.DOCK_RADIUS).all():
-            raise ValueError(f"reset: a start lies within the dock's {physics.DOCK_RADIUS:g} px of its goal")
-        (start_x, start_y), (goal_x, goal_y) = (points[name].unbind(-1) for name in ("start", "goal"))
-        columns = dict(start_x=start_x, start_y=start_y, goal_x=goal_x, goal_y=goal_y, x=start_x, y=start_y)
-        for name, allowed in (("controller", (0, 1)), ("keymap", (1, 2))):
-            value = given.get(name, None)
-            if value is None:
-                continue
-            if name == "controller" and self.has_choice:
-                raise ValueError('reset: controller is given, but with controller="choose" it comes from the option')
-            if value.shape != (self.num_envs,) or not ((value == allowed[0]) | (value == allowed[1])).all():
-                raise ValueError(f"reset: {name} must be {allowed[0]} or {allowed[1]} in shape [{self.num_envs}]")
-            columns[name] = value.to(self.device, torch.int32)
-        return columns
+        arrays = {name: given.get(name).cpu().numpy() for name in _LAYOUT_KEYS & set(given.keys())}
+        columns = layout_columns(arrays, self.num_envs, has_choice=self.has_choice)
+        return {name: torch.from_numpy(column).to(self.device) for name, column in columns.items()}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         key, durations, option = self._read_action(tensordict)
@@ -446,34 +421,4 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 def _invalid(row: int, key: Tensor, durations: Tensor, option: Tensor) -> ValueError:
-    """Return the error for a boat's invalid action."""
-    return invalid_action(
-        row,
-        {
-            "option": (option[row].item(), "allowed 0 to 1"),
-            "key": (key[row].item(), "allowed 0 to 2"),
-            "durations": (durations[row].tolist(), "the pressed key's must be finite"),
-        },
-    )
-
-
-def _check_arguments(num_envs: int, rules: Rules) -> None:
-    choices = {
-        "controller": ("choose", *harbour.CONTROLLERS[::-1], "random"),
-        "keymap": (1, 2, "random"),
-        "reward": ("paper", "sparse"),
-        "observation": ("scaled", "pixels"),
-    }
-    for name, allowed in choices.items():
-        value = getattr(rules, name)
-        if value not in allowed:
-            raise ValueError(f"BoatDockEnv: {name}={value!r}, but must be one of {', '.join(map(str, allowed))}")
-    if num_envs < 1:
-        raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
-    if not 0.0 <= rules.slip <= 1.0:
-        raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
-    noises = (("motor_noise", rules.motor_noise, 10), ("sensor_noise", (rules.sensor_noise,), 1000))
-    for name, values, largest in noises:
-        for value in values:
-            if not 0.0 <= value <= largest:
-                raise ValueError(f"BoatDockEnv: {name}={value}, but must lie between 0 and {largest}")
+    return invalid_press(row, option[row].item(), key[row].item(), durations[row].tolist())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -79,6 +80,12 @@ class Fleet:
     def columns(self) -> BoatState:
         """Return the state, columns `[N]` that change with the boats."""
         return BoatState(*self.floats, *self.integers)  # type: ignore[arg-type]
+
+    def put(self, columns: Mapping[str, np.ndarray], mask: np.ndarray | None) -> None:
+        """Set columns of the state by name, in the rows of `mask` or in all."""
+        state = self.columns()
+        for name, column in columns.items():
+            np.copyto(getattr(state, name), column, where=True if mask is None else mask)
 
     def press(
         self,

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
+
+from hpamdp.messages import invalid_action
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -103,3 +106,50 @@ class BoatState(NamedTuple):
     presses: Tensor
     outcome: Tensor
     episode: Tensor
+
+
+def one_or_two(motor_noise: float | Sequence[float]) -> tuple[float, float]:
+    """Return the motor noise of the incongruent and of the congruent boat."""
+    noises = (motor_noise, motor_noise) if isinstance(motor_noise, int | float) else tuple(motor_noise)
+    if len(noises) != 2:
+        raise ValueError(f"BoatDockEnv: motor_noise={list(noises)}, but must be one number or two")
+    return noises
+
+
+def check_arguments(num_envs: int, rules: Rules) -> None:
+    """Check what a user sets.
+
+    Raises:
+        ValueError: a value is not allowed.
+    """
+    choices = {
+        "controller": ("choose", *CONTROLLERS[::-1], "random"),
+        "keymap": (1, 2, "random"),
+        "reward": ("paper", "sparse"),
+        "observation": ("scaled", "pixels"),
+    }
+    for name, allowed in choices.items():
+        value = getattr(rules, name)
+        if value not in allowed:
+            raise ValueError(f"BoatDockEnv: {name}={value!r}, but must be one of {', '.join(map(str, allowed))}")
+    if num_envs < 1:
+        raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
+    if not 0.0 <= rules.slip <= 1.0:
+        raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
+    noises = (("motor_noise", rules.motor_noise, 10), ("sensor_noise", (rules.sensor_noise,), 1000))
+    for name, values, largest in noises:
+        for value in values:
+            if not 0.0 <= value <= largest:
+                raise ValueError(f"BoatDockEnv: {name}={value}, but must lie between 0 and {largest}")
+
+
+def invalid_press(row: int, option: object, key: object, durations: object) -> ValueError:
+    """Return the error for an invalid action of boat `row`."""
+    return invalid_action(
+        row,
+        {
+            "option": (option, "allowed 0 to 1"),
+            "key": (key, "allowed 0 to 2"),
+            "durations": (durations, "the pressed key's must be finite"),
+        },
+    )
