@@ -54,6 +54,14 @@ class NumpyEnv(Protocol):
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each."""
 
+    def info(self) -> dict[str, Any]:
+        """Return the infos of the first environment as Python's numbers."""
+        values = self.infos()
+        if not self.is_over[0]:
+            for name in self.final_infos:
+                del values[name]
+        return {name: value.item(0) for name, value in values.items()}
+
 
 class Face(gymnasium.Env):
     """One environment.
@@ -90,7 +98,7 @@ class Face(gymnasium.Env):
         observation = self._problem.reset(seed, options)[0]
         if self.render_mode is not None:
             self._track = [self._problem.state]
-        return observation, self._info()
+        return observation, self._problem.info()
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Take an action; after the end of the episode everything stays as it is and earns 0."""
@@ -98,7 +106,7 @@ class Face(gymnasium.Env):
         observations, rewards, terminations, truncations = self._problem.step(action)
         if is_drawn:
             self._track.append(self._problem.state)
-        return observations[0], rewards.item(), terminations.item(), truncations.item(), self._info()
+        return observations[0], rewards.item(), terminations.item(), truncations.item(), self._problem.info()
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the episode so far, uint8 `[480, 480, 3]`; None without a render mode."""
@@ -113,12 +121,6 @@ class Face(gymnasium.Env):
     def _draw(self) -> np.ndarray:
         raise NotImplementedError
 
-    def _info(self) -> dict[str, Any]:
-        values = self._problem.infos()
-        if not self._problem.is_over[0]:
-            for name in self._problem.final_infos:
-                del values[name]
-        return {name: value.item() for name, value in values.items()}
 
 
 class VectorFace(VectorEnv):
@@ -199,11 +201,12 @@ class VectorFace(VectorEnv):
 
     def _masked_infos(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Return the infos of `rows` in Gymnasium's format: with each value a mask `_name` of those that have it."""
-        is_over = self._problem.is_over
+        is_over, everywhere = self._problem.is_over, bool(rows.all())
         masked: dict[str, np.ndarray] = {}
         for name, value in self._problem.infos().items():
-            has_value = rows & is_over if name in self._problem.final_infos else rows
-            if has_value.all():
+            is_final = name in self._problem.final_infos
+            has_value = rows & is_over if is_final else rows
+            if everywhere and not is_final:
                 masked[name] = value
             elif has_value.any():
                 missing: Any = None if value.dtype == object else value.dtype.type(0)

@@ -65,7 +65,7 @@ class BoatDock(Face):
                 heading=(state.velocity_x.item(), state.velocity_y.item()),
                 legs=tuple(rendering.leg(*pair) for pair in itertools.pairwise(self._track)),
                 keymap=state.keymap.item(),
-                **self._info(),
+                **self._problem.info(),
             )
         )
 

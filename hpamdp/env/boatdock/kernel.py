@@ -448,8 +448,8 @@ def advance(
         invalid = _invalid_row(option, key, durations, integers, mode == PRESS_OR_RESTART, settings)
         if invalid >= 0:
             return invalid
-    scratch = np.zeros(_NUM_FLOATS * _BLOCK, np.float32)
-    numbers = np.zeros(_NUM_INTEGERS * _BLOCK, np.int32)
+    scratch = np.empty(_NUM_FLOATS * _BLOCK, np.float32)
+    numbers = np.empty(_NUM_INTEGERS * _BLOCK, np.int32)
     has_noise = max(settings[SLIP_CHANCE], settings[INCONGRUENT_NOISE], settings[CONGRUENT_NOISE]) > 0.0
     for first in range(0, len(mask), _BLOCK):
         count = min(_BLOCK, len(mask) - first)

@@ -26,6 +26,7 @@ from hpamdp.env.faces import After, NumpyEnv, as_array, describe
 
 ActionFormat = Literal["dict", "tuple"]
 
+_TANK = np.float32(task.TANK)
 _OUTCOME_NAMES = np.array(task.OUTCOMES, dtype=object)
 _OPTION_SHAPES = {"start": (2,), "goal": (2,), "controller": (), "keymap": ()}
 # Gaussian numbers that are made from 23-bit uniform ones stay within 5.8 standard deviations.
@@ -102,6 +103,7 @@ class NumpyBoats(NumpyEnv):
         self._batch = batch
         self._is_tuple = action_format == "tuple"
         self._leaf_names = ("option", "key", "duration") if self.has_choice else ("key", "duration")
+        self._leaf_set = set(self._leaf_names)
 
     @property
     def state(self) -> BoatState:
@@ -125,10 +127,8 @@ class NumpyBoats(NumpyEnv):
         if not self.is_reset:
             raise gymnasium.error.ResetNeeded("step: call reset first")
         option, key, durations = self._leaves(action)
-        if restarts:
-            result = self._fleet.press_or_restart(option, key, durations)
-        else:
-            result = self._fleet.press(option, key, durations)
+        press = self._fleet.press_or_restart if restarts else self._fleet.press
+        result = press(option, key, durations)
         if isinstance(result, int):
             chosen = self._fleet.integers[kernel.CONTROLLER] if option is None else option
             raise task.invalid_press(result, chosen[result].item(), key[result].item(), durations[result].tolist())
@@ -143,7 +143,7 @@ class NumpyBoats(NumpyEnv):
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each; `score` is meaningless where the episode is not over."""
         integers = self._fleet.integers
-        fuel = (self._fleet.floats[kernel.FUEL] / np.float32(task.TANK)).astype(np.float64)
+        fuel = (self._fleet.floats[kernel.FUEL] / _TANK).astype(np.float64)
         outcome = integers[kernel.OUTCOME]
         return {
             "outcome": _OUTCOME_NAMES[outcome],
@@ -152,6 +152,15 @@ class NumpyBoats(NumpyEnv):
             "controller": integers[kernel.CONTROLLER].astype(np.int64),
             "score": np.where(outcome == task.SUCCESS, task.SUCCESS_REWARD * fuel, task.FAILURE_REWARD),
         }
+
+    def info(self) -> dict[str, Any]:
+        """Return the infos of the first boat as Python's numbers."""
+        controller, _, presses, outcome, _ = self._fleet.integers[:, 0].tolist()
+        fuel = float(self._fleet.floats[kernel.FUEL, 0] / _TANK)
+        values = {"outcome": task.OUTCOMES[outcome], "fuel": fuel, "presses": presses, "controller": controller}
+        if outcome != task.SAILING:
+            values["score"] = task.SUCCESS_REWARD * fuel if outcome == task.SUCCESS else task.FAILURE_REWARD
+        return values
 
     def _layout(self, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Check the options of a reset and return the columns of the state that they set."""
@@ -172,12 +181,14 @@ class NumpyBoats(NumpyEnv):
         """Check the structure, types and shapes of an action and return options, keys and durations."""
         if self._is_tuple:
             action = self._named(action)
-        elif not isinstance(action, Mapping) or action.keys() != set(self._leaf_names):
+        elif not isinstance(action, dict | Mapping) or action.keys() != self._leaf_set:
             names = ", ".join(self._leaf_names)
             raise ValueError(f"step: the action must be a dict with keys {names}, but is {describe(action)}")
         durations = as_array("step: duration", action["duration"], (*self._batch, task.NUM_KEYS))
         option = self._integers("option", action["option"]) if self.has_choice else None
-        durations = np.ascontiguousarray(durations, np.float32).reshape(self.num_boats, task.NUM_KEYS)
+        if durations.dtype != np.float32 or not durations.flags.c_contiguous:
+            durations = np.ascontiguousarray(durations, np.float32)
+        durations = durations if self._batch else durations.reshape(1, task.NUM_KEYS)
         return option, self._integers("key", action["key"]), durations
 
     def _named(self, action: Any) -> dict[str, Any]:
@@ -197,4 +208,6 @@ class NumpyBoats(NumpyEnv):
 
     def _integers(self, name: str, value: Any) -> np.ndarray:
         array = as_array(f"step: {name}", value, self._batch, is_integer=True)
-        return np.ascontiguousarray(array, np.int64).reshape(self.num_boats)
+        if array.dtype != np.int64 or not array.flags.c_contiguous:
+            array = np.ascontiguousarray(array, np.int64)
+        return array if self._batch else array.reshape(1)
