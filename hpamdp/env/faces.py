@@ -122,7 +122,6 @@ class Face(gymnasium.Env):
         raise NotImplementedError
 
 
-
 class VectorFace(VectorEnv):
     """`num_envs` environments in one batch.
 

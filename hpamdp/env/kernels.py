@@ -54,7 +54,7 @@ def _sources() -> tuple[str]:
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile a function at its first call and keep the machine code on disk; division by 0 is as in NumPy."""
     try:
-        compiled = njit(function, cache=True, error_model="numpy", nogil=True)
+        compiled: Any = njit(function, cache=True, error_model="numpy", nogil=True)
     except RuntimeError:  # there is no folder for it
         return njit(function, error_model="numpy", nogil=True)
     # Numba keeps the code for as long as the function's own file is unchanged, even if it calls functions of others.

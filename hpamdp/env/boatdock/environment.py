@@ -357,8 +357,14 @@ class BoatDockEnv(PAMDPEnv):
         if self._fleet is None:  # the durations require gradients
             return super()._step_and_maybe_reset(tensordict)
         readings, rewards = self._press(key, durations, option, None, restarts=True)
-        after, root = self._reading(readings, rewards), self._reading(readings, number=1)
-        return tensordict.set("next", after), root
+        # TorchRL keeps the action, too; in a tensordict of its own, since an update of the root changes it in place.
+        action = TensorDict._new_unsafe(
+            dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
+        )
+        kept: dict[str, Any] = {keys.ACTION: action}
+        if keys.OPTION in tensordict.keys():
+            kept[keys.OPTION] = tensordict.get(keys.OPTION)
+        return tensordict.set("next", self._reading(readings, rewards)), self._reading(readings, number=1, kept=kept)
 
     def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Return keys, durations and, where the agent chooses, options; their values are still to be checked."""
@@ -393,10 +399,17 @@ class BoatDockEnv(PAMDPEnv):
         reading = self._pure_read(self._columns, self._seed, self._environment, self.rules)
         return self._with_knowledge(TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device))
 
-    def _reading(self, readings: Readings, rewards: np.ndarray | None = None, number: int = 0) -> TensorDict:
-        """Return one of the kernel's readings."""
+    def _reading(
+        self,
+        readings: Readings,
+        rewards: np.ndarray | None = None,
+        number: int = 0,
+        kept: Mapping[str, Any] | None = None,
+    ) -> TensorDict:
+        """Return one of the kernel's readings, with rewards or other leaves."""
         flags = torch.from_numpy(readings.flags[number]).unsqueeze(-1)
-        leaves = {
+        leaves: dict[str, Any] = {
+            **(kept or {}),
             keys.OBSERVATION: torch.from_numpy(readings.observations[number]),
             keys.OUTCOME: torch.from_numpy(readings.outcomes[number]),
             episode.FUEL: torch.from_numpy(readings.fuel[number]).unsqueeze(-1),

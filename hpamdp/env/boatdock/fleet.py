@@ -79,7 +79,7 @@ class Fleet:
 
     def columns(self) -> BoatState:
         """Return the state, columns `[N]` that change with the boats."""
-        return BoatState(*self.floats, *self.integers)  # type: ignore[arg-type]
+        return BoatState(*self.floats, *self.integers)
 
     def put(self, columns: Mapping[str, np.ndarray], mask: np.ndarray | None) -> None:
         """Set columns of the state by name, in the rows of `mask` or in all."""

@@ -13,6 +13,7 @@ from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.episode import FUEL
 from hpamdp.env.boatdock.fleet import Readings
+from hpamdp.env.boatdock.kernel import OUTCOME
 from hpamdp.env.boatdock.task import SAILING, BoatState, Rules
 
 
@@ -48,14 +49,14 @@ class TensorFleet:
 
     def columns(self) -> BoatState:
         """Return copies of the columns."""
-        return BoatState(*(column.cpu().numpy().copy() for column in self._env.state))  # type: ignore[arg-type]
+        return BoatState(*(column.cpu().numpy().copy() for column in self._env.state))
 
     def put(self, columns: Mapping[str, np.ndarray], mask: np.ndarray | None) -> None:
         """Set columns of the state by name."""
         state = self.columns()
         for name, column in columns.items():
             np.copyto(getattr(state, name), column, where=True if mask is None else mask)
-        self._env.state = BoatState(*(torch.from_numpy(column) for column in state))  # type: ignore[arg-type]
+        self._env.state = BoatState(*(torch.from_numpy(column) for column in state))
 
     def press(self, option: np.ndarray | None, key: np.ndarray, durations: np.ndarray) -> tuple[Readings, np.ndarray]:
         """Press a key in every boat; an invalid action raises the environment's own error."""
@@ -70,7 +71,7 @@ class TensorFleet:
         self, option: np.ndarray | None, key: np.ndarray, durations: np.ndarray
     ) -> tuple[Readings, np.ndarray]:
         """Press a key, and instead start a new episode where one is over."""
-        was_over = self.columns().outcome != SAILING
+        was_over = self.integers[OUTCOME] != SAILING
         option = None if option is None else np.where(was_over, 0, option)
         key, durations = np.where(was_over, 0, key), np.where(was_over[:, None], np.float32(0.0), durations)
         readings, rewards = self.press(option, key, durations)
@@ -91,4 +92,5 @@ class TensorFleet:
 def _readings(td: TensorDictBase) -> Readings:
     flags = np.stack([td[name][:, 0].cpu().numpy() for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)])
     columns = (td[keys.OBSERVATION], td[keys.OUTCOME], td[FUEL][:, 0])
-    return Readings(*(column.cpu().numpy().copy()[None] for column in columns), flags[None])
+    observations, outcomes, fuel = (column.cpu().numpy().copy()[None] for column in columns)
+    return Readings(observations, outcomes, fuel, flags[None])
