@@ -130,3 +130,52 @@ def sin_cos(angle: Any) -> Any:
     of_sine = cosine if swapped else sine
     of_cosine = sine if swapped else cosine
     return (-of_sine if quadrant & 2 != 0 else of_sine), (-of_cosine if (quadrant + 1) & 2 != 0 else of_cosine)
+
+
+# What the kernels of all `CounterEnv`s share: the modes, the first places in their settings, and the last rows of their
+# integers.
+ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
+SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, OWN = range(6)
+STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1
+
+
+@part
+def invalid_row(discrete: Any, parameters: Any, places: Any, integers: Any, mode: Any) -> Any:
+    """Return the first row whose action is unknown or has a parameter that is not finite, or -1.
+
+    Args:
+        discrete: int64 `[N]`.
+        parameters: float32 `[N, P]`, of all actions, side by side.
+        places: int64 `[K + 1]`; the parameters of action k are those from `places[k]` to `places[k + 1]`.
+        integers: of the state.
+        mode: with ACT_OR_RESTART, rows that start anew may have any action; with RESTART, all.
+    """
+    if mode == RESTART:
+        return -1
+    for row in range(len(discrete)):
+        is_valid = (discrete[row] >= 0) & (discrete[row] < len(places) - 1)
+        if is_valid:
+            for place in range(places[discrete[row]], places[discrete[row] + 1]):
+                is_valid &= math.isfinite(parameters[row, place])
+        if not is_valid and not (mode == ACT_OR_RESTART and integers[len(integers) + OUTCOME_ROW, row] != 0):
+            return row
+    return -1
+
+
+@inlined
+def parameter(parameters: Any, row: Any, number: Any, action: Any, places: Any, bounds: Any) -> Any:
+    """Return a parameter of the chosen action, clipped to its bounds `[2, P]`; 0 where it has none of this number."""
+    place = places[action] + number
+    if place >= places[action + 1]:
+        return ZERO
+    return min(max(parameters[row, place], bounds[0, place]), bounds[1, place])
+
+
+@inlined
+def report(outcome: Any, num_outcomes: Any, row: Any, outcomes: Any, flags: Any) -> None:
+    """Write an outcome int64 `[N]` and the flags bool `[3, N]`: done, terminated, truncated."""
+    outcomes[row] = outcome
+    is_late = outcome == num_outcomes - 1
+    flags[0, row] = outcome != 0
+    flags[1, row] = (outcome != 0) & (not is_late)
+    flags[2, row] = is_late
