@@ -8,7 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hpamdp import keys
+from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
+from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
+from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.env.platform.environment import PlatformEnv
 
 GOAL = {
     "observation": st.sampled_from(["scaled", "raw"]),
@@ -24,6 +28,28 @@ PROBLEMS = {
         {**GOAL, "repaired": st.lists(st.sampled_from([*GOAL_SLIPS, "middle_shots"]), unique=True)},
         5e-3,
     ),
+    "platform": (
+        PlatformEnv,
+        {"noise": st.sampled_from([0.0, 1.0, 3.0]), "max_steps": st.sampled_from([2, 200])},
+        5e-3,
+    ),
+    "catch_point": (
+        CatchPointEnv,
+        {
+            "max_steps": st.sampled_from([3, 25]),
+            "catches": st.sampled_from([1, 11]),
+            "late_end": st.booleans(),
+            "progress": st.booleans(),
+        },
+        1e-5,
+    ),
+    "hard_move": (
+        HardMoveEnv,
+        {"n": st.sampled_from([4, 6]), "rounded_directions": st.booleans(), "max_steps": st.sampled_from([3, 30])},
+        1e-5,
+    ),
+    "moving": (MovingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-5),
+    "sliding": (SlidingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-4),
 }
 
 

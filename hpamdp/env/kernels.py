@@ -179,3 +179,13 @@ def report(outcome: Any, num_outcomes: Any, row: Any, outcomes: Any, flags: Any)
     flags[0, row] = outcome != 0
     flags[1, row] = (outcome != 0) & (not is_late)
     flags[2, row] = is_late
+
+
+@inlined
+def must_restart(mode: Any, reading: Any, was_over: Any, outcome: Any, is_marked: Any) -> Any:
+    """Return whether a row starts anew before a reading, given how its episode was before the action and is now."""
+    if mode == RESTART:
+        return is_marked
+    if mode == ACT_OR_RESTART:
+        return was_over
+    return (reading == 1) & (outcome != 0)

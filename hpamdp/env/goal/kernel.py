@@ -305,12 +305,7 @@ def advance(
             elif end != rules.PLAYING:
                 rewards[row] = -_goal_distance(body, settings[REPAIRS_DISTANCE] != 0.0)
         for reading in range(len(observations)):
-            if mode == kernels.RESTART:
-                restarts = mask[row]
-            else:
-                is_over = was_over if mode == kernels.ACT_OR_RESTART else integers[_OUTCOME, row] != rules.PLAYING
-                restarts = is_over and (reading == 1 or mode == kernels.ACT_OR_RESTART)
-            if restarts:
+            if kernels.must_restart(mode, reading, was_over, integers[_OUTCOME, row], mask[row]):
                 _start(floats, integers, row, settings, episode_base, episode_step)
                 body[:] = floats[:, row]
             _observe(body, settings, observations[reading, row])
