@@ -38,7 +38,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         late_end: whether an episode that has no catches left ends a step later, in which it earns 0, as the published
             code does it.
         progress: whether misses and time are observed, too, `[N, 6]` instead of `[N, 4]`, as DLPA has it.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.

@@ -50,7 +50,7 @@ class GoalEnv(CounterEnv[GoalState]):
         observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
         noise: factor on the published noise of the motions; 0 is none. Starts are random all the same.
         repaired: the slips to take out; `slips` are those that the problem has.
-        compile_rules: compile the ticks: faster with many pitches, but the first action takes about a minute.
+        compile_rules: compile the ticks (takes about a minute) instead of using the kernel, for a GPU.
         device: of the tensors.
         seed: of starts and noise; the global generators are neither read nor moved.
         first_env: number of the first pitch, where other processes have the pitches before it.

@@ -41,7 +41,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         n: number of actuators.
         max_steps: actions after which an episode is truncated; HyAR has 30, DLPA 25.
         rounded_directions: whether the actuators' directions have three decimals, as published.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
