@@ -2,7 +2,8 @@
 
 Run: python experiments/throughput/throughput.py [--seconds 1] [--device cpu]
 
-Each figure is the fastest of many short trials of one process on one core, and its peers are measured beside it:
+Each figure is the fastest of many short trials of one process on one core, by its CPU time, which leaves out the turns
+of other processes; its peers are measured beside it in the same run:
 - boats, one: `gymnasium.make`, beside Gymnasium's own CartPole;
 - boats, many: Gymnasium's vector environment, `BoatDockEnv.step_and_maybe_reset` by the kernel and by the tensor
   functions (as they are and, with --compiled, compiled), beside Gymnasium's vectorised NumPy CartPole;
@@ -49,16 +50,16 @@ POOL = 8
 
 
 def rate(step: Callable[[], object], steps_per_call: int, seconds: float) -> float:
-    """Return the steps a second of the fastest of many trials of about 5 ms, which fit between others' turns."""
+    """Return the steps a second of CPU time of the fastest of many trials of a few milliseconds."""
     for _ in range(POOL + 2):
         step()
     calls, ended = 1, time.perf_counter() + seconds
     best = 0.0
     while time.perf_counter() < ended:
-        started = time.perf_counter()
+        started = time.process_time()
         for _ in range(calls):
             step()
-        taken = time.perf_counter() - started
+        taken = time.process_time() - started
         best = max(best, calls * steps_per_call / taken)
         if taken < 0.0025:
             calls *= 2
