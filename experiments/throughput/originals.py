@@ -1,8 +1,8 @@
 """One environment at a time in plain Python: lean stand-ins for the published code of the field's domains.
 
-They have its loops and its arithmetic on floats, but neither its NumPy arrays nor its checks, so are faster. Each is
-a generator function `(random) -> iterator`: one `next` is one action of a uniformly random agent, with new episodes
-where they end.
+They have its loops and its arithmetic on floats, but neither its NumPy arrays nor its checks, and so are faster.
+Each is a generator function `(random) -> iterator`: one `next` is one action of a uniformly random agent, with new
+episodes where they end.
 """
 
 from __future__ import annotations

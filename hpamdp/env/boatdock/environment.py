@@ -71,8 +71,8 @@ class BoatDockEnv(PAMDPEnv):
             congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU; on the CPU
-            the kernel is as fast.
+        compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU, instead
+            of using the kernel.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
