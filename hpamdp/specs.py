@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.geometry import PlaneGeometry, Symmetries
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,9 @@ class PAMDPSpecs:
             `num_options` rows of `num_discrete` entries; else None.
         held_option: of a learner that serves one option: its number; None: the observation ends in the one-hot option,
             or there is none.
+        symmetries: maps under which neither dynamics nor reward change; None where the problem declares none.
+        geometry: which entries are vectors of the plane, and where the discrete actions point; None where the problem
+            declares none.
     """
 
     observation_dim: int
@@ -42,6 +46,8 @@ class PAMDPSpecs:
     has_option_mask: bool = False
     option_actions: tuple[tuple[bool, ...], ...] | None = None
     held_option: int | None = None
+    symmetries: Symmetries | None = field(default=None, compare=False)
+    geometry: PlaneGeometry | None = field(default=None, compare=False)
 
     @property
     def num_options(self) -> int:
@@ -102,37 +108,83 @@ class PAMDPSpecs:
             own = of_options[self.held_option].expand(*observation.shape[:-1], -1)
         return own if action_mask is None else own & action_mask
 
-    def of_option(self, option: int) -> PAMDPSpecs:
-        """Return the specs of a learner that serves one option."""
-        return replace(self, held_option=option)
-
     def with_option_observed(self) -> PAMDPSpecs:
         """Return the specs of a learner whose observation ends in the one-hot option."""
         weight = self.initial_weight
         if weight is not None:
             weight = tuple((*row, *[0.0] * self.num_options) for row in weight)
-        return replace(self, observation_dim=self.observation_dim + self.num_options, initial_weight=weight)
+        dim = self.observation_dim
+        symmetries, geometry = self.symmetries, self.geometry
+        return replace(
+            self,
+            observation_dim=dim + self.num_options,
+            initial_weight=weight,
+            symmetries=None if symmetries is None else symmetries.with_option_observed(dim, self.num_options),
+            geometry=None if geometry is None else geometry.with_option_observed(dim),
+        )
+
+    def of_option(self, option: int) -> PAMDPSpecs:
+        """Return the specs of a learner that serves one option."""
+        symmetries, geometry = self.symmetries, self.geometry
+        return replace(
+            self,
+            held_option=option,
+            symmetries=None if symmetries is None else symmetries.of_option(option),
+            geometry=None if geometry is None else geometry.of_option(option),
+        )
+
+    @property
+    def telling_entries(self) -> list[int]:
+        """The entries of the observation that are not redundant, all of them where nothing is declared."""
+        redundant = () if self.geometry is None else self.geometry.redundant
+        return [entry for entry in range(self.observation_dim) if entry not in redundant]
+
+    def with_telling_entries(self) -> PAMDPSpecs:
+        """Return the specs of observations that have the `telling_entries` alone."""
+        entries = self.telling_entries
+        symmetries, geometry = self.symmetries, self.geometry
+        weight = self.initial_weight
+        return replace(
+            self,
+            observation_dim=len(entries),
+            initial_weight=None if weight is None else tuple(tuple(row[entry] for entry in entries) for row in weight),
+            symmetries=None if symmetries is None else symmetries.with_entries(entries),
+            geometry=None if geometry is None else geometry.with_entries(entries),
+        )
 
     @classmethod
     def from_env(cls, env: EnvBase) -> PAMDPSpecs:
         """Read the sizes off a `PAMDPEnv`.
 
         Raises:
-            ValueError: its initial parameters do not fit its observation and action.
+            ValueError: its initial parameters, symmetries or geometry do not fit its observation and action.
         """
         action = env.full_action_spec_unbatched
         parameters = action[keys.PARAMETERS]
         observation_dim = env.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
+        num_parameters = sum(env.parameter_dims)
         initial = env.initial_parameters()
         weight = bias = None
         if initial is not None:
             shapes = [list(part.shape) for part in initial]
-            num_parameters = sum(env.parameter_dims)
             expected = [[num_parameters, observation_dim], [num_parameters]]
             if shapes != expected:
                 raise ValueError(f"initial_parameters: shapes {shapes}, but must be {expected}")
             weight = tuple(tuple(row) for row in initial[0].tolist())
             bias = tuple(initial[1].tolist())
+        symmetries, geometry = env.symmetries, env.geometry
+        num_discrete = len(env.parameter_dims)
+        misfits: dict[str, str] = {}
+        if symmetries is not None:
+            misfits["symmetries"] = symmetries.fits(observation_dim, num_discrete, num_parameters)
+        if geometry is not None:
+            misfits["geometry"] = geometry.fits(observation_dim, env.parameter_dims)
+        for name, misfit in misfits.items():
+            if misfit:
+                raise ValueError(f"{name}: {misfit}")
+        has_action_mask = keys.ACTION_MASK in env.observation_spec_unbatched.keys()
+        if has_action_mask or env.option_actions is not None:
+            symmetries = None  # they do not say how masks, and options that are sets of actions, are mapped
         return cls(
             observation_dim=observation_dim,
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
@@ -141,7 +193,9 @@ class PAMDPSpecs:
             parameter_high=tuple(parameters.space.high.flatten().tolist()),
             initial_weight=weight,
             initial_bias=bias,
-            has_action_mask=keys.ACTION_MASK in env.observation_spec_unbatched.keys(),
+            has_action_mask=has_action_mask,
             has_option_mask=keys.OPTION_MASK in env.observation_spec_unbatched.keys(),
             option_actions=env.option_actions,
+            symmetries=symmetries,
+            geometry=geometry,
         )

@@ -14,6 +14,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.geometry import PlaneGeometry, Symmetries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -175,6 +176,16 @@ class PAMDPEnv(EnvBase):
         """Positions of the agents for drawing, `[N, 2]`; None where that means nothing."""
         return None
 
+    @property
+    def symmetries(self) -> Symmetries | None:
+        """The maps under which neither dynamics nor reward change; None: there are none, or none that is known."""
+        return None
+
+    @property
+    def geometry(self) -> PlaneGeometry | None:
+        """Which entries of the observation are vectors, and where the actions point; None where that means nothing."""
+        return None
+
     def fixed_episodes(self, seed: int) -> TensorDict | None:
         """Return what to `reset` with for the evaluation episodes of a seed, one for each environment.
 
@@ -295,20 +306,11 @@ class PAMDPEnv(EnvBase):
         Raises:
             ValueError: a leaf is missing, or has another shape or type.
         """
-        shapes: dict[str | tuple[str, str], tuple[int, ...]] = {
-            keys.DISCRETE: tuple(self.batch_size),
-            keys.PARAMETERS: (*self.batch_size, sum(self.parameter_dims)),
-        }
+        size = self.batch_size
+        self._check_leaf(tensordict, keys.DISCRETE, size, is_integer=True)
+        self._check_leaf(tensordict, keys.PARAMETERS, (*size, sum(self.parameter_dims)), is_integer=False)
         if self.has_choice:
-            shapes[keys.OPTION] = tuple(self.batch_size)
-        for name, shape in shapes.items():
-            value = tensordict.get(name)
-            if value is None or value.shape != shape:
-                given_shape = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
-            if name != keys.PARAMETERS and (value.is_floating_point() or value.dtype == torch.bool):
-                given_type = str(value.dtype).removeprefix("torch.")
-                raise ValueError(f"step: {name} has type {given_type}, but must be integer")
+            self._check_leaf(tensordict, keys.OPTION, size, is_integer=True)
         if self.option_actions is not None:
             self._check_option(tensordict.get(keys.OPTION), tensordict.get(keys.DISCRETE))
 
@@ -326,6 +328,18 @@ class PAMDPEnv(EnvBase):
             for name, allowed in zip(self.option_names, self._allowed_by_option.tolist(), strict=True)
         )
         raise ValueError(f"step: environment {row} got {given} (the options allow {', '.join(listed)})")
+
+    @staticmethod
+    def _check_leaf(
+        tensordict: TensorDictBase, name: str | tuple[str, str], shape: tuple[int, ...], *, is_integer: bool
+    ) -> None:
+        value = tensordict.get(name)
+        if value is None or value.shape != shape:
+            given_shape = None if value is None else list(value.shape)
+            raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
+        if is_integer and (value.is_floating_point() or value.dtype == torch.bool):
+            given_type = str(value.dtype).removeprefix("torch.")
+            raise ValueError(f"step: {name} has type {given_type}, but must be integer")
 
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""

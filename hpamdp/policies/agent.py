@@ -32,10 +32,16 @@ def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
 class OptionRouter(TensorDictModuleBase):
     """The low level's policy: in each environment, the policy of the held option's learner acts.
 
+    Keys that a learner's policy both reads and writes, its state, stay in the tensordict from step to step. A policy
+    finds none of them where nothing has been written yet.
+
     Args:
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
         is_shared: whether the single learner observes the option.
+
+    Attributes:
+        state_keys: the policies' state.
     """
 
     def __init__(self, learners: Sequence[Learner], specs: PAMDPSpecs, is_shared: bool) -> None:
@@ -43,21 +49,22 @@ class OptionRouter(TensorDictModuleBase):
         self.policies = nn.ModuleList(learner.policy for learner in learners)
         self.specs = specs
         self.is_shared = is_shared
-        in_keys = {key for learner in learners for key in learner.policy.in_keys}
-        masks = [keys.ACTION_MASK] if specs.has_action_mask else []
-        self.in_keys = [*in_keys, *masks, *([keys.OPTION] if specs.num_options else [])]
         # Learners of several classes may write keys of their own.
         self.out_keys = list(dict.fromkeys(key for learner in learners for key in learner.policy.out_keys))
+        in_keys = {key for learner in learners for key in learner.policy.in_keys}
+        self.state_keys = [key for key in self.out_keys if key in in_keys]
+        masks = [keys.ACTION_MASK] if specs.has_action_mask else []
+        self.in_keys = [*in_keys, *masks, *([keys.OPTION] if specs.num_options else [])]
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action leaves and the other `out_keys` of the learners' policies."""
         if self.is_shared:
-            acted = self.policies[0](with_option(td.select(*self.in_keys), self.specs.num_options))
+            acted = self.policies[0](with_option(self._seen(td), self.specs.num_options))
             return td.update(acted.select(*self.out_keys))
         if len(self.policies) == 1:
             return self.policies[0](td)
         option = td.get(keys.OPTION)
-        seen = td.select(*self.in_keys)
+        seen = self._seen(td)
         for i, policy in enumerate(self.policies):
             rows = option == i
             if not rows.any():
@@ -79,11 +86,15 @@ class OptionRouter(TensorDictModuleBase):
     def _fill(self, td: TensorDictBase, policy: TensorDictModuleBase) -> None:
         """Write zeros under the keys of a policy that acts in none of the environments, so that all steps have them."""
         with torch.random.fork_rng():
-            acted = policy(td.select(*self.in_keys).reshape(-1)[:1])
+            acted = policy(self._seen(td).reshape(-1)[:1])
         for key in policy.out_keys:
             if td.get(key, None) is None:
                 value = acted.get(key)
                 td.set(key, value.new_zeros(*td.batch_size, *value.shape[1:]))
+
+    def _seen(self, td: TensorDictBase) -> TensorDictBase:
+        """Return what the policies read, as far as it is there."""
+        return td.select(*self.in_keys, strict=False)
 
 
 class HeldOption(TensorDictModuleBase):

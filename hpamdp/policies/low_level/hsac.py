@@ -139,6 +139,7 @@ class HSAC(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
         policy_delay: PositiveInt,
         gamma: PositiveFraction,
         tau: PositiveFraction,
@@ -155,6 +156,7 @@ class HSAC(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.discrete_target_entropy = discrete_target_entropy
         self.most_discrete_entropy = math.log(specs.num_discrete)
