@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -50,7 +50,8 @@ class OptionRouter(TensorDictModuleBase):
         self.specs = specs
         self.is_shared = is_shared
         # Learners of several classes may write keys of their own.
-        self.out_keys = list(dict.fromkeys(key for learner in learners for key in learner.policy.out_keys))
+        self._own_out_keys = [list(learner.policy.out_keys) for learner in learners]
+        self.out_keys = list(dict.fromkeys(key for own_keys in self._own_out_keys for key in own_keys))
         in_keys = {key for learner in learners for key in learner.policy.in_keys}
         self.state_keys = [key for key in self.out_keys if key in in_keys]
         masks = [keys.ACTION_MASK] if specs.has_action_mask else []
@@ -70,7 +71,7 @@ class OptionRouter(TensorDictModuleBase):
             if not rows.any():
                 continue
             acted = policy(seen[rows])
-            for key in policy.out_keys:
+            for key in self._own_out_keys[i]:
                 value = acted.get(key)
                 written = td.get(key, None)
                 if written is None:
@@ -78,19 +79,19 @@ class OptionRouter(TensorDictModuleBase):
                 written = written.clone()
                 written[rows] = value
                 td.set(key, written)
-        for policy in self.policies:
-            if any(td.get(key, None) is None for key in policy.out_keys):
-                self._fill(td, policy)
+        for policy, own_keys in zip(self.policies, self._own_out_keys, strict=True):
+            missing = [key for key in own_keys if td.get(key, None) is None]
+            if missing:
+                self._fill(td, policy, missing)
         return td
 
-    def _fill(self, td: TensorDictBase, policy: TensorDictModuleBase) -> None:
+    def _fill(self, td: TensorDictBase, policy: nn.Module, missing: Sequence[NestedKey]) -> None:
         """Write zeros under the keys of a policy that acts in none of the environments, so that all steps have them."""
         with torch.random.fork_rng():
             acted = policy(self._seen(td).reshape(-1)[:1])
-        for key in policy.out_keys:
-            if td.get(key, None) is None:
-                value = acted.get(key)
-                td.set(key, value.new_zeros(*td.batch_size, *value.shape[1:]))
+        for key in missing:
+            value = acted.get(key)
+            td.set(key, value.new_zeros(*td.batch_size, *value.shape[1:]))
 
     def _seen(self, td: TensorDictBase) -> TensorDictBase:
         """Return what the policies read, as far as it is there."""

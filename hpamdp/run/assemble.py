@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,9 +116,12 @@ def _group_actions(env: PAMDPEnv, config: Config) -> None:
     Raises:
         ConfigError: the problem has no such actions, or options of its own.
     """
-    options = config.run.env.options
-    if options == "default":
-        options = dict(env.default_options)
+    chosen = config.run.env.options
+    options: Mapping[str, Sequence[int | str]] = {}
+    if isinstance(chosen, dict):
+        options = chosen
+    elif chosen == "default":
+        options = env.default_options
         if not options:
             raise ConfigError(f"env.options=default: {config.env} suggests none; name the actions of each option")
     for level in (config.high, *config.learners):

@@ -60,7 +60,7 @@ class GoalEnv(CounterEnv[GoalState]):
         ValueError: an argument or an action is invalid; the state is unchanged.
     """
 
-    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    discrete_names: tuple[str, ...] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims: tuple[int, ...] = rules.PARAMETER_DIMS

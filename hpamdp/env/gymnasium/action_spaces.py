@@ -195,7 +195,11 @@ class OptionSpace:
         if len(entries) == 1:
             (self.rest,) = entries.values()
         else:
-            self.rest = spaces.Dict(entries) if self._is_dict else spaces.Tuple(list(entries.values()))
+            self.rest = (
+                spaces.Dict({str(name): entry for name, entry in entries.items()})
+                if self._is_dict
+                else spaces.Tuple(list(entries.values()))
+            )
 
     def with_option(self, action: Any, option: int) -> Any:
         """Return an action of the space: one of `rest` with an option, 0 to `num_options` - 1."""

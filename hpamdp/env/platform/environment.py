@@ -43,7 +43,7 @@ class PlatformEnv(CounterEnv[PlatformState]):
         ValueError: an argument or an action is invalid; the state is unchanged.
     """
 
-    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 1)
