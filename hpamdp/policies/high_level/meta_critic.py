@@ -4,6 +4,9 @@ Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2
 bounds of an ensemble: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
 
 Differs from the sources: where a time limit ends an episode, nothing follows.
+
+Differs from Chen et al.: which decisions a member of the ensemble learns from is drawn anew at every update, not once
+for each decision, and all members share one target, the mean of the target members.
 """
 
 from __future__ import annotations
