@@ -6,7 +6,7 @@
 - Directives, which are HTML comments on lines of their own, are filled in:
   `<!-- settings of conf/low/hppo.yaml -->`, every value with its default and its comment;
   `<!-- docstring of hpamdp/policies/low_level/hppo.py: Source -->`, the parts of a module's docstring that begin so;
-  `<!-- rows of experiments/table1/README.md, table 2: hppo, random -->`, the rows of a study's table by their first cell;
+  `<!-- rows of experiments/table1/README.md, table 2: hppo -->`, the rows of a study's table by their first cell;
   `<!-- csv experiments/domains/published.csv: domain=platform -->`, the rows of a csv file by a column.
 - Every module of the package with a public docstring gets a page in the API.
 """
@@ -151,14 +151,16 @@ def outside_code(text: str, change: Callable[[str], str]) -> str:
 
 
 def settings_of(path: str) -> str:
-    """Return a table of a yaml's values: name, default, and the comment above, which holds until the next one."""
+    """Return what a yaml says at its head, and a table of its values: name, default, the comment above."""
+    head, section = "", ""
+    comment: list[str] = []
     rows = ["| setting | default | |", "|---|---|---|"]
-    section, comment = "", []
     for line in (ROOT / path).read_text(encoding="utf-8").splitlines():
         entry = re.match(r"(  )?(\w+):(?: (.+))?$", line)
         if line.lstrip().startswith("#"):
             comment.append(line.lstrip()[1:].strip())
         elif not entry or entry[2] == "_target_":
+            head = head or cell(" ".join(comment))
             comment = []
         elif entry[3] is None:
             section = f"{entry[2]}."
@@ -169,7 +171,7 @@ def settings_of(path: str) -> str:
             comment = []
     if len(rows) == 2:
         return "It has no settings."
-    return "\n".join(rows)
+    return "\n".join([head, "", *rows])
 
 
 def cell(text: str) -> str:
@@ -184,8 +186,10 @@ def docstring_of(words: str) -> str:
     found = [paragraph for paragraph in paragraphs if paragraph.startswith(start)]
     if not found:
         raise SiteError(f"no paragraph begins with {start}")
+    text = "\n\n".join(found)
     # Docstrings have no empty line between a sentence and its list, which Markdown needs.
-    return "\n\n".join(re.sub(r":\n- ", ":\n\n- ", paragraph) for paragraph in found)
+    text = re.sub(r":\n- ", ":\n\n- ", text)
+    return re.sub(r"arXiv([ :\n])(\d{4}\.\d{5})", r"arXiv\1[\2](https://arxiv.org/abs/\2)", text)
 
 
 def rows_of(words: str) -> str:

@@ -1,7 +1,7 @@
 """The tutorials in docs/tutorials run: their commands and their Python, in the order of the page.
 
-A block `shell` holds commands of `hpamdp`, a block `python` code, which shares its names with the blocks before it. What
-Python prints has to be what a block `text` right after it says.
+A block `shell` holds commands of `hpamdp`, a block `python` code, which shares its names with the blocks before it.
+What Python prints has to be what a block `text` right after it says.
 """
 
 import io
@@ -21,7 +21,9 @@ from hpamdp.data.human.released_file import PATH_VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted((ROOT / "docs/tutorials").glob("*.md"))
-BLOCK = re.compile(r"^```(?P<kind>python|shell)\n(?P<code>.*?)^```\n(?:\n```text\n(?P<printed>.*?)^```\n)?", re.M | re.S)
+BLOCK = re.compile(
+    r"^```(?P<kind>python|shell)\n(?P<code>.*?)^```\n(?:\n```text\n(?P<printed>.*?)^```\n)?", re.M | re.S
+)
 
 
 def follow(page: Path, folder: Path) -> None:
