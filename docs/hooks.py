@@ -231,6 +231,13 @@ DIRECTIVES: dict[str, Callable[[str], str]] = {
 }
 
 
+def studies() -> list[str]:
+    """Return the places of the studies' pages, those to begin with first."""
+    first = ["table1", "learners", "hierarchy", "quickstart", "human"]
+    names = sorted(file.parent.name for file in ROOT.glob("experiments/*/README.md"))
+    return [f"studies/{name}.md" for name in sorted(names, key=lambda n: first.index(n) if n in first else len(first))]
+
+
 def api_nav() -> list[object]:
     """Return the navigation of the API, nested as the package is."""
     tree: dict[str, object] = {}
@@ -252,8 +259,10 @@ def _nested(tree: dict[str, object]) -> Iterator[object]:
 
 
 def on_config(config):
-    """Put the API's pages into the navigation."""
+    """Put the studies and the API into the navigation."""
     for item in config.nav:
+        if "Results" in item:
+            item["Results"] += studies()
         if "API" in item:
             item["API"] = api_nav()
     return config

@@ -1,6 +1,7 @@
 """The pages of the site: one for each learner, selector and domain, made of the repository's own files."""
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -54,7 +55,7 @@ def test_every_choice_has_a_page_that_names_it_and_shows_its_settings(group, nam
 def test_a_domains_page_names_its_actions_outcomes_and_observations(name):
     text = page("env", name).read_text()
     env = make_config([f"env={name}"]).env.cls(1)
-    named = [*env.observation_names] if hasattr(env, "observation_names") else []
+    named = [each for each in getattr(env, "observation_names", ()) if not re.fullmatch(r"[xy]_\d+", each)]
     named += [*env.outcomes] if hasattr(env, "outcomes") else []
     named += [] if name == "hard_move" else [*getattr(env, "discrete_names", ())]
     assert not [each for each in named if f"`{each}`" not in text]
@@ -110,8 +111,10 @@ QUICK = {
     "dlpa": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
     "actor": ["high.minibatch_size=16"],
     "meta_critic": ["high.warmup_decisions=16", "high.updates_per_decision=0.1"],
+    "option_critic": ["high.warmup_steps=64"],
 }
-SELECTORS = ["ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson", "meta_critic", "actor"]
+SELECTORS = ["ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson", "actor", "meta_critic"]
+SELECTORS += ["option_critic"]
 
 
 def run(words: list[str]) -> None:
@@ -125,6 +128,7 @@ def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
     high = SELECTORS[sorted(TRAINED).index(low) % len(SELECTORS)]
     words = [f"low={low}", f"high={high}", "num_envs=16", "steps_per_batch=4", "total_frames=1024", "log_every=64"]
     words += ["eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}", "agent.uniform_option_frames=1024"]
+    words += ["agent.option_length=learned"] if high == "option_critic" else []
     words += ["low.warmup_frames=128"] if "warmup_frames" in (ROOT / f"conf/low/{low}.yaml").read_text() else []
     assert forked(run, [*words, *QUICK.get(low, []), *QUICK.get(high, [])]) == 0
     columns = {name for row in read_rows(tmp_path / "metrics.csv") for name in row}
