@@ -186,9 +186,11 @@ def docstring_of(words: str) -> str:
     found = [paragraph for paragraph in paragraphs if paragraph.startswith(start)]
     if not found:
         raise SiteError(f"no paragraph begins with {start}")
-    text = "\n\n".join(found)
+    # The page's own headings say what these are.
+    text = "\n\n".join(re.sub(r"^(Source|Differs from the sources?):\s", "", paragraph) for paragraph in found)
     # Docstrings have no empty line between a sentence and its list, which Markdown needs.
     text = re.sub(r":\n- ", ":\n\n- ", text)
+    text = text[0].upper() + text[1:]
     return re.sub(r"arXiv([ :\n])(\d{4}\.\d{5})", r"arXiv\1[\2](https://arxiv.org/abs/\2)", text)
 
 

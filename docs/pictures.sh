@@ -4,7 +4,7 @@ set -e
 film() {
     name=$1
     shift
-    hpamdp watch "$@" --to "docs/domains/$name.gif" --episodes 4 --size 200
+    hpamdp watch "$@" --to "docs/domains/$name.gif" --episodes 3 --size 240
 }
 film boatdock low=planner high=oracle
 film catch_point low=planner high=none env=catch_point

@@ -33,7 +33,7 @@ def follow(page: Path, folder: Path) -> None:
     names: dict = {}
     for block in BLOCK.finditer(page.read_text()):
         if block["kind"] == "shell":
-            for line in block["code"].splitlines():
+            for line in block["code"].replace("\\\n", " ").splitlines():
                 assert forked(run, shlex.split(line)) == 0, line
             continue
         with redirect_stdout(io.StringIO()) as printed:
