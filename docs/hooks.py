@@ -187,7 +187,7 @@ def docstring_of(words: str) -> str:
     if not found:
         raise SiteError(f"no paragraph begins with {start}")
     # The page's own headings say what these are.
-    text = "\n\n".join(re.sub(r"^(Source|Differs from the sources?):\s", "", paragraph) for paragraph in found)
+    text = "\n\n".join(re.sub(r"^(Sources?|Differs from the sources?):\s", "", paragraph) for paragraph in found)
     # Docstrings have no empty line between a sentence and its list, which Markdown needs.
     text = re.sub(r":\n- ", ":\n\n- ", text)
     text = text[0].upper() + text[1:]

@@ -14,6 +14,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.geometry import PlaneGeometry, Symmetries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -97,6 +98,16 @@ class PAMDPEnv(EnvBase):
     @property
     def position(self) -> Tensor | None:
         """Positions of the agents for drawing, `[N, 2]`; None where that means nothing."""
+        return None
+
+    @property
+    def symmetries(self) -> Symmetries | None:
+        """The maps under which neither dynamics nor reward change; None: there are none, or none that is known."""
+        return None
+
+    @property
+    def geometry(self) -> PlaneGeometry | None:
+        """Which entries of the observation are vectors, and where the actions point; None where that means nothing."""
         return None
 
     def fixed_episodes(self, seed: int) -> TensorDict | None:

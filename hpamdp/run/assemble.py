@@ -114,9 +114,11 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     """
     selector = config.high.build(specs=specs, device=device) if specs.num_options else None
     is_shared = config.run.agent.sharing == "shared" and specs.num_options > 0
-    learner_specs = specs.with_option_observed() if is_shared else specs
-    num_learners = 1 if is_shared else max(1, specs.num_options)
-    learners = [config.low.build(specs=learner_specs, device=device) for _ in range(num_learners)]
+    if is_shared:
+        learner_specs = [specs.with_option_observed()]
+    else:
+        learner_specs = [specs.of_option(i) for i in range(specs.num_options)] or [specs]
+    learners = [config.low.build(specs=own_specs, device=device) for own_specs in learner_specs]
     agent = HierarchicalAgent(
         selector,
         learners,

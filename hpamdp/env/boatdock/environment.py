@@ -27,6 +27,7 @@ from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.columns import where
+from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
+_CONTROLLER_ENTRY = episode.OBSERVATION_NAMES.index("controller")
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 
 
@@ -166,6 +168,84 @@ class BoatDockEnv(PAMDPEnv):
     def position(self) -> Tensor:
         """Where the boats are, px from the harbour's centre, `[N, 2]`."""
         return torch.stack([self._state.x, self._state.y], -1)
+
+    @property
+    def symmetries(self) -> Symmetries:
+        """The turns and mirrors of the plane that permute a boat's directions and, where both occur, swap the boats.
+
+        Six maps keep a boat, and six more swap it for the other, whose directions are the opposite ones. With a random
+        key map, which is not observed, only those remain that permute the keys of both key maps alike; with motor noise
+        that differs between the boats, those that keep the boat.
+        """
+        tables = self._directions()
+        plane = plane_maps(6)
+        flips = []  # for each map, whether every boat's directions become those of the other boat
+        discrete = []
+        for each in plane:
+            for is_swap in {False, len(tables) > 1}:
+                targets = tables[::-1] if is_swap else tables
+                rows = [_as_one_table(each, own, other) for own, other in zip(tables, targets, strict=True)]
+                found = [row for row in rows if row is not None]
+                if len(found) == len(rows) and not (is_swap and len(set(self.rules.motor_noise)) > 1):
+                    flips.append((each, is_swap))
+                    discrete.append(torch.stack(found))
+        kept = torch.stack([each for each, _ in flips])
+        weight, offset = on_observations(kept, self._observation_dim, *self._vectors())
+        keys_after = torch.stack(discrete)
+        contexts = torch.stack([torch.tensor([1, 0] if is_swap else range(len(tables))) for _, is_swap in flips])
+        return make_symmetries(
+            weight,
+            offset=offset,
+            discrete=keys_after,
+            source=keys_after.argsort(-1),  # key k has parameter k
+            contexts=contexts,
+            context_entry=_CONTROLLER_ENTRY if len(tables) > 1 else None,
+            num_parameters=harbour.NUM_KEYS,
+        )
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """The places and the velocity, and where the keys point, unless a random key map leaves that open.
+
+        Every press begins at rest, so that the velocity tells nothing; where the start was shows in the distances
+        alone. The harbour is always the same. With the goal's offset, the goal itself is known, too.
+        """
+        names = ["start_x", "start_y", "centre_x", "centre_y", "radius", "velocity_x", "velocity_y"]
+        if self.rules.observation == "scaled" and self.rules.sensor_noise == 0.0:
+            names += ["goal_x", "goal_y"]
+        tables = self._directions()
+        vectors, origins = self._vectors()
+        is_known = all(len(table) == 1 for table in tables)
+        return PlaneGeometry(
+            num_contexts=len(tables),
+            context_entry=_CONTROLLER_ENTRY if len(tables) > 1 else None,
+            vectors=vectors,
+            origins=origins,
+            directions=torch.stack([table[0] for table in tables]).float() if is_known else None,
+            kinds=(0,) * harbour.NUM_KEYS if is_known else (),
+            has_mirror=True,
+            redundant=tuple(episode.OBSERVATION_NAMES.index(name) for name in names),
+        )
+
+    def _directions(self) -> list[list[Tensor]]:
+        """Return for each boat that occurs the possible tables of its keys' directions, float64 `[3, 2]`."""
+        maps = (1, 2) if self.rules.keymap == "random" else (self.rules.keymap,)
+        table = torch.tensor(harbour.DIRECTIONS, dtype=torch.float64)
+        both = [[table[number - 1] for number in maps], [table[2]]]
+        if self.rules.controller in harbour.CONTROLLERS:
+            return [both[harbour.CONTROLLERS.index(self.rules.controller)]]
+        return both
+
+    @property
+    def _observation_dim(self) -> int:
+        return self.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
+
+    def _vectors(self) -> tuple[tuple[tuple[int, int], ...], tuple[tuple[float, float], ...]]:
+        """Return which entries of the observation are vectors, and from where on they are measured."""
+        places: tuple[tuple[int, int], ...] = ((0, 1), (2, 3), (8, 9))
+        if self.rules.observation == "pixels":
+            return (*places, (10, 11)), (*[harbour.CENTRE] * len(places), (0.0, 0.0))
+        return (*places, (10, 11), (14, 15)), ()
 
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return layouts to `reset` with, one for each boat, that no training episode meets, whatever its seed."""
@@ -344,6 +424,23 @@ class BoatDockEnv(PAMDPEnv):
         if self._has_human:
             seen.set(keys.HUMAN_OPTION, human_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
+
+
+def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) -> Tensor | None:
+    """Return which keys the keys become, int64 `[3]`, if a map makes every table the target of its number.
+
+    None: some direction becomes none of the targets, or another key with another key map.
+    """
+    if len(tables) != len(targets):
+        return None
+    found = None
+    for table, target in zip(tables, targets, strict=True):
+        keys_after = as_directions(plane.unsqueeze(0), table, target)[0]
+        is_exact = torch.allclose(table @ plane.T, target[keys_after], atol=1e-6)
+        if not is_exact or (found is not None and not keys_after.equal(found)):
+            return None
+        found = keys_after
+    return found
 
 
 def _check_arguments(num_envs: int, rules: Rules) -> None:
