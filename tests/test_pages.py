@@ -100,7 +100,8 @@ def test_links_to_code_lead_to_pages_that_show_it(hooks, tmp_path, monkeypatch):
     assert "```python\nprint(1)\n```" in site.pages["source/run.py.md"]
 
 
-# What makes each one learn within a few steps.
+# What makes each one learn within a few steps, and seldom.
+FEW = {"warmup_frames": 128, "updates_per_frame": 0.1}
 QUICK = {
     "hppo": ["low.minibatch_size=16"],
     "qpamdp": [
@@ -108,14 +109,14 @@ QUICK = {
         *(f"low.{name}=1" for name in ("phi_order", "psi_order", "parameter_updates")),
     ],
     "hyar": ["low.codec_pretrain_updates=1", "low.codec_every=1"],
-    "pets": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1", "low.updates_per_frame=0.1"],
+    "pets": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
     "dlpa": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
     "actor": ["high.minibatch_size=16"],
     "meta_critic": ["high.warmup_decisions=16", "high.updates_per_decision=0.1"],
     "option_critic": ["high.warmup_steps=64"],
 }
-SELECTORS = ["ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson", "actor", "meta_critic"]
-SELECTORS += ["option_critic"]
+SELECTORS = ["ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson", "option_critic", "actor"]
+SELECTORS += ["meta_critic"]
 
 
 def run(words: list[str]) -> None:
@@ -129,15 +130,15 @@ def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
     high = SELECTORS[sorted(TRAINED).index(low) % len(SELECTORS)]
     words = [f"low={low}", f"high={high}", "num_envs=16", "steps_per_batch=4", "total_frames=1024", "log_every=64"]
     words += ["eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}", "agent.uniform_option_frames=1024"]
-    words += ["agent.option_length=learned"] if high == "option_critic" else []
-    words += ["low.warmup_frames=128"] if "warmup_frames" in (ROOT / f"conf/low/{low}.yaml").read_text() else []
+    words += ["env=rooms", "agent.option_length=learned"] if high == "option_critic" else []
+    settings = yaml.safe_load((ROOT / f"conf/low/{low}.yaml").read_text())
+    words += [f"low.{name}={value}" for name, value in FEW.items() if name in settings]
     assert forked(run, [*words, *QUICK.get(low, []), *QUICK.get(high, [])]) == 0
     columns = {name for row in read_rows(tmp_path / "metrics.csv") for name in row}
     logged = {name for name in columns if name.startswith(("low/", "high/"))}
     assert {name.split("/")[0] for name in logged} == {"low", "high"}
     for column in logged:
         level, *_, name = column.split("/")
-        for option in ("incongruent", "congruent"):
-            name = name.replace(f"_{option}", "_NAME")
+        name = re.sub("_(incongruent|congruent)$", "_NAME", name)
         text = page(level, low if level == "low" else high).read_text()
         assert f"`{name}`" in text, column
