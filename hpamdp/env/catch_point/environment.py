@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.catch_point import rules
+from hpamdp.env.catch_point import kernel, rules
 from hpamdp.env.catch_point.rules import CatchPointState
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.point_env import PointEnv
@@ -40,7 +40,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         late_end: whether an episode that has no catches left ends a step later, in which it earns 0, as the published
             code does it.
         progress: whether misses and time are observed, too, `[N, 6]` instead of `[N, 4]`, as DLPA has it.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
@@ -86,6 +86,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         self.catches = catches
         self.late_end = late_end
         self.progress = progress
+        self._use_kernel(kernel.advance, CatchPointEnv, [catches, late_end, progress])
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

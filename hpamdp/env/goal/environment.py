@@ -19,7 +19,7 @@ from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.goal import rendering, rules
+from hpamdp.env.goal import kernel, rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
 from hpamdp.geometry import Symmetries, make_symmetries
 
@@ -51,7 +51,7 @@ class GoalEnv(CounterEnv[GoalState]):
         observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
         noise: factor on the published noise of the motions; 0 is none. Starts are random all the same.
         repaired: the slips to take out; `slips` are those that the problem has.
-        compile_rules: compile the ticks: faster with many pitches, but the first action takes about a minute.
+        compile_rules: compile the ticks (takes about a minute) instead of using the kernel, for a GPU.
         device: of the tensors.
         seed: of starts and noise; the global generators are neither read nor moved.
         first_env: number of the first pitch, where other processes have the pitches before it.
@@ -110,6 +110,14 @@ class GoalEnv(CounterEnv[GoalState]):
         if compile_rules:
             self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
             self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
+        self._is_compiled = compile_rules
+        repairs = ("kick_to", "goal_distance", "keeper_projection", "middle_shots")
+        is_hard = self.parameter_dims != rules.PARAMETER_DIMS
+        self._use_kernel(
+            kernel.advance,
+            GoalEnv,
+            [noise, self._is_scaled, *(repair in self.repaired for repair in repairs), is_hard],
+        )
 
     def start(self, episode: Tensor, rng: Key) -> GoalState:
         """Return the states in which episodes begin."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.gym_hybrid import rules
+from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
@@ -52,6 +52,7 @@ class _VehicleEnv(PointEnv[VehicleState]):
             oracle=oracle,
             compile_rules=compile_rules,
         )
+        self._use_kernel(kernel.advance, _VehicleEnv, [self.slides])
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -125,7 +126,7 @@ class MovingEnv(_VehicleEnv):
     Args:
         num_envs: number of fields.
         max_steps: actions after which an episode is truncated; gym-hybrid has 201.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hpamdp.env import point_agent
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.hard_move import rules
+from hpamdp.env.hard_move import kernel, rules
 from hpamdp.env.hard_move.rules import HardMoveState
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
@@ -42,7 +42,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         n: number of actuators.
         max_steps: actions after which an episode is truncated; HyAR has 30, DLPA 25.
         rounded_directions: whether the actuators' directions have three decimals, as published.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
@@ -89,6 +89,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
             oracle=oracle,
             compile_rules=compile_rules,
         )
+        self._use_kernel(kernel.advance, HardMoveEnv, motions.flatten().tolist())
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
