@@ -191,7 +191,7 @@ def docstring_of(words: str) -> str:
     # Docstrings have no empty line between a sentence and its list, which Markdown needs.
     text = re.sub(r":\n- ", ":\n\n- ", text)
     text = text[0].upper() + text[1:]
-    return re.sub(r"arXiv([ :\n])(\d{4}\.\d{5})", r"arXiv\1[\2](https://arxiv.org/abs/\2)", text)
+    return re.sub(r"arXiv([ :\n])(\d{4}\.\d{4,5})", r"arXiv\1[\2](https://arxiv.org/abs/\2)", text)
 
 
 def rows_of(words: str) -> str:
