@@ -147,6 +147,7 @@ class RunConfig(BaseModel):
     checkpoint: str | None
     resume: str | None
     overwrite: bool
+    film: bool = True  # runs of earlier versions did not save it
 
     @property
     def num_frames(self) -> int:
@@ -289,6 +290,19 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
         _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
     return Config(run, **{group: component(group, names[group], plain[group]) for group in GROUPS})
+
+
+def compose_words(words: list[str]) -> DictConfig:
+    """Return the config of a command line's words, with its `hydra` part, outside of Hydra's own command line.
+
+    Raises:
+        ConfigError: the words cannot be composed.
+    """
+    try:
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose("config", words, return_hydra_config=True)
+    except (hydra.errors.HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(f"{' '.join(words)}: {first_line(error)}") from error
 
 
 def chosen_names(cfg: DictConfig) -> Mapping[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -159,6 +159,16 @@ class PAMDPEnv(EnvBase):
             summary: of the run; `references` has the figures to compare with.
         """
         return {}
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterable[np.ndarray]:
+        """Return the pictures of one episode, uint8 `[size, size, 3]` each; none where there is nothing to see.
+
+        Args:
+            track: its `env_state` at the start and after every step, columns `[1, ...]`.
+            fps: pictures a second.
+            size: px from edge to edge.
+        """
+        return ()
 
     @property
     def keeps_episodes(self) -> bool:

@@ -31,6 +31,7 @@ from hpamdp.messages import first_line, one_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.run.folder import CHECKPOINT_NAME as FILE_NAME
+from hpamdp.run.folder import POLICY_NAME
 
 _FORMAT = 2
 _MANIFEST = "manifest.json"
@@ -55,9 +56,14 @@ _DAMAGE = (
 
 
 def find(path: str | Path, where: str) -> Path:
-    """Return the checkpoint's file, given itself or the run's output folder; `where` names the setting in an error."""
+    """Return the checkpoint's file, given itself or the run's output folder; `where` names the setting in an error.
+
+    A folder without a checkpoint may hold the networks alone, which suffice for everything but to resume the run.
+    """
     path = Path(path).expanduser()
     file = path / FILE_NAME if path.is_dir() else path
+    if where != "resume" and path.is_dir() and not file.is_file() and (path / POLICY_NAME).is_file():
+        file = path / POLICY_NAME
     if not file.is_file():
         raise ConfigError(f"{where}={path}: no checkpoint there; give a run's output folder or its {FILE_NAME}")
     if not zipfile.is_zipfile(file):

@@ -6,7 +6,7 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -227,6 +227,12 @@ class BoatDockEnv(PAMDPEnv):
         from hpamdp.env.boatdock import figures  # matplotlib takes long to import
 
         return figures.draw(evaluation, summary)
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+        """Return the pictures of one episode, in which the boat moves as it does in the task."""
+        from hpamdp.env.boatdock import film  # which draws, as few who sail do
+
+        return film.film(track, fps, size)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
