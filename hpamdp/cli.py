@@ -38,7 +38,7 @@ _EXTRAS = {
     "hydra/sweeper": {"optuna": "optuna"},
 }
 # Commands beside that of a run, by the modules whose `main` gets the words that follow, and a parser.
-_COMMANDS = {"watch": "hpamdp.run.watch"}
+_COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play"}
 # What Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UnicodeDecodeError)
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
@@ -66,6 +66,7 @@ Examples
   {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
       the same, two at a time; needs hpamdp[joblib]
 
+  hpamdp play                      lets you play the boats yourself; hpamdp play --help
   hpamdp watch FOLDER              films the agent of a run; hpamdp watch --help
   {program} low=hyar --cfg job     shows every value and option without running
   {program} --hydra-help           shows Hydra's own flags

@@ -251,12 +251,19 @@ class Config:
 
 
 def conf_dir() -> Path:
-    """Return the folder of the yaml files: inside the package where it is installed, beside it in a clone."""
+    """Return the folder of the yaml files."""
+    folder = package_dir("conf")
+    if folder is None or not (folder / "config.yaml").is_file():
+        package = Path(__file__).resolve().parent
+        raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
+    return folder
+
+
+def package_dir(name: str) -> Path | None:
+    """Return a folder that lies inside the package where it is installed, and beside it in a clone; None: neither."""
     package = Path(__file__).resolve().parent
-    for folder in (package / "conf", package.parent / "conf"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
+    folders = (package / name, package.parent / name)
+    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:

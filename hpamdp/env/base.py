@@ -18,6 +18,8 @@ from hpamdp import keys
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from hpamdp.env.page import Page
+
 # Separates the seeds of an evaluation from the small ones that people give to training.
 _EVALUATION = 0x5EED0000
 
@@ -169,6 +171,14 @@ class PAMDPEnv(EnvBase):
             size: px from edge to edge.
         """
         return ()
+
+    def page(self, seed: int) -> Page | None:
+        """Return the page on which people play this problem in a browser; None if there is none.
+
+        Args:
+            seed: of its episodes.
+        """
+        return None
 
     @property
     def keeps_episodes(self) -> bool:

@@ -31,6 +31,8 @@ from hpamdp.env.columns import where
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from hpamdp.env.boatdock.play.boat_page import BoatPage
+
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
@@ -233,6 +235,12 @@ class BoatDockEnv(PAMDPEnv):
         from hpamdp.env.boatdock import film  # which draws, as few who sail do
 
         return film.film(track, fps, size)
+
+    def page(self, seed: int) -> BoatPage:
+        """Return the page on which people dock boats."""
+        from hpamdp.env.boatdock.play.boat_page import BoatPage
+
+        return BoatPage(seed)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
