@@ -10,7 +10,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -214,15 +214,21 @@ def _check_end(episode: Episode, played: Replay) -> None:
             raise EpisodeError(f"{name}: not what the presses come to")
 
 
-def figures(episodes: Sequence[Episode]) -> dict[str, Any]:
+def figures(episodes: Sequence[Episode], controller: str | None = None) -> dict[str, float]:
     """Return the mean figures of episodes, without those of practice, by the names of `hpamdp.env.boatdock.reference`.
+
+    Args:
+        episodes: of one recording.
+        controller: only episodes with this one; None: with either.
 
     Raises:
         EpisodeError: there is none.
     """
-    counted = [episode for episode in episodes if episode.mode != PRACTICE]
+    counted = [e for e in episodes if e.mode != PRACTICE and controller in (None, e.controller)]
     if not counted:
-        raise EpisodeError("no episode but those of practice")
+        raise EpisodeError(
+            f"recording: no episode{'' if controller is None else f' with the {controller} boat'}, practice aside"
+        )
     num = len(counted)
     shares = {
         name: sum(episode.outcome == name for episode in counted) / num

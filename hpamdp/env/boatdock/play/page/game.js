@@ -40,6 +40,7 @@
     $("#welcome").hidden = screen !== "start";
     $("#game").hidden = !["choose", "sail", "result"].includes(screen);
     $("#end").hidden = screen !== "end";
+    window.scrollTo(0, 0);
     $("#status").textContent = screen === "start" ? "" : statusText();
   }
 
@@ -82,7 +83,7 @@
     document.querySelectorAll(".key").forEach((button, key) => {
       const svg = document.createElementNS("http://www.w3.org/2000/svg", "svg");
       svg.setAttribute("viewBox", "-50 -50 100 100");
-      svg.append(arrow(directions[key], 0, 38));
+      svg.append(arrow(directions[key], -32, 32));
       button.replaceChildren(document.createTextNode(String(key + 1)), svg);
       button.setAttribute("aria-label", `key ${key + 1}`);
     });
@@ -271,6 +272,8 @@
 
   const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   const share = (results) => mean(results.map((r) => (r.outcome === "success" ? 1 : 0)));
+  const cssPercent = (value) => `${100 * value}%`;
+  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller} boat`);
   const percent = (value) => `${(100 * value).toFixed(0)} %`;
   const colourOf = (i) => COLOURS.agents[i % COLOURS.agents.length];
   const swatch = (colour, dashes) => `<span class="swatch" style="border-color:${colour};border-top-style:${dashes}"></span>`;
@@ -303,7 +306,7 @@
     rows.push(["", "Best of 40 people", data.people.best.toFixed(2), percent(data.people.best_success)]);
     data.agents.forEach((agent, i) => {
       const own = results.map((r) => r.agents[i]);
-      rows.push(["", escape(agent.title), has ? write(mean(own.map((r) => r.score))) : "", has ? percent(share(own)) : ""]);
+      rows.push(["", escape(titleOf(agent)), has ? write(mean(own.map((r) => r.score))) : "", has ? percent(share(own)) : ""]);
     });
     rows.push(["", "Ceiling", has ? write(mean(results.map((r) => r.best))) : "", has ? "100 %" : ""]);
     table.innerHTML = "<caption>Means; agents and ceiling on your layouts</caption>" +
@@ -316,12 +319,12 @@
   function setGauges(fuel, speed) {
     const left = fuel / rules.tank;
     const scale = 3 * rules.docking_speed; // px/s at the right end of the bar
-    $("#fuel i").style.width = percent(left);
+    $("#fuel i").style.width = cssPercent(left);
     $("#fuel i").className = left < 0.25 ? "low" : "";
     $("#fuel-text").textContent = `${fuel.toFixed(2)} s`;
-    $("#speed i").style.width = percent(Math.min(speed / scale, 1));
+    $("#speed i").style.width = cssPercent(Math.min(speed / scale, 1));
     $("#speed i").className = speed > rules.docking_speed ? "low" : "";
-    $("#speed em").style.left = percent(rules.docking_speed / scale);
+    $("#speed em").style.left = cssPercent(rules.docking_speed / scale);
     $("#speed-text").textContent = speed > rules.docking_speed ? "too fast to dock" : `${speed.toFixed(0)} px/s`;
   }
 
@@ -427,8 +430,12 @@
   function drawCurve(results) {
     const canvas = $("#curve");
     const pen = canvas.getContext("2d");
-    const [width, height, left, right, top, bottom] = [720, 360, 44, 150, 16, 34];
-    pen.setTransform(1, 0, 0, 1, 0, 0);
+    const ratio = window.devicePixelRatio || 1;
+    const width = canvas.clientWidth || 720;
+    const [height, left, right, top, bottom] = [Math.max(260, width / 2), 36, 150, 16, 34];
+    canvas.width = Math.round(width * ratio);
+    canvas.height = Math.round(height * ratio);
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
     pen.font = "13px system-ui, sans-serif";
     const total = Math.max(results.length, 2);
