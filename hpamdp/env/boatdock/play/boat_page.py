@@ -96,27 +96,26 @@ class BoatPage:
     def _layouts(self) -> dict[str, list[dict[str, Any]]]:
         """Return the layouts of each mode: start, goal, people's choice, and each boat's best score and plan.
 
-        The keys of the plans are those under key map 1; lengths are rounded to 1e-4 px, so that they are short to send.
+        The keys of the plans are those under key map 1. Numbers are exact, as some plans barely touch the dock.
         """
         sizes = {"practice": _PRACTICE, "round": BLOCK * NUM_BLOCKS, "free": _FREE}
         num = sum(sizes.values())
         # The seeds of evaluations are small; so these layouts are not theirs.
         layout = harbour.fixed_layouts(num, 2**31 + self.seed)
-        layout = harbour.Layout(*((column * 1e4).round() / 1e4 for column in layout))
         plans = planner.best_plans(layout, torch.ones(num, dtype=torch.int32))
         bins = torch.bucketize(harbour.bearing_offset(layout), torch.tensor(OFFSET_EDGES[1:-1], dtype=torch.float32))
         rows = [
             {
-                "start": [_short(layout.start_x[i]), _short(layout.start_y[i])],
-                "goal": [_short(layout.goal_x[i]), _short(layout.goal_y[i])],
+                "start": [layout.start_x[i].item(), layout.start_y[i].item()],
+                "goal": [layout.goal_x[i].item(), layout.goal_y[i].item()],
                 "people": HUMAN_CONGRUENT_BY_OFFSET[int(bins[i])],
                 "best": {
                     name: {
-                        "score": _short(plans.score[i, option]),
+                        "score": plans.score[i, option].item(),
                         "presses": [
                             {
                                 "key": int(plans.keys[i, option, j]),
-                                "duration": round(float(plans.durations[i, option, j]), 6),
+                                "duration": plans.durations[i, option, j].item(),
                             }
                             for j in range(int(plans.num_presses[i, option]))
                         ],
@@ -131,10 +130,6 @@ class BoatPage:
             modes[mode] = rows[first : first + size]
             first += size
         return modes
-
-
-def _short(value: torch.Tensor) -> float:
-    return round(value.item(), 4)
 
 
 def _check_agent(agent: Mapping[str, Any]) -> None:
