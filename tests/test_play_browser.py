@@ -74,9 +74,16 @@ class Player:
     def get(self, expression):
         return self.page.evaluate(f"hpamdpGame.{expression}")
 
+    def until(self, expression, seconds=8.0):
+        """Wait; the page's policy forbids what Playwright waits with."""
+        deadline = time.monotonic() + seconds
+        while not self.get(expression):
+            assert time.monotonic() < deadline, (expression, self.get("screen"), self.page.inner_text("#notice"))
+            time.sleep(0.02)
+
     def board(self, boat="congruent", layout=None):
         """Choose a boat, and put the episode on another layout before."""
-        self.page.wait_for_function("hpamdpGame.screen === 'choose'")
+        self.until("screen === 'choose'")
         if layout is not None:
             self.page.evaluate("(layout) => Object.assign(hpamdpGame.layout, layout)", layout)
         self.page.click(f"[data-boat={boat}]")
@@ -92,7 +99,7 @@ class Player:
         return (before + time.perf_counter()) / 2 - (begun + middle) / 2
 
     def ends(self):
-        self.page.wait_for_function("hpamdpGame.screen === 'result'", timeout=8000)
+        self.until("screen === 'result'")
         return self.get("results.free.at(-1)") if self.get("mode") == "free" else self.get("results.round.at(-1)")
 
 
@@ -241,7 +248,7 @@ def test_episodes_wait_for_a_server_that_is_gone_and_two_pages_lose_none(browser
         assert [player.get("unsent.length") for player in players] == [1, 1] and not path.exists()
         context.set_offline(False)
         for player in players:
-            player.page.wait_for_function("hpamdpGame.sent === 1", timeout=8000)
+            player.until("sent === 1")
         assert len({json.loads(line)["player"] for line in path.read_text().splitlines()}) == 2
         context.close()
 
@@ -265,7 +272,7 @@ def test_the_exported_page_plays_from_files_and_gives_its_episodes_as_a_file(bro
 
 def play_plan(player, boat):
     """Play the best plan of a boat from rest to rest, as well as a process can that sleeps between."""
-    player.page.wait_for_function("hpamdpGame.screen === 'choose'")
+    player.until("screen === 'choose'")
     plan = player.get(f"layout.best.{boat}.presses")
     player.board(boat)
     for press in plan:
@@ -327,7 +334,7 @@ def test_the_command_serves_the_page_and_ends_on_ctrl_c(browser, tmp_path):
         player.board(layout=DOWN_THE_MIDDLE)
         player.hold("k", 1.8)
         player.ends()
-        player.page.wait_for_function("hpamdpGame.sent === 1")
+        player.until("sent === 1")
         context.close()
     finally:
         process.send_signal(signal.SIGINT)
