@@ -79,7 +79,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(venv)
-	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray]'
+	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video]'
 	@touch $@
 
 # This launcher wants cloudpickle < 3, so it has constraints of its own; without them pip searches for an hour.

@@ -1,4 +1,5 @@
-"""The page in a real browser, by its own key, touch and focus events; skipped where there is no Chromium."""
+"""The page in a real browser, by its own key, touch and focus events; skipped where there is no Chromium
+(Debian: `apt-get install chromium`) or no Playwright (`hpamdp[browser]`)."""
 
 import json
 import os

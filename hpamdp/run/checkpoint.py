@@ -65,7 +65,9 @@ def find(path: str | Path, where: str) -> Path:
     if where != "resume" and path.is_dir() and not file.is_file() and (path / POLICY_NAME).is_file():
         file = path / POLICY_NAME
     if not file.is_file():
-        raise ConfigError(f"{where}={path}: no checkpoint there; give a run's output folder or its {FILE_NAME}")
+        has_policy = (path / POLICY_NAME).is_file()
+        why = "networks alone, which cannot be resumed" if has_policy else "no checkpoint there"
+        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}")
     if not zipfile.is_zipfile(file):
         raise ConfigError(f"{where}={file}: not a checkpoint of this program")
     return file

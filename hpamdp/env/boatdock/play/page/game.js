@@ -210,6 +210,13 @@
     $("#download").title = game.stored.length ? "" : "Nothing was recorded: you did not agree to it at the start";
     $("#end-text").textContent = `${MODES[game.mode]}: ${results.length} episodes${isStopped || isDone ? "" : " so far"}, ` +
       `mean score ${mean(results.map((r) => r.score)).toFixed(2)}, ${percent(share(results))} docked.`;
+    if (game.mode === "round") {
+      const blocks = data.people.success_by_block.map((people, i) => {
+        const own = results.slice(i * rules.block, (i + 1) * rules.block);
+        return own.length === rules.block ? `Round ${i + 1}: you docked ${percent(share(own))}, people ${percent(people)}.` : "";
+      });
+      $("#end-text").textContent += ` ${blocks.filter(Boolean).join(" ")}`;
+    }
     drawCurve(results);
     fillTable($("#end-table"));
   }
