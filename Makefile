@@ -48,6 +48,7 @@ wheel: $(SLOW)/.installed
 	cd $(SLOW)/wheel && PYTHONPATH=site ../bin/python -c 'import hpamdp; assert "wheel/site" in hpamdp.__file__'
 	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp \
 	    high=ucb low=hyar total_frames=1024 num_envs=32 eval.layouts=10 eval.every=0
+	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp play --export page
 
 # The quick tests with the lowest versions that pyproject.toml allows.
 lowest: $(LOWEST)/.installed

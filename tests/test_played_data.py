@@ -20,12 +20,13 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.run.train import run
 
 START, GOAL = (0.0, 60.0), (0.0, -60.0)
+SECOND = {"t": 1.35, "type": "down", "key": 0, "code": "KeyJ"}
 EPISODES = [
     *docked(30),
     *docked(4, player="f" * 16),
     played(START, GOAL, "congruent", events_of([(1, 2.0)]), index=90),
     # The second press stops the glide of the first.
-    played(START, GOAL, "congruent", [*events_of([(1, 0.9)]), {"t": 1.35, "type": "down", "key": 0, "code": ""}], index=91),
+    played(START, GOAL, "congruent", [*events_of([(1, 0.9)]), SECOND], index=91),
     *docked(1, mode="practice", player="e" * 16),
 ]  # fmt: skip
 
