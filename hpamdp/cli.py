@@ -66,7 +66,7 @@ Examples
   {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
       the same, two at a time; needs hpamdp[joblib]
 
-  hpamdp play                      lets you play the boats yourself; hpamdp play --help
+  hpamdp play                      lets you play the problem yourself; hpamdp play --help
   hpamdp watch FOLDER              films the agent of a run; hpamdp watch --help
   {program} low=hyar --cfg job     shows every value and option without running
   {program} --hydra-help           shows Hydra's own flags

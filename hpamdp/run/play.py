@@ -22,7 +22,7 @@ from hpamdp.run.players import Player, load_player, split_words
 _DESCRIPTION = """\
 Play a problem yourself, beside agents.
 
-  hpamdp play                                      the boats, beside the agents that come with the code
+  hpamdp play                                      beside the agents that come with the code
   hpamdp play --agent outputs/2025-01-31/12-00-00  beside the agent of a run; --agent can be given several times
   hpamdp play --export site                        the page as files that need no server
 """
