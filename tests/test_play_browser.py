@@ -163,16 +163,21 @@ def test_the_wall_the_speed_limit_and_the_empty_tank_end_an_episode(player):
     assert [episodes.check(each).outcome for each in stored(player, 3)] == ["too_fast", "out_of_bounds", "out_of_fuel"]
 
 
-def test_durations_are_those_of_the_keys_within_five_milliseconds(player):
-    held, found = [], []
+def test_durations_are_those_of_the_keys_within_five_milliseconds_however_late_the_page_hears_of_them(player):
+    keyboard = player.page.context.new_cdp_session(player.page)
     wanted = [0.05, 0.12, 0.2, 0.3, 0.08, 0.25] * 4
-    player.board(layout={"start": [0, 60], "goal": [0, -60]})
+    player.board(layout=DOWN_THE_MIDDLE)
     for turn, seconds in enumerate(wanted):
-        held.append(player.hold(KEYS[turn % 3], seconds))
-        time.sleep(0.05)
+        event = {"code": f"Digit{turn % 3 + 1}", "key": str(turn % 3 + 1), "windowsVirtualKeyCode": 49 + turn % 3}
+        begun = time.time()
+        # The browser gives the page these times, at which the system saw the keys, with events that come later.
+        keyboard.send("Input.dispatchKeyEvent", {"type": "keyDown", "timestamp": begun, **event})
+        time.sleep(max(0.0, begun + seconds + 0.02 - time.time()))
+        keyboard.send("Input.dispatchKeyEvent", {"type": "keyUp", "timestamp": begun + seconds, **event})
+        time.sleep(0.03)
     found = [press["duration"] for press in player.page.evaluate("hpamdpGame.state.presses")]
-    num = min(len(found), len(held))
-    errors = [abs(one - other) for one, other in zip(found[:num], held[:num], strict=True)]
+    num = len(found) - 1  # the last one may have run the tank dry
+    errors = [abs(one - other) for one, other in zip(found[:num], wanted[:num], strict=True)]
     assert num > 15 and statistics.median(errors) < 0.005, sorted(errors)
 
 
