@@ -20,7 +20,7 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.counter_env import GOING_ON, CounterEnv
-from hpamdp.env.faces import CounterFace
+from hpamdp.env.counter_faces import CounterFace
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform.environment import PlatformEnv
@@ -235,6 +235,8 @@ def test_a_seed_fixes_the_starts(problem):
 @each_problem
 def test_evaluation_draws_starts_and_noise_from_streams_of_its_own_until_the_next_seed(problem):
     env = problem(4)
+    # The tensor functions; what the kernels draw is compared with them in test_counter_kernels.
+    env._columns, env.rows = env.state, None
     streams = []
 
     drawn = counter_rng.key_for

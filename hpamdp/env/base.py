@@ -14,6 +14,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.geometry import PlaneGeometry, Symmetries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,6 +67,10 @@ class PAMDPEnv(EnvBase):
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
 
+    # Whether a reset of some environments returns the others as they are. Then TorchRL's merge of the two, which takes
+    # longer than simple physics of 65,536 environments, would change nothing and is left out.
+    reset_returns_all_rows: ClassVar[bool] = False
+
     # Settings that leave the choice of an option to the agent and that take it away, to name in an error.
     choice_setting: ClassVar[str] = ""
     no_choice_setting: ClassVar[str] = ""
@@ -95,6 +100,16 @@ class PAMDPEnv(EnvBase):
     @property
     def position(self) -> Tensor | None:
         """Positions of the agents for drawing, `[N, 2]`; None where that means nothing."""
+        return None
+
+    @property
+    def symmetries(self) -> Symmetries | None:
+        """The maps under which neither dynamics nor reward change; None: there are none, or none that is known."""
+        return None
+
+    @property
+    def geometry(self) -> PlaneGeometry | None:
+        """Which entries of the observation are vectors, and where the actions point; None where that means nothing."""
         return None
 
     def fixed_episodes(self, seed: int) -> TensorDict | None:
@@ -214,26 +229,44 @@ class PAMDPEnv(EnvBase):
         option = {keys.OPTION: Categorical(len(self.option_names), shape=n, device=device)} if has_option else {}
         return Composite(**option, action=action, shape=n)
 
+    def reset_mask(self, tensordict: TensorDictBase | None) -> Tensor:
+        """Return which environments `_reset` is asked to reset, bool `[N]`: all, where its argument does not say."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            return torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        return mask.reshape(self.batch_size)
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if not self.reset_returns_all_rows:
+            return super()._reset_proc_data(tensordict, tensordict_reset)
+        if tensordict is None:
+            return tensordict_reset
+        tensordict.pop("_reset", None)
+        return tensordict.update(tensordict_reset)
+
     def check_action(self, tensordict: TensorDictBase) -> None:
         """Check the action leaves' shapes and types; their values are the subclass's to check.
 
         Raises:
             ValueError: a leaf is missing, or has another shape or type.
         """
-        shapes: dict[str | tuple[str, str], tuple[int, ...]] = {
-            keys.DISCRETE: tuple(self.batch_size),
-            keys.PARAMETERS: (*self.batch_size, sum(self.parameter_dims)),
-        }
+        size = self.batch_size
+        self._check_leaf(tensordict, keys.DISCRETE, size, is_integer=True)
+        self._check_leaf(tensordict, keys.PARAMETERS, (*size, sum(self.parameter_dims)), is_integer=False)
         if self.has_choice:
-            shapes[keys.OPTION] = tuple(self.batch_size)
-        for name, shape in shapes.items():
-            value = tensordict.get(name)
-            if value is None or value.shape != shape:
-                given_shape = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
-            if name != keys.PARAMETERS and (value.is_floating_point() or value.dtype == torch.bool):
-                given_type = str(value.dtype).removeprefix("torch.")
-                raise ValueError(f"step: {name} has type {given_type}, but must be integer")
+            self._check_leaf(tensordict, keys.OPTION, size, is_integer=True)
+
+    @staticmethod
+    def _check_leaf(
+        tensordict: TensorDictBase, name: str | tuple[str, str], shape: tuple[int, ...], *, is_integer: bool
+    ) -> None:
+        value = tensordict.get(name)
+        if value is None or value.shape != shape:
+            given_shape = None if value is None else list(value.shape)
+            raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
+        if is_integer and (value.is_floating_point() or value.dtype == torch.bool):
+            given_type = str(value.dtype).removeprefix("torch.")
+            raise ValueError(f"step: {name} has type {given_type}, but must be integer")
 
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -115,9 +116,11 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     """
     selector = config.high.build(specs=specs, device=device) if specs.num_options else None
     is_shared = config.run.agent.sharing == "shared" and specs.num_options > 0
-    learner_specs = specs.with_option_observed() if is_shared else specs
-    num_learners = 1 if is_shared else max(1, specs.num_options)
-    learners = [config.low.build(specs=learner_specs, device=device) for _ in range(num_learners)]
+    if is_shared:
+        learner_specs = [specs.with_option_observed()]
+    else:
+        learner_specs = [specs.of_option(i) for i in range(specs.num_options)] or [specs]
+    learners = [config.low.build(specs=own_specs, device=device) for own_specs in learner_specs]
     agent = HierarchicalAgent(
         selector,
         learners,
@@ -125,6 +128,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         is_shared=is_shared,
         is_frozen=config.run.low.freeze,
         uniform_option_frames=config.run.agent.uniform_option_frames,
+        selector_ends_options=config.run.agent.option_length == "learned" and selector is not None,
     )
     return agent.to(device)
 
@@ -165,6 +169,8 @@ def _gamma(agent: HierarchicalAgent) -> float:
 
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
     length = config.run.agent.option_length
+    if length == "learned":
+        return with_decisions(env, gamma, math.inf)
     return with_decisions(env, gamma, None if length == "episode" else length)
 
 
@@ -183,7 +189,8 @@ def check_classes(config: Config) -> None:
 def check_run_memory(config: Config, device: torch.device) -> None:
     """Refuse more environments, steps or episodes than there is memory for, before any of them is built.
 
-    What counts are the tensors of a step, which an environment of its own gives, and the positions of an evaluation.
+    The estimate takes the tensors of a step, from a single environment that is built for it, and the paths that an
+    evaluation records.
 
     Raises:
         ConfigError: with the bytes that are surely needed.
@@ -232,7 +239,7 @@ def check_agent_memory(config: Config, specs: PAMDPSpecs, device: torch.device) 
 
 
 def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
-    """Refuse settings that need more bytes together than there are; the line names the one that needs most."""
+    """Refuse settings that together need more bytes than there are; the error names the one that needs most."""
     if not needs:
         return
     available = total_memory(device)
@@ -263,7 +270,7 @@ def memory_errors_explained(config: Config) -> Iterator[None]:
 
 
 def check_choice(config: Config, env: PAMDPEnv) -> None:
-    """Refuse a selector where there is nothing to choose, none where there is, and options of an impossible length.
+    """Refuse a needless or a missing selector, and options of a length that the environment does not allow.
 
     Raises:
         ConfigError: with the settings to change.
@@ -288,10 +295,20 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
         raise ConfigError(
             f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
         )
+    if length != "episode" and getattr(config.high.cls, "is_bandit", False):
+        raise ConfigError(
+            f"agent.option_length={length}: {config.high} is a bandit, which counts what an option pays and nothing of "
+            "what follows it; use agent.option_length=episode, high=meta_critic or high=actor"
+        )
+    if length == "learned" and not getattr(config.high.cls, "ends_options", False):
+        raise ConfigError(
+            f"agent.option_length=learned: {config.high} does not decide where options end; use high=option_critic, "
+            "high=meta_critic or a number of steps"
+        )
 
 
 def check_modes(config: Config) -> None:
-    """Refuse a learner that cannot learn from what the run has: its own steps, batches of them, a data set or both.
+    """Refuse a run whose agent cannot learn from what there is: steps of its own, a data set or both.
 
     Raises:
         ConfigError: with the settings to change.

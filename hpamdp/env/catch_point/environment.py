@@ -9,20 +9,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.env import point_agent, point_pictures
-from hpamdp.env.catch_point import rules
+from hpamdp.env import point_agent
+from hpamdp.env.catch_point import kernel, rules
 from hpamdp.env.catch_point.rules import CatchPointState
-from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.point_env import PointEnv
+from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 
+_TURNS = 8  # of all the turns, so many are declared
 _CEILING = {25: 0.964, 30: 0.997}  # of success, by the limit of steps: who starts too far away cannot arrive
 
 
-class CatchPointEnv(CounterEnv[CatchPointState]):
+class CatchPointEnv(PointEnv[CatchPointState]):
     """Catch the target in `num_envs` planes at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 move, 1 catch; `("action", "parameters")` float32 `[N, 1]`:
@@ -39,7 +40,7 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
         late_end: whether an episode that has no catches left ends a step later, in which it earns 0, as the published
             code does it.
         progress: whether misses and time are observed, too, `[N, 6]` instead of `[N, 4]`, as DLPA has it.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
@@ -52,6 +53,7 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
     discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     parameter_dims = (1, 0)
+    target_radius = point_agent.HIT_RADIUS
 
     def __init__(
         self,
@@ -84,6 +86,7 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
         self.catches = catches
         self.late_end = late_end
         self.progress = progress
+        self._use_kernel(kernel.advance, CatchPointEnv, [catches, late_end, progress])
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -94,9 +97,28 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
         return [*low, -1.0, -1.0], [*high, 1.0, self.max_steps / 12.0 - 0.99]
 
     @property
-    def position(self) -> Tensor:
-        """Where the agents are, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
+    def symmetries(self) -> Symmetries:
+        """Turns of the plane by multiples of 45 degrees and their mirrors; any other turn would do as well."""
+        plane = plane_maps(_TURNS)
+        weight, offset = on_observations(plane, len(self.observation_names), point_agent.VECTORS)
+        # A direction runs from +y to +x, so a turn by a, from +x to +y, makes p into p - a; the mirror x -> -x before
+        # it makes p into -p.
+        turn = 2.0 * torch.arange(_TURNS).repeat(2) / _TURNS
+        sign = torch.ones(2 * _TURNS).index_fill(0, torch.arange(_TURNS, 2 * _TURNS), -1.0)
+        return make_symmetries(
+            weight,
+            offset=offset,
+            discrete=torch.arange(len(rules.ACTIONS)).expand(2 * _TURNS, -1),
+            sign=sign.unsqueeze(-1),
+            shift=-turn.unsqueeze(-1),
+            is_periodic=[True],
+            num_parameters=1,
+        )
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """The speed and the way to the target; where a move points is its parameter."""
+        return PlaneGeometry(vectors=point_agent.VECTORS)
 
     def start(self, episode: Tensor, rng: Key) -> CatchPointState:
         """Return states with agent and target anywhere in the square."""
@@ -122,19 +144,7 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
         is_published = (self.max_steps, self.catches, self.late_end) == (25, rules.PUBLISHED_CATCHES, True)
         return ({"scripted": {"score": 8.5, "success": 0.961}} if is_published else {}) | ceiling
 
-    def draw(self, track: Sequence[CatchPointState]) -> np.ndarray:
-        """Return a picture of the agent's way to the target, uint8 `[480, 480, 3]`."""
-        last = track[-1]
-        misses = int(last.misses)
-        return point_pictures.draw(
-            point_pictures.Scene(
-                path=point_pictures.path_of(track),
-                target=(float(last.target_x), float(last.target_y)),
-                radius=point_agent.HIT_RADIUS,
-                outcome=rules.OUTCOMES[int(last.outcome)],
-                is_over=int(last.outcome) != rules.GOING_ON,
-                is_success=int(last.outcome) == rules.CAUGHT,
-                steps=int(last.steps),
-                note=f"{misses} {'miss' if misses == 1 else 'misses'}",
-            )
-        )
+    def picture_note(self, state: CatchPointState) -> str:
+        """Return how many catches have missed."""
+        misses = int(state.misses)
+        return f"{misses} {'miss' if misses == 1 else 'misses'}"

@@ -8,24 +8,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.env import point_pictures
-from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.gym_hybrid import rules
+from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
+from hpamdp.env.point_env import PointEnv
+from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 
 
-class _VehicleEnv(CounterEnv[VehicleState]):
+class _VehicleEnv(PointEnv[VehicleState]):
     """What Moving and Sliding have in common; see `MovingEnv`."""
 
     discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 0)
+    target_radius = rules.TARGET_RADIUS
+    has_walls = True
     slides: ClassVar[bool]
     scripted_figures: ClassVar[dict[str, float]]  # of the hand-written player
 
@@ -51,6 +52,7 @@ class _VehicleEnv(CounterEnv[VehicleState]):
             oracle=oracle,
             compile_rules=compile_rules,
         )
+        self._use_kernel(kernel.advance, _VehicleEnv, [self.slides])
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -58,9 +60,25 @@ class _VehicleEnv(CounterEnv[VehicleState]):
         return rules.observation_bounds(self.max_steps)
 
     @property
-    def position(self) -> Tensor:
-        """Where the vehicles are, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
+    def symmetries(self) -> Symmetries:
+        """The turns of the square field and their mirrors, which also mirror a turn of the vehicle."""
+        plane = plane_maps(4)
+        weight, offset = on_observations(plane, len(self.observation_names), rules.VECTORS)
+        is_mirrored = torch.arange(len(plane)) >= 4
+        turn_sign = torch.where(is_mirrored, -1.0, 1.0)
+        # Unit parameters: the acceleration stays, the turn changes its sign.
+        return make_symmetries(
+            weight,
+            offset=offset,
+            discrete=torch.arange(len(rules.ACTIONS)).expand(len(plane), -1),
+            sign=torch.stack([torch.ones_like(turn_sign), turn_sign], -1),
+            num_parameters=2,
+        )
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """The places of vehicle and target, and the heading."""
+        return PlaneGeometry(vectors=rules.VECTORS)
 
     def start(self, episode: Tensor, rng: Key) -> VehicleState:
         """Return states with vehicle and target anywhere in the field, at rest."""
@@ -86,23 +104,13 @@ class _VehicleEnv(CounterEnv[VehicleState]):
             return {}
         return {"scripted": self.scripted_figures, "ceiling": {"success": 1.0}}
 
-    def draw(self, track: Sequence[VehicleState]) -> np.ndarray:
-        """Return a picture of the vehicle's way to the target, uint8 `[480, 480, 3]`."""
-        last = track[-1]
-        return point_pictures.draw(
-            point_pictures.Scene(
-                path=point_pictures.path_of(track),
-                target=(float(last.target_x), float(last.target_y)),
-                radius=rules.TARGET_RADIUS,
-                outcome=rules.OUTCOMES[int(last.outcome)],
-                is_over=int(last.outcome) != rules.GOING_ON,
-                is_success=int(last.outcome) == rules.STOPPED,
-                steps=int(last.steps),
-                note=f"speed {float(last.speed):.2f}",
-                heading=float(last.heading),
-                has_walls=True,
-            )
-        )
+    def picture_note(self, state: VehicleState) -> str:
+        """Return the speed."""
+        return f"speed {float(state.speed):.2f}"
+
+    def heading(self, state: VehicleState) -> float:
+        """Return where the vehicle looks, rad."""
+        return float(state.heading)
 
 
 class MovingEnv(_VehicleEnv):
@@ -118,7 +126,7 @@ class MovingEnv(_VehicleEnv):
     Args:
         num_envs: number of fields.
         max_steps: actions after which an episode is truncated; gym-hybrid has 201.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.

@@ -44,6 +44,7 @@ from hpamdp.policies.shared.networks import (
     InvertingGradients,
     mlp,
     polyak_update,
+    with_clipped_noise,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -122,6 +123,7 @@ class PDQN(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
         gamma: PositiveFraction,
         reward_scale: PositiveFloat,
         actor_lr: LearningRate,
@@ -142,6 +144,7 @@ class PDQN(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.stores_own_parameters = multipass
         self.double_q = double_q
@@ -193,6 +196,9 @@ class PDQN(ReplayLearner):
         rows["reward"] = reward
         rows["next_state"] = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
         rows["discount"] = self.gamma**num_rewards * ~terminated.gather(-1, last)
+        for name in ("option_ended", "next_option"):
+            if name in rows.keys():
+                rows[name] = rows[name].gather(-1, last)
         return rows
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
@@ -217,22 +223,20 @@ class PDQN(ReplayLearner):
         self.critics.requires_grad_(True)
         return loss
 
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount max_k Q'(s', k, x'(s')), `[B]`, where the discount is 0 after a termination.
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)), `[B]`.
 
         With `double_q`, the learned critics choose k instead of the target critics.
         """
-        state = batch["next_state"]
-        with torch.no_grad():
-            unit = self.target_actor(state)
-            if self.target_smoothing > 0.0:
-                bound = self.target_smoothing_clip
-                noise = (self.target_smoothing * torch.randn_like(unit)).clamp(-bound, bound)
-                unit = (unit + noise).clamp(-1.0, 1.0)
-            q = self.target_critics(state, unit).amin(0)
-            choosing_q = self.critics(state, unit).amin(0) if self.double_q else q
-            best = q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
-            return batch["reward"] + batch["discount"] * best
+        unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
+        q = self.target_critics(observation, unit).amin(0)
+        choosing_q = self.critics(observation, unit).amin(0) if self.double_q else q
+        return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
+
+    def _target(self, batch: TensorDictBase) -> Tensor:
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return batch["reward"] + batch["discount"] * self.next_value(batch)
 
 
 def n_step_returns(reward: Tensor, done: Tensor, n: int, gamma: float) -> tuple[Tensor, Tensor]:

@@ -31,7 +31,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
-from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
+from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -118,6 +118,7 @@ class TD3BC(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
     ) -> None:
         super().__init__(
             specs,
@@ -127,6 +128,7 @@ class TD3BC(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.behaviour_weight = behaviour_weight
         self.target_smoothing = target_smoothing
@@ -179,12 +181,12 @@ class TD3BC(ReplayLearner):
         return loss
 
     @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`."""
+        unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
+        q = self.target_critics(observation, unit).amin(0)
+        return q.masked_fill(self.policy.is_rare(observation), -torch.inf).amax(-1)
+
     def _target(self, sample: TensorDictBase) -> Tensor:
-        """Return r + discount max_k Q'(s', k, x'(s')) over the allowed discrete actions k, `[B]`."""
-        state = sample["next_state"]
-        unit = self.target_actor(state)
-        bound = self.target_smoothing_clip
-        noise = (self.target_smoothing * torch.randn_like(unit)).clamp(-bound, bound)
-        q = self.target_critics(state, (unit + noise).clamp(-1.0, 1.0)).amin(0)
-        best = q.masked_fill(self.policy.is_rare(state), -torch.inf).amax(-1)
-        return sample["reward"] + sample["discount"] * best
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return sample["reward"] + sample["discount"] * self.next_value(sample)

@@ -12,6 +12,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
+from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -25,7 +26,10 @@ class ReplayLearner(Learner):
     - `start` and `explore`: what happens at the end of the warm-up, and with every batch after it;
     - `updates_due`: when updates are made.
 
+    The target of a value is `reward + discount * next_value(sample)`, which asks `value`.
+
     Attributes:
+        symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
         stores_own_parameters: whether the buffer holds the parameters of the discrete action taken alone, which is less
             where there are many; samples then have 0 for the others.
     """
@@ -49,6 +53,7 @@ class ReplayLearner(Learner):
         buffer_size: int,
         batch_size: int,
         updates_per_frame: float,
+        augment: bool = False,
     ) -> None:
         if batch_size > buffer_size:
             raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
@@ -59,6 +64,7 @@ class ReplayLearner(Learner):
         self.warmup_frames = warmup_frames
         self.batch_size = batch_size
         self.updates_per_frame = updates_per_frame
+        self.symmetry = RandomSymmetry(specs, device) if augment else None
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
@@ -122,7 +128,11 @@ class ReplayLearner(Learner):
         for sample in self.buffer.sample(num_batches * self.batch_size).split(self.batch_size):
             if self.stores_own_parameters:
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
-            yield sample
+            yield self.augmented(sample)
+
+    def augmented(self, sample: TensorDictBase) -> TensorDictBase:
+        """Return a sample `[N, *]` with each row mapped by a random symmetry of the problem, if `augment` is set."""
+        return sample if self.symmetry is None else self.symmetry(sample)
 
     def _all_parameters(self, discrete: Tensor, own: Tensor) -> Tensor:
         """Return parameters `[B, num_parameters]`, 0 but for the discrete actions' own `[B, max(parameter_dims)]`."""
@@ -132,7 +142,7 @@ class ReplayLearner(Learner):
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the step terminated, else gamma."""
-        return TensorDict(
+        rows = TensorDict(
             {
                 "state": batch[keys.OBSERVATION],
                 "discrete": batch[keys.DISCRETE],
@@ -143,6 +153,29 @@ class ReplayLearner(Learner):
             },
             batch_size=batch.shape,
         )
+        option_ended = batch.get(("next", keys.OPTION_ENDED), None)
+        if option_ended is not None:
+            rows["option_ended"] = option_ended.squeeze(-1)
+            rows["option"] = batch[keys.OPTION]
+            rows["next_option"] = batch[keys.NEXT_OPTION]
+        return rows
+
+    def next_value(self, sample: TensorDictBase) -> Tensor:
+        """Return the values `[B]` of a sample's next states.
+
+        Where an option has ended, it is the value under the option that the selector would choose now, by that option's
+        learner: the selector has learned since.
+        """
+        state = sample["next_state"]
+        value = self.value(state)
+        if "option_ended" not in sample.keys():
+            return value
+        is_ended = sample["option_ended"] | self.following.decides_ends
+        if is_ended.any():
+            state = state[is_ended]
+            option = self.following.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
+            value[is_ended] = self.following.value(state, option)
+        return value
 
     def start(self) -> None:
         """Prepare for the first update, from the transitions that the warm-up stored."""
