@@ -49,6 +49,7 @@ wheel: $(SLOW)/.installed
 	cd $(SLOW)/wheel && PYTHONPATH=site ../bin/python -c 'import hpamdp; assert "wheel/site" in hpamdp.__file__'
 	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp \
 	    high=ucb low=hyar total_frames=1024 num_envs=32 eval.layouts=10 eval.every=0
+	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp play --export page
 
 # The quick tests with the lowest versions that pyproject.toml allows.
 lowest: $(LOWEST)/.installed
@@ -85,7 +86,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(venv)
-	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray]'
+	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video]'
 	@touch $@
 
 # This launcher wants cloudpickle < 3, so it has constraints of its own; without them pip searches for an hour.

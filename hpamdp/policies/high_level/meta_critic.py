@@ -27,6 +27,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
+from hpamdp.policies.shared.portable import portable_ensemble
 from hpamdp.policies.shared.replay import linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
@@ -97,6 +98,10 @@ class MetaCritic(Selector):
     def stateful(self) -> dict[str, Any]:
         """Return the optimiser and the replay buffer."""
         return {"critics": self.optimizer, "buffer": self.buffer}
+
+    def portable(self) -> dict[str, Any]:
+        """Return the critics: see `hpamdp.policies.shared.portable`."""
+        return portable_ensemble(self.critics)
 
     @property
     def epsilon(self) -> float:
