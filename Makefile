@@ -3,16 +3,17 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 IS_ALLOWED := import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
 
-# Environments of their own for `make slow` and `make lowest`.
+# Environments of their own for `make slow`, `make lowest` and `make docs`.
 SLOW := .venv-slow
 RAY := .venv-ray-launcher
 LOWEST := .venv-lowest
+DOCS := .venv-docs
 
 COVERAGE := --cov=hpamdp --cov-report=term:skip-covered --cov-fail-under=90
 # The one slow test that needs the Ray launcher, which shares no environment with the others.
 RAY_TEST := test_a_killed_sweep_is_finished_by_the_same_command and ray
 
-.PHONY: run test slow slow-tests ray-launcher wheel lowest report
+.PHONY: run test slow slow-tests ray-launcher wheel lowest report docs
 
 # A first run: which boat, by UCB; how to sail it, by HyAR. More settings: make run ARGS="seed=1"
 run: $(VENV)/.installed
@@ -58,6 +59,11 @@ lowest: $(LOWEST)/.installed
 report: $(VENV)/.installed
 	$(PYTHON) experiments/report.py
 
+# The documentation site, in site/: runs the tutorials, then builds the pages. Warnings are errors.
+docs: $(DOCS)/.installed
+	$(DOCS)/bin/python -m pytest tests/test_tutorials.py tests/test_pages.py -m 'slow or not slow' $(ARGS)
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build
+
 # A python on the PATH may be a stub that does not run (pyenv) or lack venv's pip (Debian), so each is tried.
 define venv
 @$(@D)/bin/python -c 'import pip; $(IS_ALLOWED)' 2>/dev/null || { \
@@ -92,4 +98,9 @@ $(RAY)/.installed: pyproject.toml constraints-ray-launcher.txt
 $(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
 	$(venv)
 	$(INSTALL) -c constraints-lowest.txt -e '.[dev]'
+	@touch $@
+
+$(DOCS)/.installed: pyproject.toml constraints.txt
+	$(venv)
+	$(INSTALL) -c constraints.txt -e '.[dev,docs]'
 	@touch $@

@@ -7,6 +7,9 @@ Where the selector decides when options end, an option is interrupted as soon as
 the first source).
 
 Differs from the sources: where a time limit ends an episode, nothing follows.
+
+Differs from Chen et al.: which decisions a member of the ensemble learns from is drawn anew at every update, not once
+for each decision, and all members share one target, the mean of the target members.
 """
 
 from __future__ import annotations
