@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -18,6 +18,8 @@ from hpamdp.geometry import PlaneGeometry, Symmetries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from hpamdp.env.page import Page
 
 # Separates the seeds of an evaluation from the small ones that people give to training.
 _EVALUATION = 0x5EED0000
@@ -250,6 +252,24 @@ class PAMDPEnv(EnvBase):
             summary: of the run; `references` has the figures to compare with.
         """
         return {}
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterable[np.ndarray]:
+        """Return the pictures of one episode, uint8 `[size, size, 3]` each; none where there is nothing to see.
+
+        Args:
+            track: its `env_state` at the start and after every step, columns `[1, ...]`.
+            fps: pictures a second.
+            size: px from edge to edge.
+        """
+        return ()
+
+    def page(self, seed: int) -> Page | None:
+        """Return the page on which people play this problem in a browser; None if there is none.
+
+        Args:
+            seed: of its episodes.
+        """
+        return None
 
     @property
     def keeps_episodes(self) -> bool:

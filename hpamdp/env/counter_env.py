@@ -6,13 +6,15 @@ is the same for all of them: specs, checks of actions, masked steps and resets, 
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
+from PIL import Image
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
@@ -29,6 +31,7 @@ from hpamdp.env.rows import Advance, Results, Rows
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
+_SECONDS_A_STEP = 0.25  # in films
 
 
 class EpisodeColumns(Columns, Protocol):
@@ -205,6 +208,15 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             track: the states of one environment from the start on, columns `[1]`.
         """
         raise NotImplementedError(f"{type(self).__name__} has no pictures")
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+        """Yield the pictures of `draw`, each for a quarter of a second; none if there are none."""
+        if type(self).draw is CounterEnv.draw:
+            return
+        states = [type(self._state)(**columns) for columns in track]
+        for i in range(1, len(states) + 1):
+            picture = np.array(Image.fromarray(self.draw(states[:i])).resize((size, size), Image.Resampling.LANCZOS))
+            yield from itertools.repeat(picture, max(1, round(fps * _SECONDS_A_STEP)))
 
     @property
     def state(self) -> EpisodeState:

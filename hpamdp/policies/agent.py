@@ -314,6 +314,18 @@ class HierarchicalAgent(nn.Module):
             levels["selector"] = self.selector
         return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
 
+    def portable(self) -> dict[str, Any] | None:
+        """Return as JSON values what a program without torch needs to act greedily; None if a part of it cannot say.
+
+        `selector` is None where there is nothing to choose; `learners` has one entry for each option, or a single one,
+        which with `is_shared` observes the one-hot option at the end of the observation.
+        """
+        learners = [learner.portable() for learner in self._learners()]
+        selector = None if self.selector is None else self.selector.portable()
+        if any(learner is None for learner in learners) or (self.selector is not None and selector is None):
+            return None
+        return {"selector": selector, "learners": learners, "is_shared": self.is_shared}
+
     def _learners(self) -> Iterator[Learner]:
         for learner in self.learners:
             assert isinstance(learner, Learner)

@@ -234,6 +234,13 @@ class Selector(TensorDictModuleBase):
         """
         return {}
 
+    def portable(self) -> dict[str, Any] | None:
+        """Return as JSON values what a program without torch needs to choose greedily; None if that is not known.
+
+        `kind` names the form, which `hpamdp.policies.shared.portable` explains.
+        """
+        return None
+
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write `out_keys`: a fresh choice where `is_decision`, elsewhere what `td` already holds."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
@@ -373,6 +380,13 @@ class Learner(nn.Module):
         """
         fresh = {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in self.progress}
         self.load_state_dict({name: fresh.get(name, value) for name, value in state.items()})
+
+    def portable(self) -> dict[str, Any] | None:
+        """Return as JSON values what a program without torch needs to act greedily; None if that is not known.
+
+        `kind` names the form, which `hpamdp.policies.shared.portable` explains.
+        """
+        return None
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, as `Selector.stateful` does."""

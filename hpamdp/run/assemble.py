@@ -31,6 +31,8 @@ from hpamdp.specs import PAMDPSpecs
 
 # Fewer steps or episodes than this need no estimate of their memory, for which an environment is built.
 _MANY = 1_000_000
+# Episodes of the film that every run leaves behind.
+FILMED_EPISODES = 3
 # A weight is there four times: itself, its gradient and two moments of Adam.
 _BYTES_A_WEIGHT = 16
 
@@ -176,11 +178,14 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
     return demonstrations
 
 
-def make_evaluation(config: Config, env: PAMDPEnv) -> Evaluation:
-    """Build the evaluation on environments of its own, which scale observations as `env` does."""
+def make_evaluation(config: Config, env: PAMDPEnv, num_filmed: int = FILMED_EPISODES) -> Evaluation:
+    """Build the evaluation on environments of its own, which scale observations as `env` does.
+
+    With `film=false` no episode is filmed, otherwise the first `num_filmed`.
+    """
     test_env = make_env(config, config.run.eval.layouts, env.device, seed=0)
     test_env.set_scaling_from(env)
-    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed)
+    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed, num_filmed if config.run.film else 0)
 
 
 def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:

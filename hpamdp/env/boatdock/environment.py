@@ -6,7 +6,8 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -33,6 +34,8 @@ from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symme
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from hpamdp.env.boatdock.play.boat_page import BoatPage
 
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
@@ -73,6 +76,7 @@ class BoatDockEnv(PAMDPEnv):
             congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
+        recording: a file of `hpamdp play`, whose figures stand in tables and curves in place of people's.
         compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU, instead
             of using the kernel.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
@@ -133,6 +137,7 @@ class BoatDockEnv(PAMDPEnv):
         motor_noise: float | Pair = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
+        recording: str | None = None,
         compile_rules: bool = False,
         oracle: bool = False,
         human: bool = False,
@@ -142,6 +147,7 @@ class BoatDockEnv(PAMDPEnv):
     ) -> None:
         rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
         check_arguments(num_envs, rules)
+        self._played = None if recording is None else _figures_of(recording, controller)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
@@ -323,11 +329,13 @@ class BoatDockEnv(PAMDPEnv):
         return "chosen" if self.has_choice else self.rules.controller
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the figures of people, of the best of them and of the ceiling on the same layouts."""
+        """Return the figures of people, of the best of them, or of a recording, and of the ceiling on these layouts."""
         ceiling = {**super().references(measured)["ceiling"], "success": 1.0}
         ceiling["human_normalised"] = human_normalised(ceiling["score"], self._controller_of_run)
         if self.has_choice:
             ceiling["oracle_agreement"] = 1.0
+        if self._played is not None:
+            return {"you": self._played, "ceiling": ceiling}
         return {**human_references(self._controller_of_run), "ceiling": ceiling}
 
     def summary_entries(self) -> dict[str, str]:
@@ -340,6 +348,18 @@ class BoatDockEnv(PAMDPEnv):
         from hpamdp.env.boatdock import figures  # matplotlib takes long to import
 
         return figures.draw(evaluation, summary)
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+        """Return the pictures of one episode, in which the boat moves as it does in the task."""
+        from hpamdp.env.boatdock import film  # which draws, as few who sail do
+
+        return film.film(track, fps, size)
+
+    def page(self, seed: int) -> BoatPage:
+        """Return the page on which people dock boats."""
+        from hpamdp.env.boatdock.play.boat_page import BoatPage
+
+        return BoatPage(seed)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
@@ -507,6 +527,18 @@ class BoatDockEnv(PAMDPEnv):
         if self._has_human:
             seen.set(keys.HUMAN_OPTION, human_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
+
+
+def _figures_of(recording: str, controller: str) -> dict[str, float]:
+    """Return the means of a recording, of the episodes with this controller where it is fixed."""
+    from hpamdp.env.boatdock.play import episodes  # which few need
+
+    of_controller = controller if controller in harbour.CONTROLLERS else None
+    means = episodes.figures(episodes.read(Path(recording)), of_controller)
+    return {
+        **means,
+        "human_normalised": human_normalised(means["score"], "chosen" if of_controller is None else controller),
+    }
 
 
 def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) -> Tensor | None:
