@@ -14,7 +14,7 @@ import linecache
 import re
 import traceback
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
@@ -56,8 +56,8 @@ _TARGET = "_target_"
 _MOST_COMPLAINTS = 3
 # Larger numbers leave those that a computation can hold; infinity is refused as well.
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
-# Entries of a learner's yaml that are not options of its class.
-_NO_OPTIONS = ("budget", "checkpoint", "freeze")
+# Entries of a group that are not options of its class.
+_NO_OPTIONS = {"low": ("budget", "checkpoint", "freeze", "per_option"), "env": ("options",)}
 # Options whose names have changed since a config may have been saved: old name to new.
 _RENAMED = {"compile_physics": "compile_rules"}
 
@@ -93,7 +93,8 @@ class AgentConfig(BaseModel):
     model_config = _STRICT
 
     sharing: Literal["per_option", "shared"]
-    option_length: Literal["episode", "learned"] | PositiveInt
+    termination: Literal["episode", "steps", "learned"]
+    option_length: PositiveInt | None
     uniform_option_frames: NonNegativeInt
 
 
@@ -107,12 +108,24 @@ class OfflineConfig(BaseModel):
 
 
 class StartConfig(BaseModel):
-    """The learners that a run starts with."""
+    """The learners that a run starts with, and which of them are of another class than `low`.
+
+    `per_option` maps the name of an option to the name of a learner, or to its `name` and options.
+    """
 
     model_config = _STRICT
 
     checkpoint: str | None
     freeze: bool
+    per_option: dict[str, str | dict[str, Any]] | None
+
+
+class EnvConfig(BaseModel):
+    """What can be made of any problem."""
+
+    model_config = _STRICT
+
+    options: Literal["default"] | dict[str, list[int | str]] | None
 
 
 class BudgetConfig(BaseModel):
@@ -136,6 +149,7 @@ class RunConfig(BaseModel):
     device: Annotated[str, AfterValidator(_check_device)]
     threads: Annotated[int, Field(ge=1, le=1024)]
     agent: AgentConfig
+    env: EnvConfig
     low: StartConfig
     total_frames: PositiveInt
     num_envs: PositiveInt
@@ -241,6 +255,12 @@ class Config:
     data: Component
     logger: Component
     collector: Component
+    low_of: Mapping[str, Component] = field(default_factory=dict)
+
+    @property
+    def learners(self) -> list[Component]:
+        """The learner that was chosen and those of single options."""
+        return [self.low, *self.low_of.values()]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as plain values, with the classes by their names: what a run saves and is resumed from."""
@@ -289,6 +309,7 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     own.pop("hydra", None)
     plain = _plain(own)
     values = {name: value for name, value in plain.items() if name not in GROUPS}
+    values["env"] = {name: plain["env"].get(name) for name in EnvConfig.model_fields}
     values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
     if "budget" in plain["low"]:
@@ -298,7 +319,25 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
             raise ConfigError(f"low.budget={_as_json(budget)}: must be a mapping ({file})")
         _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
-    return Config(run, **{group: component(group, names[group], plain[group]) for group in GROUPS})
+    components = {group: component(group, names[group], plain[group]) for group in GROUPS}
+    return Config(run, **components, low_of=_learners_of_options(run.low.per_option or {}))
+
+
+def _learners_of_options(choices: Mapping[str, str | Mapping[str, Any]]) -> dict[str, Component]:
+    """Return the learner of each of these options: its yaml with the given options."""
+    learners = {}
+    for option, choice in choices.items():
+        given = {"name": choice} if isinstance(choice, str) else dict(choice)
+        name = str(given.pop("name", ""))
+        if not re.fullmatch(r"\w+", name):
+            given_choice = f"low.per_option.{option}={_as_json(choice)}"
+            raise ConfigError(f"{given_choice}: must be the name of a learner, or its name and options")
+        try:
+            node = _compose([f"low={name}"]).low
+        except ConfigError as error:
+            raise ConfigError(f"low.per_option.{option}={name}: there is no {_file('low', name)}") from error
+        learners[option] = component("low", name, {**_plain(node, "low"), **given})
+    return learners
 
 
 def compose_words(words: list[str]) -> DictConfig:
@@ -328,6 +367,15 @@ def job_overrides() -> list[str]:
 
 
 def _check_mode(run: RunConfig) -> None:
+    termination, length = run.agent.termination, run.agent.option_length
+    if termination == "steps" and length is None:
+        raise ConfigError(
+            "agent.option_length: missing; agent.termination=steps needs the number of steps of an option"
+        )
+    if termination != "steps" and length is not None:
+        raise ConfigError(
+            f"agent.option_length={length}: goes with agent.termination=steps only, not with {termination}"
+        )
     for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
         if value == "":
             raise ConfigError(f"{name}: empty; give the output folder of a run, or leave {name} out")
@@ -356,7 +404,7 @@ def component(group: str, name: str, node: Any) -> Component:
         ConfigError: all that is wrong with this group, in one line.
     """
     options = _plain(node, group)
-    for entry in _NO_OPTIONS:
+    for entry in _NO_OPTIONS.get(group, ()):
         options.pop(entry, None)
     target = options.pop(_TARGET, None)
     file = _file(group, name)
@@ -375,11 +423,21 @@ def compose_saved(saved: Mapping[str, Any]) -> tuple[DictConfig, dict[str, str]]
     """
     choices = {group: saved[group]["name"] for group in GROUPS}
     today = _compose([f"{group}={name}" for group, name in choices.items()])
-    values = dict(saved)
+    values = {**saved, "agent": _with_termination(saved["agent"])}
     for group in GROUPS:
         options = {_RENAMED.get(name, name): value for name, value in saved[group].items() if name != "name"}
         values[group] = {**{str(key): value for key, value in today[group].items()}, **options}
     return OmegaConf.create(values), choices
+
+
+def _with_termination(agent: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `agent` as it is set today; `option_length` used to say all by itself where options end."""
+    length = agent.get("option_length")
+    if "termination" in agent:
+        return dict(agent)
+    if isinstance(length, str):
+        return {**agent, "termination": length, "option_length": None}
+    return {**agent, "termination": "steps"}
 
 
 def _compose(overrides: list[str]) -> DictConfig:

@@ -9,6 +9,10 @@ REWARD = "reward"
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 OUTCOME = "outcome"  # how the episode ended, in an environment's own codes
 
+# Written by an environment that forbids some choices at times: what may be chosen in its current state.
+ACTION_MASK = "action_mask"  # discrete actions
+OPTION_MASK = "option_mask"  # options
+
 # Written by DecisionTracker.
 IS_DECISION = "is_decision"
 OPTION_RETURN, OPTION_STEPS = "option_return", "option_steps"

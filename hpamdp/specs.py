@@ -24,6 +24,12 @@ class PAMDPSpecs:
         initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the parameters
             in [-1, 1] that the field starts this problem with; None where there is no such convention.
         initial_bias: what it adds, `num_parameters` entries.
+        has_action_mask: whether the environment says which discrete actions may be taken, `action_mask`.
+        has_option_mask: whether it says which options may be chosen, `option_mask`.
+        option_actions: where options are sets of discrete actions: whether each option allows each of them,
+            `num_options` rows of `num_discrete` entries; else None.
+        held_option: of a learner that serves one option: its number; None: the observation ends in the one-hot option,
+            or there is none.
         symmetries: maps under which neither dynamics nor reward change; None where the problem declares none.
         geometry: which entries are vectors of the plane, and where the discrete actions point; None where the problem
             declares none.
@@ -36,6 +42,10 @@ class PAMDPSpecs:
     parameter_high: tuple[float, ...]
     initial_weight: tuple[tuple[float, ...], ...] | None = None
     initial_bias: tuple[float, ...] | None = None
+    has_action_mask: bool = False
+    has_option_mask: bool = False
+    option_actions: tuple[tuple[bool, ...], ...] | None = None
+    held_option: int | None = None
     symmetries: Symmetries | None = field(default=None, compare=False)
     geometry: PlaneGeometry | None = field(default=None, compare=False)
 
@@ -82,6 +92,22 @@ class PAMDPSpecs:
         low, high = unit.new_tensor(self.parameter_low), unit.new_tensor(self.parameter_high)
         return low + (unit + 1.0) * 0.5 * (high - low)
 
+    def allowed(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor | None:
+        """Return which discrete actions a learner may take, bool `[*B, num_discrete]`; None: all of them.
+
+        Args:
+            observation: as the learner sees it, `[*B, observation_dim]`.
+            action_mask: what the environment allows, `[*B, num_discrete]`; None: everything.
+        """
+        if self.option_actions is None:
+            return action_mask
+        of_options = torch.tensor(self.option_actions, device=observation.device)
+        if self.held_option is None:
+            own = of_options[observation[..., -self.num_options :].argmax(-1)]
+        else:
+            own = of_options[self.held_option].expand(*observation.shape[:-1], -1)
+        return own if action_mask is None else own & action_mask
+
     def with_option_observed(self) -> PAMDPSpecs:
         """Return the specs of a learner whose observation ends in the one-hot option."""
         weight = self.initial_weight
@@ -102,6 +128,7 @@ class PAMDPSpecs:
         symmetries, geometry = self.symmetries, self.geometry
         return replace(
             self,
+            held_option=option,
             symmetries=None if symmetries is None else symmetries.of_option(option),
             geometry=None if geometry is None else geometry.of_option(option),
         )
@@ -155,6 +182,9 @@ class PAMDPSpecs:
         for name, misfit in misfits.items():
             if misfit:
                 raise ValueError(f"{name}: {misfit}")
+        has_action_mask = keys.ACTION_MASK in env.observation_spec_unbatched.keys()
+        if has_action_mask or env.option_actions is not None:
+            symmetries = None  # they do not say how masks, and options that are sets of actions, are mapped
         return cls(
             observation_dim=observation_dim,
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
@@ -163,6 +193,9 @@ class PAMDPSpecs:
             parameter_high=tuple(parameters.space.high.flatten().tolist()),
             initial_weight=weight,
             initial_bias=bias,
+            has_action_mask=has_action_mask,
+            has_option_mask=keys.OPTION_MASK in env.observation_spec_unbatched.keys(),
+            option_actions=env.option_actions,
             symmetries=symmetries,
             geometry=geometry,
         )

@@ -56,23 +56,23 @@ def crossing(*words: str) -> Config:
             "incongruent, random",
         ),
         (
-            "high=ucb agent.option_length=3",
-            "agent.option_length=3: env=boatdock keeps an option for an episode; use agent.option_length=episode",
+            "high=ucb agent.termination=steps agent.option_length=3",
+            "agent.termination=steps: env=boatdock keeps an option for an episode; use agent.termination=episode",
         ),
         (
-            "high=none env=platform agent.option_length=3",
-            "agent.option_length=3: env=platform has no options; use agent.option_length=episode",
+            "high=none env=platform agent.termination=steps agent.option_length=3",
+            "agent.termination=steps: env=platform has no options; use agent.termination=episode",
         ),
         (
-            "high=actor env=crossing low=stepper agent.option_length=learned",
-            "agent.option_length=learned: high=actor does not decide where options end; use high=option_critic, "
-            "high=meta_critic or a number of steps",
+            "high=actor env=crossing low=stepper agent.termination=learned",
+            "agent.termination=learned: high=actor does not decide where options end; use high=option_critic, "
+            "high=meta_critic or agent.termination=steps",
         ),
         *(
             (
-                f"high={high} env=crossing low=stepper agent.option_length=3",
-                f"agent.option_length=3: high={high} is a bandit, which counts what an option pays and nothing of what "
-                "follows it; use agent.option_length=episode, high=meta_critic or high=actor",
+                f"high={high} env=crossing low=stepper agent.termination=steps agent.option_length=3",
+                f"agent.termination=steps: high={high} is a bandit, which counts what an option pays and nothing of "
+                "what follows it; use agent.termination=episode, high=meta_critic or high=actor",
             )
             for high in ("ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson")
         ),
@@ -108,7 +108,7 @@ def test_a_selector_that_ends_options_trains_and_is_evaluated(high, tmp_path):
     )
     words = QUICK_CRITIC if high == "meta_critic" else [f"high={high}", *words]
     low = ["low=pdqn", *SHORT["pdqn"]]
-    config = make_config([*SMALL, "env=rooms", *low, *words, "agent.option_length=learned"])
+    config = make_config([*SMALL, "env=rooms", *low, *words, "agent.termination=learned"])
     parts = train(config, tmp_path / "run")
     played = parts.evaluation.run(parts.agent.policy)
     assert played["steps"].max() <= 50
@@ -116,8 +116,8 @@ def test_a_selector_that_ends_options_trains_and_is_evaluated(high, tmp_path):
 
 def test_frozen_learners_play_whole_episodes_so_that_options_cannot_be_shorter(tmp_path):
     with pytest.raises(ConfigError) as error:
-        make(crossing("low.freeze=true", "agent.option_length=2"), tmp_path)
-    line = "agent.option_length=2: low.freeze=true plays whole episodes; use agent.option_length=episode"
+        make(crossing("low.freeze=true", "agent.termination=steps", "agent.option_length=2"), tmp_path)
+    line = "agent.termination=steps: low.freeze=true plays whole episodes; use agent.termination=episode"
     assert str(error.value) == line
 
 
@@ -215,7 +215,9 @@ def test_frozen_learners_that_need_no_training_need_no_checkpoint(tmp_path):
 
 
 def test_options_of_a_fixed_length_are_chosen_and_discounted_as_the_selector_asks(tmp_path):
-    parts = make(crossing(*QUICK_CRITIC, "high.gamma=0.9", "agent.option_length=2"), tmp_path)
+    parts = make(
+        crossing(*QUICK_CRITIC, "high.gamma=0.9", "agent.termination=steps", "agent.option_length=2"), tmp_path
+    )
     batch = parts.env.rollout(40, parts.policy, break_when_any_done=False)
     is_cut = batch["next", keys.IS_DECISION] & ~batch["next", keys.DONE]
     assert is_cut.any() and batch["next", keys.OPTION_STEPS].max() == 2

@@ -183,6 +183,41 @@ def test_a_config_that_was_saved_before_an_option_was_renamed_is_read():
     assert read(*compose_saved(saved)) == config
 
 
+@pytest.mark.parametrize(
+    ("saved_length", "termination"), [("episode", "episode"), ("learned", "learned"), (3, "steps")]
+)
+def test_a_config_that_was_saved_when_a_length_alone_said_where_options_end_is_read(saved_length, termination):
+    saved = make_config([]).to_dict()
+    del saved["agent"]["termination"]
+    saved["agent"]["option_length"] = saved_length
+    agent = read(*compose_saved(saved)).run.agent
+    assert agent.termination == termination
+    assert agent.option_length == (3 if termination == "steps" else None)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (
+            ["agent.termination=steps"],
+            "agent.option_length: missing; agent.termination=steps needs the number of steps of an option",
+        ),
+        (
+            ["agent.option_length=3"],
+            "agent.option_length=3: goes with agent.termination=steps only, not with episode",
+        ),
+        (
+            ["agent.termination=learned", "agent.option_length=3"],
+            "agent.option_length=3: goes with agent.termination=steps only, not with learned",
+        ),
+    ],
+)
+def test_a_number_of_steps_goes_with_options_that_end_after_steps_alone(words, complaint):
+    with pytest.raises(ConfigError) as error:
+        make_config(words)
+    assert str(error.value) == complaint
+
+
 def test_a_name_of_a_saved_config_that_is_nowhere_is_told_in_one_line():
     saved = make_config([]).to_dict()
     saved["low"]["name"] = "gone"

@@ -30,6 +30,7 @@ COLUMNS = (
     "high",
     "low",
     "sharing",
+    "termination",
     "option_length",
     "seed",
     "steps",
@@ -41,11 +42,24 @@ COLUMNS = (
 )
 GAMMA = 0.95
 # On every run, before the words of the command line.
-COMMON = ["env=rooms", f"low.gamma={GAMMA}", "agent.option_length=3", "eval.layouts=200", "eval.every=0", "log_every=0"]
+COMMON = [
+    "env=rooms",
+    f"low.gamma={GAMMA}",
+    "agent.termination=steps",
+    "agent.option_length=3",
+    "eval.layouts=200",
+    "eval.every=0",
+    "log_every=0",
+]
 SELECTORS = {
     "meta_critic": [f"high.gamma={GAMMA}", "high.updates_per_decision=0.02", "high.epsilon_decisions=10000"],
     "actor": [f"high.gamma={GAMMA}", "high.entropy=0.02", "high.lr=1e-3"],
-    "option_critic": [f"high.gamma={GAMMA}", "high.epsilon_steps=50000", "agent.option_length=learned"],
+    "option_critic": [
+        f"high.gamma={GAMMA}",
+        "high.epsilon_steps=50000",
+        "agent.termination=learned",
+        "agent.option_length=null",
+    ],
 }
 LEARNERS = {
     "hppo": ["total_frames=600000", "num_envs=256", "steps_per_batch=16", "low.minibatch_size=1024"],
@@ -73,13 +87,14 @@ def train(words: Sequence[str]) -> dict[str, object]:
         trainer.train()
     cpu = time.process_time() - cpu
     length = config.run.agent.option_length
-    steps = length if isinstance(length, int) else 1
+    steps = length or 1
     means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
     optimum = mean_over_starts(parts, rules.best_values(1.0, steps))
     return {
         "high": config.high.name,
         "low": config.low.name,
         "sharing": config.run.agent.sharing,
+        "termination": config.run.agent.termination,
         "option_length": length,
         "seed": config.run.seed,
         "steps": trainer.frames,

@@ -53,6 +53,8 @@ class PAMDPEnv(EnvBase):
       `[N, num_parameters]`: the bounded parameters of all discrete actions side by side, of which only those of the
       chosen one count;
     - where the agent chooses options, the action leaf `option` int64 `[N]`;
+    - where some choices are forbidden at times, `action_mask` bool `[N, num_discrete]` and `option_mask` bool
+      `[N, num_options]` beside the observation: what may be chosen in the current state;
     - `reward`, `done`, `terminated`, `truncated` `[N, 1]`; a time limit is `truncated` only.
 
     A step leaves an episode that is over as it is and earns 0.
@@ -62,6 +64,8 @@ class PAMDPEnv(EnvBase):
     """
 
     option_names: tuple[str, ...] = ()
+    discrete_names: tuple[str, ...] = ()  # of the discrete actions, where they have names
+    option_actions: tuple[tuple[bool, ...], ...] | None = None  # what `group_actions` has made of the options
     can_change_option: ClassVar[bool] = True  # whether an option may end before its episode
     parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
     max_steps: int  # steps of the longest episode
@@ -86,6 +90,78 @@ class PAMDPEnv(EnvBase):
         Metric("score", "Score"),
         Metric("success", "Episodes that succeed", "share"),
     )
+
+    @property
+    def title(self) -> str:
+        """What errors call the problem."""
+        return type(self).__name__
+
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """Options to begin with, as for `group_actions`; empty where none suggest themselves."""
+        return {}
+
+    def group_actions(self, options: Mapping[str, Sequence[int | str]]) -> None:
+        """Let the agent choose among options that allow some of the discrete actions each.
+
+        The action spec then has the leaf `option`. An action that the option does not allow is refused. Actions of no
+        option are never taken; an action may belong to several.
+
+        Args:
+            options: for each option's name its discrete actions, by number or name, with _ for a space.
+
+        Raises:
+            ValueError: the problem has options of its own, an option has no action, or an action does not exist.
+        """
+        if self.has_choice or self.option_names:
+            raise ValueError(f"{self.title} has options of its own: {', '.join(self.option_names)}")
+        if not options:
+            raise ValueError("name at least one option")
+        num_discrete = len(self.parameter_dims)
+        rows = []
+        for name, actions in options.items():
+            if not actions:
+                raise ValueError(f"option {name} allows no action; name at least one")
+            numbers = {self._number_of_action(action) for action in actions}
+            rows.append(tuple(number in numbers for number in range(num_discrete)))
+        self.option_names = tuple(options)
+        self.option_actions = tuple(rows)
+        n, device = self.batch_size, self.device
+        leaf = {keys.OPTION: Categorical(len(rows), shape=n, device=device)}
+        self.action_spec = Composite(**leaf, **self.full_action_spec, shape=n)
+        self._allowed_by_option = torch.tensor(rows, device=device)
+
+    def _number_of_action(self, action: int | str) -> int:
+        num_discrete = len(self.parameter_dims)
+        names = [name.replace(" ", "_") for name in self.discrete_names]
+        if isinstance(action, int):
+            if 0 <= action < num_discrete:
+                return action
+        elif action.replace(" ", "_") in names:
+            return names.index(action.replace(" ", "_"))
+        named = f" or {', '.join(names)}" if names else ""
+        raise ValueError(f"{self.title} has no discrete action {action}; it has 0 to {num_discrete - 1}{named}")
+
+    def check_masks(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return what a step or a reset gave, with masks that allow something in every row.
+
+        Where an episode is over, nothing is chosen any more, so a mask that allows nothing becomes one that allows
+        everything.
+
+        Raises:
+            ProblemError: a mask allows nothing where the episode goes on.
+        """
+        for name in (keys.ACTION_MASK, keys.OPTION_MASK):
+            mask = tensordict.get(name, None)
+            if mask is None:
+                continue
+            is_empty = ~mask.any(-1)
+            is_stuck = is_empty & ~tensordict.get(keys.DONE).squeeze(-1)
+            if is_stuck.any():
+                row = int(is_stuck.nonzero()[0])
+                raise ProblemError(f"{self.title}: environment {row} gave an {name} that allows nothing")
+            tensordict.set(name, mask | is_empty.unsqueeze(-1))
+        return tensordict
 
     @property
     def has_choice(self) -> bool:
@@ -255,6 +331,23 @@ class PAMDPEnv(EnvBase):
         self._check_leaf(tensordict, keys.PARAMETERS, (*size, sum(self.parameter_dims)), is_integer=False)
         if self.has_choice:
             self._check_leaf(tensordict, keys.OPTION, size, is_integer=True)
+        if self.option_actions is not None:
+            self._check_option(tensordict.get(keys.OPTION), tensordict.get(keys.DISCRETE))
+
+    def _check_option(self, option: Tensor, discrete: Tensor) -> None:
+        """Refuse an option that does not exist, and an action that its option does not allow, `[N]` each."""
+        num_options, num_discrete = self._allowed_by_option.shape
+        exists = (option >= 0) & (option < num_options) & (discrete >= 0) & (discrete < num_discrete)
+        is_valid = exists & self._allowed_by_option[torch.where(exists, option, 0), torch.where(exists, discrete, 0)]
+        if is_valid.all():
+            return
+        row = int((~is_valid).nonzero()[0])
+        given = f"option={option[row].item()}, discrete={discrete[row].item()}"
+        listed = (
+            f"{name}: {[number for number, is_allowed in enumerate(allowed) if is_allowed]}"
+            for name, allowed in zip(self.option_names, self._allowed_by_option.tolist(), strict=True)
+        )
+        raise ValueError(f"step: environment {row} got {given} (the options allow {', '.join(listed)})")
 
     @staticmethod
     def _check_leaf(

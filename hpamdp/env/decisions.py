@@ -117,7 +117,16 @@ class DecisionEnv(TransformedEnv):
         given = self.transform._reset_env_preprocess(given)
         fresh = self.base_env._reset(given, **kwargs)
         self.base_env._complete_done(self.base_env.full_done_spec, fresh)
+        self._problem.check_masks(fresh)
         return self.transform._reset(fresh.empty() if given is None else given, fresh)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self._problem.check_masks(super()._step(tensordict))
+
+    @property
+    def _problem(self) -> PAMDPEnv:
+        assert isinstance(self.base_env, PAMDPEnv)
+        return self.base_env
 
 
 def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionEnv:

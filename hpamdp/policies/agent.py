@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.shared.masks import allowed_or_first
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -48,10 +49,13 @@ class OptionRouter(TensorDictModuleBase):
         self.policies = nn.ModuleList(learner.policy for learner in learners)
         self.specs = specs
         self.is_shared = is_shared
-        self.out_keys = list(learners[0].policy.out_keys)
+        # Learners of several classes may write keys of their own.
+        self._own_out_keys = [list(learner.policy.out_keys) for learner in learners]
+        self.out_keys = list(dict.fromkeys(key for own_keys in self._own_out_keys for key in own_keys))
         in_keys = {key for learner in learners for key in learner.policy.in_keys}
         self.state_keys = [key for key in self.out_keys if key in in_keys]
-        self.in_keys = [*in_keys, *([keys.OPTION] if specs.num_options else [])]
+        masks = [keys.ACTION_MASK] if specs.has_action_mask else []
+        self.in_keys = [*in_keys, *masks, *([keys.OPTION] if specs.num_options else [])]
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action leaves and the other `out_keys` of the learners' policies."""
@@ -67,7 +71,7 @@ class OptionRouter(TensorDictModuleBase):
             if not rows.any():
                 continue
             acted = policy(seen[rows])
-            for key in self.out_keys:
+            for key in self._own_out_keys[i]:
                 value = acted.get(key)
                 written = td.get(key, None)
                 if written is None:
@@ -75,7 +79,19 @@ class OptionRouter(TensorDictModuleBase):
                 written = written.clone()
                 written[rows] = value
                 td.set(key, written)
+        for policy, own_keys in zip(self.policies, self._own_out_keys, strict=True):
+            missing = [key for key in own_keys if td.get(key, None) is None]
+            if missing:
+                self._fill(td, policy, missing)
         return td
+
+    def _fill(self, td: TensorDictBase, policy: nn.Module, missing: Sequence[NestedKey]) -> None:
+        """Write zeros under the keys of a policy that acts in none of the environments, so that all steps have them."""
+        with torch.random.fork_rng():
+            acted = policy(self._seen(td).reshape(-1)[:1])
+        for key in missing:
+            value = acted.get(key)
+            td.set(key, value.new_zeros(*td.batch_size, *value.shape[1:]))
 
     def _seen(self, td: TensorDictBase) -> TensorDictBase:
         """Return what the policies read, as far as it is there."""
@@ -83,7 +99,7 @@ class OptionRouter(TensorDictModuleBase):
 
 
 class HeldOption(TensorDictModuleBase):
-    """The same option in every environment at every step."""
+    """The same option in every environment at every step; the first allowed one where it is forbidden."""
 
     def __init__(self, option: int) -> None:
         super().__init__()
@@ -93,8 +109,9 @@ class HeldOption(TensorDictModuleBase):
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write `option` int64 `[*B]`."""
-        observation = td.get(keys.OBSERVATION)
-        return td.set(keys.OPTION, torch.full(td.batch_size, self.option, device=observation.device))
+        option = torch.full(td.batch_size, self.option, device=td.get(keys.OBSERVATION).device)
+        mask = td.get(keys.OPTION_MASK, None)
+        return td.set(keys.OPTION, option if mask is None else allowed_or_first(option, mask))
 
 
 class NextOptions:
@@ -114,16 +131,23 @@ class NextOptions:
         self.sees_observation_alone = {*selector.in_keys} <= {keys.OBSERVATION, keys.IS_DECISION}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, option: Tensor) -> Tensor:
-        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen."""
+    def value(self, observation: Tensor, option: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen.
+
+        Args:
+            observation: of the states.
+            option: chosen there, `[N]`.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+        """
+        masks = () if action_mask is None else (action_mask,)
         if self.is_shared:
             one_hot = F.one_hot(option, self.num_options).to(observation)
-            return self.learners[0].value(torch.cat([self._without_option(observation), one_hot], -1))
+            return self.learners[0].value(torch.cat([self._without_option(observation), one_hot], -1), *masks)
         value = observation.new_zeros(len(observation))
         for i, learner in enumerate(self.learners):
             rows = option == i
             if rows.any():
-                value[rows] = learner.value(observation[rows])
+                value[rows] = learner.value(observation[rows], *(mask[rows] for mask in masks))
         return value
 
     @property

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
+from hpamdp.policies.shared.masks import random_choice
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -33,8 +34,14 @@ class Following(Protocol):
     learner. Learners reach one another through this alone. Observations are as the learner that asks sees them.
     """
 
-    def value(self, observation: Tensor, option: Tensor) -> Tensor:
-        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen."""
+    def value(self, observation: Tensor, option: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen.
+
+        Args:
+            observation: of the states.
+            option: chosen there, `[N]`.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+        """
         ...
 
     @property
@@ -87,9 +94,11 @@ class Selector(TensorDictModuleBase):
     `conf/high`. A selector never sees the environment, the config or the agent.
 
     Tensordict: `forward` gets the current step of `[*B]` environments and reads `in_keys`: `observation`
-    `[*B, observation_dim]` and `is_decision` bool `[*B, 1]`. It writes `out_keys`: `option` int64 `[*B]`. If `learn`
-    needs to know more about a choice, such as its log-probability, append a key to `out_keys` and return it from
-    `choose` and `choose_uniformly`, shape `[*B]`. It is held with the option and is there again in `learn`.
+    `[*B, observation_dim]` and `is_decision` bool `[*B, 1]`; where the environment says which options may be chosen,
+    also `option_mask` bool `[*B, num_options]`: forbidden ones must neither be chosen nor count in a target. It writes
+    `out_keys`: `option` int64 `[*B]`. If `learn` needs to know more about a choice, such as its log-probability, append
+    a key to `out_keys` and return it from `choose` and `choose_uniformly`, first dimensions `[*B]`. It is held with the
+    option and is there again in `learn`.
 
     State: the same module acts in training and evaluation, with different numbers of environments, so whatever belongs
     to an episode travels in the tensordict. What the selector has learned belongs in parameters and buffers: they are
@@ -105,7 +114,7 @@ class Selector(TensorDictModuleBase):
         gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
             it, and so is the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
-        decides_ends: whether it does so in this run (`agent.option_length=learned`); the agent sets it.
+        decides_ends: whether it does so in this run (`agent.termination=learned`); the agent sets it.
         is_bandit: whether the selector takes what an option paid for all that its choice was worth. It then is for
             options that last as long as their episodes, after which nothing follows; others are refused.
         modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others
@@ -133,6 +142,8 @@ class Selector(TensorDictModuleBase):
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION, keys.IS_DECISION]
+        if specs.has_option_mask:
+            self.in_keys.append(keys.OPTION_MASK)
         self.out_keys = [keys.OPTION]
         self.specs = specs
         self.register_buffer("is_uniform", torch.zeros((), dtype=torch.bool))
@@ -154,7 +165,8 @@ class Selector(TensorDictModuleBase):
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return a uniformly random choice: a tensor `[*B]` for each of `out_keys`."""
-        return {keys.OPTION: torch.randint(self.specs.num_options, td.batch_size, device=self.is_uniform.device)}
+        mask = td.get(keys.OPTION_MASK, None)
+        return {keys.OPTION: random_choice(td.batch_size, self.specs.num_options, mask, self.is_uniform.device)}
 
     def ends(self, td: TensorDictBase) -> Tensor:
         """Return where the held `option` `[*B]` of `td` ends, given `observation`, bool `[*B]`; greedily or exploring.
@@ -242,7 +254,8 @@ class Selector(TensorDictModuleBase):
         explores_uniformly = bool(self.is_uniform) and not is_greedy()
         fresh = self.choose_uniformly(td) if explores_uniformly else self.choose(td)
         for key, value in fresh.items():
-            td.set(key, value if nothing_held else torch.where(is_decision, value, held[key]))
+            is_fresh = is_decision.reshape(*is_decision.shape, *[1] * (value.ndim - is_decision.ndim))
+            td.set(key, value if nothing_held else torch.where(is_fresh, value, held[key]))
         return td
 
 
@@ -277,6 +290,9 @@ class Learner(nn.Module):
     `specs.parameter_mask` says whose they are, `specs.from_unit` maps [-1, 1] to the bounds. `is_greedy()` says whether
     to act greedily or to explore.
 
+    - Where some discrete actions are forbidden at times, `specs.allowed(observation, td.get("action_mask", None))`
+      says which ones may be taken, in the policy as in `learn`; it is None where nothing is forbidden. They must
+      neither be taken nor count in a target.
     - If `learn` needs to know more about an action, such as its log-probability, append a key to the policy's
       `out_keys`: it is there again in the batch.
     - The policy gets only the environments whose option is its learner's, so their number changes from step to step,
@@ -309,10 +325,14 @@ class Learner(nn.Module):
         super().__init__()
         self.specs = specs
 
-    def value(self, observation: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the values `[N]` of states `[N, observation_dim]` from which this learner would bootstrap.
 
         That is the value of what the learner does from there on, by its target networks if it has any.
+
+        Args:
+            observation: of the states.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
         """
         raise NotImplementedError(f"{type(self).__name__} has no value to bootstrap from")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,6 +71,7 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     check_run_memory(config, device)
     env = make_env(config, config.run.num_envs, device, config.run.seed)
     check_choice(config, env)
+    check_learners_of_options(config, env)
     check_collector(config, env)
     check_modes(config)
     specs = PAMDPSpecs.from_env(env)
@@ -97,7 +98,7 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
     assert config.env.cls is not None
     arguments = constructor_arguments(config.env.cls)
     needs = {}
-    for level in (config.high, config.low):
+    for level in (config.high, *config.learners):
         for name in getattr(level.cls, "needs", ()):
             if name not in arguments:
                 lacks = {"oracle": "has no planner to ask", "human": "has no human data"}[name]
@@ -105,7 +106,33 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
             needs[name] = True
     if first_env > 0 and "first_env" not in arguments:
         seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
-    return config.env.build(num_envs=num_envs, device=device, seed=seed, first_env=first_env, **needs)
+    env: PAMDPEnv = config.env.build(num_envs=num_envs, device=device, seed=seed, first_env=first_env, **needs)
+    if config.run.env.options is not None:
+        _group_actions(env, config)
+    return env
+
+
+def _group_actions(env: PAMDPEnv, config: Config) -> None:
+    """Make options of the problem's discrete actions.
+
+    Raises:
+        ConfigError: the problem has no such actions, or options of its own.
+    """
+    chosen = config.run.env.options
+    options: Mapping[str, Sequence[int | str]] = {}
+    if isinstance(chosen, dict):
+        options = chosen
+    elif chosen == "default":
+        options = env.default_options
+        if not options:
+            raise ConfigError(f"env.options=default: {config.env} suggests none; name the actions of each option")
+    for level in (config.high, *config.learners):
+        if getattr(level.cls, "needs", ()):
+            raise ConfigError(f"env.options: {level} knows nothing of them; use another {level.group}")
+    try:
+        env.group_actions(options)
+    except ValueError as error:
+        raise ConfigError(f"env.options: {first_line(error)} ({config.env})") from error
 
 
 def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> HierarchicalAgent:
@@ -120,7 +147,8 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         learner_specs = [specs.with_option_observed()]
     else:
         learner_specs = [specs.of_option(i) for i in range(specs.num_options)] or [specs]
-    learners = [config.low.build(specs=own_specs, device=device) for own_specs in learner_specs]
+    chosen = [config.low] if is_shared else _learners_of(config, specs)
+    learners = [low.build(specs=each, device=device) for low, each in zip(chosen, learner_specs, strict=True)]
     agent = HierarchicalAgent(
         selector,
         learners,
@@ -128,9 +156,14 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         is_shared=is_shared,
         is_frozen=config.run.low.freeze,
         uniform_option_frames=config.run.agent.uniform_option_frames,
-        selector_ends_options=config.run.agent.option_length == "learned" and selector is not None,
+        selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
     )
     return agent.to(device)
+
+
+def _learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:
+    """Return the component of each option's learner; of the only one where there is no choice."""
+    return [config.low_of.get(name, config.low) for name in specs.option_names] or [config.low]
 
 
 def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | None:
@@ -168,10 +201,8 @@ def _gamma(agent: HierarchicalAgent) -> float:
 
 
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
-    length = config.run.agent.option_length
-    if length == "learned":
-        return with_decisions(env, gamma, math.inf)
-    return with_decisions(env, gamma, None if length == "episode" else length)
+    is_learned = config.run.agent.termination == "learned"
+    return with_decisions(env, gamma, math.inf if is_learned else config.run.agent.option_length)
 
 
 def check_classes(config: Config) -> None:
@@ -180,7 +211,8 @@ def check_classes(config: Config) -> None:
     Raises:
         ConfigError: with the class that it would have to be derived from.
     """
-    bases: tuple[tuple[Component, type], ...] = ((config.env, PAMDPEnv), (config.high, Selector), (config.low, Learner))
+    bases: list[tuple[Component, type]] = [(config.env, PAMDPEnv), (config.high, Selector)]
+    bases += [(low, Learner) for low in config.learners]
     for component, base in bases:
         if component.cls is not None and not issubclass(component.cls, base):
             raise ConfigError(f"{component}: {component.cls.__name__} is no {base.__name__} ({base.__module__})")
@@ -224,7 +256,8 @@ def check_agent_memory(config: Config, specs: PAMDPSpecs, device: torch.device) 
     row = 4 * (2 * specs.observation_dim + specs.num_parameters + 2)
     is_shared = config.run.agent.sharing == "shared"
     needs = {}
-    for component, num in ((config.high, 1), (config.low, 1 if is_shared else max(1, specs.num_options))):
+    lows = [config.low] if is_shared else _learners_of(config, specs)
+    for component, num in ((config.high, 1), *((low, lows.count(low)) for low in lows)):
         for name, value in component.options.items():
             setting = f"{component.group}.{name}={value}"
             if name == "buffer_size":
@@ -270,12 +303,12 @@ def memory_errors_explained(config: Config) -> Iterator[None]:
 
 
 def check_choice(config: Config, env: PAMDPEnv) -> None:
-    """Refuse a needless or a missing selector, and options of a length that the environment does not allow.
+    """Refuse a needless or a missing selector, and options that end where they must not.
 
     Raises:
         ConfigError: with the settings to change.
     """
-    length, freeze = config.run.agent.option_length, config.run.low.freeze
+    termination, freeze = config.run.agent.termination, config.run.low.freeze
     has_selector = config.high.cls is not None
     if has_selector and not env.option_names:
         raise ConfigError(f"{config.high}: {config.env} has no options to choose; use high=none")
@@ -286,25 +319,39 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
     if not has_selector and env.has_choice:
         without = f" or {env.no_choice_setting}" if env.no_choice_setting else ""
         raise ConfigError(f"high=none: {config.env} needs a selector; use another high{without}")
-    if length != "episode" and not (env.has_choice and env.can_change_option):
+    if termination != "episode" and not (env.has_choice and env.can_change_option):
         why = "keeps an option for an episode" if env.has_choice else "has no options"
-        raise ConfigError(f"agent.option_length={length}: {config.env} {why}; use agent.option_length=episode")
+        raise ConfigError(f"agent.termination={termination}: {config.env} {why}; use agent.termination=episode")
     if freeze and not env.has_choice:
         raise ConfigError("low.freeze=true: there is no choice left to learn; use low.freeze=false")
-    if freeze and length != "episode":
+    if freeze and termination != "episode":
         raise ConfigError(
-            f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
+            f"agent.termination={termination}: low.freeze=true plays whole episodes; use agent.termination=episode"
         )
-    if length != "episode" and getattr(config.high.cls, "is_bandit", False):
+    if termination != "episode" and getattr(config.high.cls, "is_bandit", False):
         raise ConfigError(
-            f"agent.option_length={length}: {config.high} is a bandit, which counts what an option pays and nothing of "
-            "what follows it; use agent.option_length=episode, high=meta_critic or high=actor"
+            f"agent.termination={termination}: {config.high} is a bandit, which counts what an option pays and nothing "
+            "of what follows it; use agent.termination=episode, high=meta_critic or high=actor"
         )
-    if length == "learned" and not getattr(config.high.cls, "ends_options", False):
+    if termination == "learned" and not getattr(config.high.cls, "ends_options", False):
         raise ConfigError(
-            f"agent.option_length=learned: {config.high} does not decide where options end; use high=option_critic, "
-            "high=meta_critic or a number of steps"
+            f"agent.termination=learned: {config.high} does not decide where options end; use high=option_critic, "
+            "high=meta_critic or agent.termination=steps"
         )
+
+
+def check_learners_of_options(config: Config, env: PAMDPEnv) -> None:
+    """Refuse learners of options that do not exist, or that share a learner.
+
+    Raises:
+        ConfigError: with the options that there are, or the setting to change.
+    """
+    unknown = [name for name in config.low_of if not env.has_choice or name not in env.option_names]
+    if unknown:
+        known = ", ".join(env.option_names) if env.has_choice else "none to choose"
+        raise ConfigError(f"low.per_option: {config.env} has no option {unknown[0]}; it has {known}")
+    if config.low_of and config.run.agent.sharing == "shared":
+        raise ConfigError("low.per_option: agent.sharing=shared has one learner for all; use agent.sharing=per_option")
 
 
 def check_modes(config: Config) -> None:
@@ -314,18 +361,19 @@ def check_modes(config: Config) -> None:
         ConfigError: with the settings to change.
     """
     mode, has_data = config.run.mode, config.data.cls is not None
-    modes: tuple[str, ...] = getattr(config.low.cls, "modes", ())
     sources = {"train": "its own steps", "offline": "data sets"}
-    learns = f"{config.low} learns from {' and '.join(sources[known] for known in modes)}"
-    if mode == "train" and "train" not in modes:
-        raise ConfigError(f"mode=train: {learns} only; use mode=offline and a data set, or another low")
     if mode == "offline" and not has_data:
         raise ConfigError("mode=offline: data=none leaves nothing to learn from; choose a data set")
-    if mode != "eval" and has_data and "offline" not in modes:
-        raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
+    for low in config.learners:
+        modes: tuple[str, ...] = getattr(low.cls, "modes", ())
+        learns = f"{low} learns from {' and '.join(sources[known] for known in modes)}"
+        if mode == "train" and "train" not in modes:
+            raise ConfigError(f"mode=train: {learns} only; use mode=offline and a data set, or another low")
+        if mode != "eval" and has_data and "offline" not in modes:
+            raise ConfigError(f"{config.data}: {learns} only; use data=none, or another low")
     if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
         raise ConfigError(f"{config.high}: learns from its own choices only; use mode=train, or another high")
-    n_step = config.low.options.get("n_step", 1)
+    n_step = max(low.options.get("n_step", 1) for low in config.learners)
     if mode == "train" and n_step > config.run.steps_per_batch:
         raise ConfigError(
             f"low.n_step={n_step}: must be at most steps_per_batch={config.run.steps_per_batch}, as sums of rewards "

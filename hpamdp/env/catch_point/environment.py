@@ -50,7 +50,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         ValueError: an argument or an action is invalid; the state is unchanged.
     """
 
-    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     parameter_dims = (1, 0)
     target_radius = point_agent.HIT_RADIUS

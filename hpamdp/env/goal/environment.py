@@ -60,7 +60,7 @@ class GoalEnv(CounterEnv[GoalState]):
         ValueError: an argument or an action is invalid; the state is unchanged.
     """
 
-    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    discrete_names: tuple[str, ...] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims: tuple[int, ...] = rules.PARAMETER_DIMS
@@ -167,6 +167,11 @@ class GoalEnv(CounterEnv[GoalState]):
             bias = bias - weights @ ((high + low) / (high - low))
             weights = 2.0 * weights / (high - low)
         return weights, bias
+
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """Carry: the kick to a point; shoot: all shots."""
+        return {"carry": self.discrete_names[:1], "shoot": self.discrete_names[1:]}
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return how episodes `[M]` ended: `success` (a goal), `caught`, `out` and `time_limit`, all bool.

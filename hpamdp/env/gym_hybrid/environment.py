@@ -21,7 +21,7 @@ from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_obser
 class _VehicleEnv(PointEnv[VehicleState]):
     """What Moving and Sliding have in common; see `MovingEnv`."""
 
-    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 0)

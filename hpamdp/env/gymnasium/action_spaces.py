@@ -1,7 +1,7 @@
 """Gymnasium's parameterised action spaces: discrete actions whose parameters lie side by side in one vector.
 
-Accepted are a `Tuple` that begins with a `Discrete(K)`, the discrete actions, and a `Dict` of a `Discrete(K)` and one
-other entry, with any names. The `Discrete` may have any `start`. The parameters are one of these:
+Accepted are a `Tuple` that begins with a `Discrete(K)`, the discrete actions, a `Dict` of a `Discrete(K)` and one other
+entry, with any names, and a `OneOf` of K boxes. The `Discrete` may have any `start`. The parameters are one of these:
 
 - a `Tuple` of K boxes, one for each discrete action: `Tuple(Discrete(K), Tuple(Box, ...))` is the field's convention. A
   discrete action without parameters has a box of shape `(0,)`. In a `Tuple` the K boxes may also follow the `Discrete`
@@ -13,6 +13,10 @@ other entry, with any names. The `Discrete` may have any `start`. The parameters
   copy is passed.
 
 Boxes hold floats with finite bounds, in any shape.
+
+A space may have one more entry, a `Discrete`: the option, which the agent chooses less often than the action. It is the
+entry `option` of a `Dict`, or the entry that `option_key` names. What is left without it has one of the forms above, or
+is a single entry that has.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ from gymnasium import spaces
 
 _ACCEPTED = (
     "accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P, where P is a Tuple or a Dict of K Boxes or "
-    "one Box for all discrete actions, and Tuple(Discrete(K), Box, ..., Box) with K Boxes"
+    "one Box for all discrete actions, Tuple(Discrete(K), Box, ..., Box) with K Boxes, and OneOf(K Boxes)"
 )
 
 
@@ -83,6 +87,8 @@ class ActionSpace:
             values = tuple(_fill(box, parameters[own]) for box, own in zip(self._boxes, self._slices, strict=True))
             if self._box_names is not None:
                 values = dict(zip(self._box_names, values, strict=True))
+        if self._is_one_of:
+            return native_discrete, values[discrete]
         if self._part_names is not None:
             return dict(zip(self._part_names, (native_discrete, values), strict=True))
         return (native_discrete, *values) if self._is_flat else (native_discrete, values)
@@ -92,6 +98,9 @@ class ActionSpace:
         space = self._space
         self._part_names: tuple[str, str] | None = None
         self._is_flat = False
+        self._is_one_of = isinstance(space, spaces.OneOf)
+        if isinstance(space, spaces.OneOf):
+            return spaces.Discrete(len(space.spaces)), spaces.Tuple(space.spaces)
         if isinstance(space, spaces.Dict) and len(space.spaces) == 2:
             # Stable: puts the Discrete first, and keeps the order if both or neither are one.
             names = sorted(space.spaces, key=lambda name: not isinstance(space.spaces[name], spaces.Discrete))
@@ -141,6 +150,75 @@ class ActionSpace:
 
     def _refusal(self, reason: str) -> ValueError:
         return ValueError(f"action space {written(self._space)}: {reason}; {_ACCEPTED}")
+
+
+class OptionSpace:
+    """The entry of an action space that is the option, taken out of it and put back in.
+
+    Args:
+        space: of the environment's actions.
+        option_key: the option's name in a `Dict` or its number in a `Tuple`; None: the entry `option` of a `Dict`.
+
+    Attributes:
+        rest: the space without the option.
+        num_options: how many options there are; 0: the space has none.
+
+    Raises:
+        ValueError: the space has no such entry, or it is no `Discrete`.
+    """
+
+    def __init__(self, space: spaces.Space, option_key: int | str | None = None) -> None:
+        entries: dict[int | str, spaces.Space] = {}
+        if isinstance(space, spaces.Dict):
+            entries.update(space.spaces)
+        elif isinstance(space, spaces.Tuple):
+            entries.update(enumerate(space.spaces))
+        self.rest = space
+        self.num_options = 0
+        self._is_dict = isinstance(space, spaces.Dict)
+        if option_key is None:
+            others = [entry for name, entry in entries.items() if name != "option"]
+            # Where one entry is left, it must be an action by itself; else `option` is the name of the action.
+            if not self._is_dict or len(others) == len(entries) or (len(others) == 1 and not _is_action(others[0])):
+                return
+            option_key = "option"
+        option = entries.pop(option_key, None)
+        if not isinstance(option, spaces.Discrete) or not entries:
+            given = written(space)
+            raise ValueError(
+                f"option_key={option_key}: must name a Discrete beside the action, in the action space {given}"
+            )
+        self._key = option_key
+        self._option = option
+        self._names = list(entries)
+        self.num_options = int(option.n)
+        if len(entries) == 1:
+            (self.rest,) = entries.values()
+        else:
+            self.rest = (
+                spaces.Dict({str(name): entry for name, entry in entries.items()})
+                if self._is_dict
+                else spaces.Tuple(list(entries.values()))
+            )
+
+    def with_option(self, action: Any, option: int) -> Any:
+        """Return an action of the space: one of `rest` with an option, 0 to `num_options` - 1."""
+        native = self._option.dtype.type(self._option.start + option)
+        if self._is_dict:
+            parts = {self._names[0]: action} if len(self._names) == 1 else dict(action)
+            return {**parts, self._key: native}
+        values = [action] if len(self._names) == 1 else list(action)
+        values.insert(int(self._key), native)
+        return tuple(values)
+
+
+def _is_action(space: spaces.Space) -> bool:
+    """Return whether a space holds a discrete action of its own."""
+    if isinstance(space, spaces.Tuple):
+        return any(isinstance(part, spaces.Discrete) for part in space.spaces)
+    if isinstance(space, spaces.Dict):
+        return any(isinstance(part, spaces.Discrete) for part in space.spaces.values())
+    return isinstance(space, spaces.OneOf)
 
 
 def _in_order(names: list[str]) -> list[str]:

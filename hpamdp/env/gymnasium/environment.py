@@ -7,19 +7,19 @@ import importlib
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.data import Binary, Categorical, Composite, Unbounded
 
 from hpamdp import keys
-from hpamdp.env.actions import check_action_values
+from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import PAMDPEnv, ProblemError
-from hpamdp.env.gymnasium.action_spaces import ActionSpace, written
+from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import checked
 from hpamdp.env.gymnasium.four_value import FourValueEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
@@ -36,7 +36,9 @@ class GymnasiumEnv(PAMDPEnv):
 
     `hpamdp.env.gymnasium.action_spaces` and `hpamdp.env.gymnasium.observation_spaces` tell which spaces are accepted
     and how they are converted. Parameters outside their bounds are clipped; those of the chosen action must be finite.
-    The leaf `success` bool `[N]` is `is_success` or `success` in the info of a step, False if it has neither.
+    A space with an option in it, see there, leaves its choice to the agent; the environment may name its options in an
+    attribute `option_names`. The leaf `success` bool `[N]` is `is_success` or `success` in the info of a step, False if
+    it has neither.
 
     A copy's first reset is seeded from `seed` and the copy's number, later resets are not seeded. `reset` also takes
     the seeds to use: a tensordict with `seed` int `[N]`.
@@ -50,8 +52,13 @@ class GymnasiumEnv(PAMDPEnv):
         max_steps: steps after which an episode is truncated; None: the environment's own time limit.
         parameter_dims: how many parameters each discrete action takes of one box for all; None: each takes the whole
             box.
+        option_key: the option's name in a `Dict` of actions, or its number in a `Tuple`; None: the entry `option`, if
+            there is one.
+        action_mask: where the environment says which discrete actions it forbids, and which options, as K numbers that
+            are 0 where one is: `info`: as `action_mask` and `option_mask` in the info of every reset and step;
+            `ignore`: what it says is ignored; None: in the observation, a `Dict`, if it has these entries.
         observation_keys: of a `Tuple` (numbers from 0) or `Dict` (names) of observations, the entries to keep, in this
-            order; None: all.
+            order; None: all but masks.
         observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
         device: of the tensors.
         seed: of the episodes, see above.
@@ -73,6 +80,8 @@ class GymnasiumEnv(PAMDPEnv):
         kwargs: dict[str, Any] | None = None,
         max_steps: int | None = None,
         parameter_dims: list[int] | None = None,
+        option_key: int | str | None = None,
+        action_mask: Literal["info", "ignore"] | None = None,
         observation_keys: list[int | str] | None = None,
         observation_scaling: Scaling = "bounds",
         device: torch.device | str | None = "cpu",
@@ -92,11 +101,17 @@ class GymnasiumEnv(PAMDPEnv):
             raise ValueError(f"{self._name}: has no time limit of its own; set env.max_steps")
         self.max_steps = limit
         try:
-            self._actions = ActionSpace(self.envs[0].action_space, parameter_dims)
+            self._options = OptionSpace(self.envs[0].action_space, option_key)
+            self._actions = ActionSpace(self._options.rest, parameter_dims)
+            self._place_masks(action_mask)
+            if self._mask_source == "observation" and observation_keys is None:
+                space = self.envs[0].observation_space
+                observation_keys = [name for name in getattr(space, "spaces", {}) if name not in self._masks]
             self.observations = ObservationSpace(self.envs[0].observation_space, observation_scaling, observation_keys)
         except ValueError as error:
             raise ValueError(f"{self._name}: {error}") from error
         self.parameter_dims = self._actions.parameter_dims
+        self.option_names = self._names_of_options()
         self._make_specs()
         self._observation = np.zeros((num_envs, self.observations.dim), np.float32)
         self._terminated = np.zeros(num_envs, bool)
@@ -109,6 +124,11 @@ class GymnasiumEnv(PAMDPEnv):
     def is_shardable(self) -> bool:
         """Whether no running statistics are kept, which all environments must share."""
         return self.observations.statistics is None
+
+    @property
+    def title(self) -> str:
+        """The class and what it was made from."""
+        return self._name
 
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return seeds to `reset` with, one for each copy, from another stream than those of training."""
@@ -200,6 +220,43 @@ class GymnasiumEnv(PAMDPEnv):
             raise ValueError(f"{self._name}: there is no class or function {name} in {module_name}")
         return entry
 
+    def _place_masks(self, action_mask: str | None) -> None:
+        """Note where masks come from, and make room for them: `[N, K]` each."""
+        if action_mask not in (None, "info", "ignore"):
+            raise ValueError(f"action_mask={action_mask}: must be info, ignore or null")
+        sizes = {keys.ACTION_MASK: len(self._actions.parameter_dims), keys.OPTION_MASK: self._options.num_options}
+        sizes = {name: size for name, size in sizes.items() if size > 0}
+        if action_mask is None:
+            space = self.envs[0].observation_space
+            entries = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {}
+            sizes = {name: size for name, size in sizes.items() if name in entries}
+        self._mask_source = "observation" if action_mask is None and sizes else action_mask
+        if action_mask == "ignore":
+            sizes = {}
+        self._masks = {name: np.ones((self.num_envs, size), bool) for name, size in sizes.items()}
+
+    def _names_of_options(self) -> tuple[str, ...]:
+        num_options = self._options.num_options
+        names = tuple(map(str, getattr(self.envs[0].unwrapped, "option_names", ())))
+        return names if num_options and len(names) == num_options else tuple(f"option{i}" for i in range(num_options))
+
+    def _keep_masks(self, row: int, observation: Any, info: Mapping[str, Any]) -> None:
+        """Keep the masks that one copy gives with its observation or its info."""
+        if self._mask_source is None and keys.ACTION_MASK in info:
+            raise ProblemError(
+                "gave an action_mask in its info; set env.action_mask=info to honour it, or env.action_mask=ignore"
+            )
+        source = observation if self._mask_source == "observation" else info
+        for name, masks in self._masks.items():
+            given = source.get(name)
+            if given is None and name == keys.OPTION_MASK:
+                masks[row] = True
+                continue
+            mask = np.asarray(given)
+            if mask.shape != masks[row].shape or mask.dtype.kind not in "iubf":
+                raise ProblemError(f"gave {given!r} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
+            masks[row] = mask != 0
+
     def _make_specs(self) -> None:
         n = self.num_envs
         device = self.device
@@ -210,9 +267,12 @@ class GymnasiumEnv(PAMDPEnv):
             },
             shape=(n,),
         )
+        for name, masks in self._masks.items():
+            size = masks.shape[1]
+            self.observation_spec[name] = Binary(size, shape=(n, size), dtype=torch.bool, device=device)
         low = torch.from_numpy(self._actions.low)
         high = torch.from_numpy(self._actions.high)
-        self.action_spec = self.make_action_spec(low, high)
+        self.action_spec = self.make_action_spec(low, high, has_option=self._options.num_options > 0)
         self.reward_spec = Unbounded(shape=(n, 1), device=device)
         self.done_spec = self.make_done_spec()
 
@@ -233,8 +293,9 @@ class GymnasiumEnv(PAMDPEnv):
             seed = self._next_seeds[row] if given is None else given[row].item()
             self._next_seeds[row] = None
             with self._problem_of(row):
-                observation, _ = self.envs[row].reset(seed=seed)
+                observation, info = self.envs[row].reset(seed=seed)
                 observations.append(self.observations.flat(observation))
+                self._keep_masks(row, observation, info)
         self._keep(rows, observations)
         self._terminated[rows] = False
         self._truncated[rows] = False
@@ -246,6 +307,7 @@ class GymnasiumEnv(PAMDPEnv):
         check_action_values(tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS), self.parameter_dims)
         discrete = tensordict.get(keys.DISCRETE).tolist()
         parameters = tensordict.get(keys.PARAMETERS).detach().cpu().numpy()
+        options = self._read_options(tensordict)
         is_running = ~(self._terminated | self._truncated)
         if "_step" in tensordict.keys():
             is_running &= np.isin(np.arange(self.num_envs), _rows(tensordict.get("_step")))
@@ -254,9 +316,12 @@ class GymnasiumEnv(PAMDPEnv):
         rewards = np.zeros((self.num_envs, 1), np.float32)
         for row in rows:
             action = self._actions.to_native(discrete[row], parameters[row])
+            if options is not None:
+                action = self._options.with_option(action, options[row])
             with self._problem_of(row):
                 observation, reward, terminated, truncated, info = self.envs[row].step(action)
                 observations.append(self.observations.flat(observation))
+                self._keep_masks(row, observation, info)
             rewards[row] = reward
             self._terminated[row] = terminated
             self._truncated[row] = truncated and not terminated
@@ -265,6 +330,17 @@ class GymnasiumEnv(PAMDPEnv):
             self._success[row] = bool(success)
         self._keep(rows, observations)
         return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device))
+
+    def _read_options(self, tensordict: TensorDictBase) -> list[int] | None:
+        """Return the options, checked; None where the environment itself has none."""
+        num_options = self._options.num_options
+        if num_options == 0:
+            return None
+        options = tensordict.get(keys.OPTION).tolist()
+        for row, option in enumerate(options):
+            if not 0 <= option < num_options:
+                raise invalid_action(row, {keys.OPTION: (option, f"allowed 0 to {num_options - 1}")})
+        return options
 
     @contextmanager
     def _problem_of(self, row: int) -> Iterator[None]:
@@ -283,13 +359,14 @@ class GymnasiumEnv(PAMDPEnv):
         leaves = {
             keys.OBSERVATION: self._observation,
             _SUCCESS: self._success,
+            **self._masks,
             keys.TERMINATED: self._terminated[:, None],
             keys.TRUNCATED: self._truncated[:, None],
             keys.DONE: (self._terminated | self._truncated)[:, None],
         }
         # torch.tensor copies, so that the next step does not change what was returned.
         tensors = {name: torch.tensor(leaf, device=self.device) for name, leaf in leaves.items()}
-        return TensorDict(tensors, batch_size=self.batch_size, device=self.device)
+        return self.check_masks(TensorDict(tensors, batch_size=self.batch_size, device=self.device))
 
 
 def _check_arguments(num_envs: int, id: str | None, entry_point: str | None, max_steps: int | None) -> None:

@@ -97,6 +97,18 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         return point_agent.observation_bounds(self.max_steps)
 
     @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """The quadrant that a set pushes to with a positive parameter; sets that push nowhere are in the first."""
+        x, y = self._motions.unbind(-1)
+        quadrants = {
+            "north_east": (x >= 0) & (y >= 0),
+            "north_west": (x < 0) & (y >= 0),
+            "south_west": (x < 0) & (y < 0),
+            "south_east": (x >= 0) & (y < 0),
+        }
+        return {name: is_in.nonzero().squeeze(-1).tolist() for name, is_in in quadrants.items()}
+
+    @property
     def symmetries(self) -> Symmetries:
         """Turns by the angle between two actuators and their mirrors.
 

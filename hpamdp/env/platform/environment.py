@@ -43,7 +43,7 @@ class PlatformEnv(CounterEnv[PlatformState]):
         ValueError: an argument or an action is invalid; the state is unchanged.
     """
 
-    discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
+    discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 1)
@@ -71,6 +71,11 @@ class PlatformEnv(CounterEnv[PlatformState]):
         )
         self.noise = noise
         self._use_kernel(kernel.advance, PlatformEnv, [noise])
+
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """Run and jump."""
+        return {"run": ["run"], "jump": ["hop", "leap"]}
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return constants: run 3, hop 10, leap 400."""

@@ -29,6 +29,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import masked_logits
 from hpamdp.policies.shared.networks import mlp, sample_index
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.specs import PAMDPSpecs
@@ -36,6 +37,7 @@ from hpamdp.specs import PAMDPSpecs
 # Of the held option at its decision, float32 [*B] each.
 LOG_PROB = "option_log_prob"  # by the policy, also where the option was chosen uniformly
 WEIGHT = "option_weight"  # its probability by the policy over the one with which it was chosen
+ALLOWED = "option_allowed"  # the options that could be chosen there, bool [*B, num_options], if not always all of them
 
 
 class Actor(OnPolicy, Selector):
@@ -68,7 +70,7 @@ class Actor(OnPolicy, Selector):
         max_grad_norm: PositiveFloat,
     ) -> None:
         super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
-        self.out_keys = [*self.out_keys, LOG_PROB, WEIGHT]
+        self.out_keys = [*self.out_keys, LOG_PROB, WEIGHT, *([ALLOWED] if specs.has_option_mask else [])]
         self.gamma = gamma
         self.entropy = entropy
         self.logits = mlp(specs.observation_dim, hidden_dims, specs.num_options)
@@ -82,18 +84,29 @@ class Actor(OnPolicy, Selector):
 
         The options are the most likely ones if the policy is greedy, else samples.
         """
-        log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
+        log_probs = self._log_probs(td)
         option = log_probs.argmax(-1) if is_greedy() else sample_index(log_probs)
         log_prob = log_probs.gather(-1, option.unsqueeze(-1)).squeeze(-1)
-        return {keys.OPTION: option, LOG_PROB: log_prob, WEIGHT: torch.ones_like(log_prob)}
+        chosen = {keys.OPTION: option, LOG_PROB: log_prob, WEIGHT: torch.ones_like(log_prob)}
+        return {**chosen, **self._allowed(td)}
 
     @torch.no_grad()
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return uniformly random options, the policy's log-probabilities and the weights, `[*B]` each."""
         chosen = super().choose_uniformly(td)
-        log_probs = self.logits(td.get(keys.OBSERVATION)).log_softmax(-1)
+        log_probs = self._log_probs(td)
         log_prob = log_probs.gather(-1, chosen[keys.OPTION].unsqueeze(-1)).squeeze(-1)
-        return {**chosen, LOG_PROB: log_prob, WEIGHT: log_prob.exp() * self.specs.num_options}
+        mask = td.get(keys.OPTION_MASK, None)
+        num_allowed = self.specs.num_options if mask is None else mask.sum(-1)
+        return {**chosen, LOG_PROB: log_prob, WEIGHT: log_prob.exp() * num_allowed, **self._allowed(td)}
+
+    def _log_probs(self, td: TensorDictBase) -> Tensor:
+        """Return the policy's log-probabilities `[*B, num_options]`."""
+        logits = masked_logits(self.logits(td.get(keys.OBSERVATION)), td.get(keys.OPTION_MASK, None))
+        return logits.log_softmax(-1)
+
+    def _allowed(self, td: TensorDictBase) -> dict[str, Tensor]:
+        return {ALLOWED: td.get(keys.OPTION_MASK).clone()} if self.specs.has_option_mask else {}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
@@ -115,11 +128,13 @@ class Actor(OnPolicy, Selector):
             "weight": decisions.get(WEIGHT),
             "target": after.get(keys.OPTION_RETURN).squeeze(-1) + self.next_discount(decisions) * next_value,
         }
+        if self.specs.has_option_mask:
+            rows["allowed"] = decisions.get(ALLOWED)
         return TensorDict(rows, batch_size=decisions.shape)
 
     def _update(self, rows: TensorDictBase) -> dict[str, Tensor]:
         """Make one update from decisions `[B]`; return scalars to log."""
-        log_probs = self.logits(rows["state"]).log_softmax(-1)
+        log_probs = masked_logits(self.logits(rows["state"]), rows.get("allowed", None)).log_softmax(-1)
         log_prob = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
         surrogate = (rows["weight"] * self.surrogate(log_prob - rows["log_prob"], rows["advantage"])).mean()
         entropy = -(log_probs.exp() * log_probs).sum(-1).mean()

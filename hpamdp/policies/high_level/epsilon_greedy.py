@@ -13,6 +13,7 @@ from torch import Tensor
 
 from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
 from hpamdp.policies.shared.fractions import Fraction
+from hpamdp.policies.shared.masks import random_choice
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -41,11 +42,13 @@ class EpsilonGreedy(Bandit):
         self.epsilon_scale = epsilon_scale
         self.epsilon_final = epsilon_final
 
-    def sample(self, num: int) -> Tensor:
-        """Return `num` choices; all are random as long as an option is untried."""
+    def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
+        """Return `num` choices; all are random as long as an allowed option is untried."""
         device = self.statistics.counts.device
         time = self.num_decisions + self.pending.sum() + torch.arange(1, num + 1, device=device)
         epsilon = (self.epsilon_scale / time).clamp(self.epsilon_final, 1.0)
         is_random = torch.rand(num, device=device) < epsilon
-        anything = torch.randint(self.specs.num_options, (num,), device=device)
-        return torch.where(is_random | self.statistics.is_untried.any(), anything, self.best())
+        mask = None if allowed is None else allowed.expand(num, -1)
+        anything = random_choice(torch.Size([num]), self.specs.num_options, mask, device)
+        is_untried = self.statistics.is_untried if allowed is None else self.statistics.is_untried & allowed
+        return torch.where(is_random | is_untried.any(), anything, self.best(allowed))

@@ -20,6 +20,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, RewardStatistics
 from hpamdp.policies.shared.fractions import PositiveFraction
+from hpamdp.policies.shared.masks import masked_values
 from hpamdp.specs import PAMDPSpecs
 
 PROBABILITY = "option_probability"  # of the held option at its decision, float32 [*B]
@@ -63,26 +64,34 @@ class Exp3(Bandit):
         weights = (self.exploration / num * self.gains.sums).softmax(0)
         return (1.0 - self.exploration) * weights + self.exploration / num
 
-    def best(self) -> int:
-        """Return the option with the largest weight."""
-        return int(self.gains.sums.argmax())
+    def best(self, allowed: Tensor | None = None) -> int:
+        """Return the option with the largest weight, among the allowed ones."""
+        return int(masked_values(self.gains.sums, allowed).argmax())
 
-    def sample(self, num: int) -> Tensor:
-        """Return `num` choices."""
+    def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
+        """Return `num` choices, with the probabilities of the allowed options in proportion."""
         if num == 0:  # which `multinomial` refuses
             return torch.zeros(0, dtype=torch.long, device=self.gains.sums.device)
-        return self.probabilities.multinomial(num, replacement=True)
+        probabilities = self.probabilities if allowed is None else self.probabilities * allowed
+        return probabilities.multinomial(num, replacement=True)
 
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return the options and the probabilities they were chosen with, `[*B]` each."""
         option = self.select(td)
-        return {keys.OPTION: option, PROBABILITY: self.probabilities.float()[option]}
+        probability = self.probabilities.float()[option]
+        mask = td.get(keys.OPTION_MASK, None)
+        if mask is not None:
+            probability = probability / (self.probabilities.float() * mask).sum(-1)
+        return {keys.OPTION: option, PROBABILITY: probability}
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return uniformly random options and their probabilities, `[*B]` each."""
         chosen = super().choose_uniformly(td)
         uniform = 1.0 / self.specs.num_options
         chosen[PROBABILITY] = torch.full_like(chosen[keys.OPTION], uniform, dtype=torch.float32)
+        mask = td.get(keys.OPTION_MASK, None)
+        if mask is not None:
+            chosen[PROBABILITY] = 1.0 / mask.sum(-1)
         return chosen
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:

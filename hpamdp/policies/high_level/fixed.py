@@ -8,11 +8,12 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
+from hpamdp.policies.shared.masks import allowed_or_first
 from hpamdp.specs import PAMDPSpecs
 
 
 class Fixed(Selector):
-    """Choose the same option at every decision.
+    """Choose the same option at every decision; the first allowed one where it is forbidden.
 
     Args:
         specs: of the problem.
@@ -31,4 +32,6 @@ class Fixed(Selector):
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the option for every environment, int64 `[*B]`."""
-        return torch.full_like(td.get(keys.IS_DECISION).squeeze(-1), self.option, dtype=torch.long)
+        option = torch.full_like(td.get(keys.IS_DECISION).squeeze(-1), self.option, dtype=torch.long)
+        mask = td.get(keys.OPTION_MASK, None)
+        return option if mask is None else allowed_or_first(option, mask)

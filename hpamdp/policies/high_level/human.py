@@ -24,4 +24,6 @@ class Human(Selector):
     def select(self, td: TensorDictBase) -> Tensor:
         """Return samples, int64 `[*B]`, from the human probabilities `[*B, num_options]`."""
         probabilities = td.get(keys.HUMAN_OPTION)
+        mask = td.get(keys.OPTION_MASK, None)
+        probabilities = probabilities if mask is None else (probabilities + 1e-9) * mask
         return probabilities.flatten(0, -2).multinomial(1).reshape(probabilities.shape[:-1])

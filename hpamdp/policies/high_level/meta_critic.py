@@ -26,6 +26,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import masked_values
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.portable import portable_ensemble
 from hpamdp.policies.shared.replay import linear_schedule
@@ -117,6 +118,7 @@ class MetaCritic(Selector):
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the choices `[*B]`: the highest mean Q if the policy is greedy, else exploring."""
         observation = td.get(keys.OBSERVATION)
+        mask = td.get(keys.OPTION_MASK, None)
         q = self.critics(observation.flatten(0, -2))
         value = q.mean(0)
         if not is_greedy():
@@ -124,13 +126,14 @@ class MetaCritic(Selector):
                 value = value + self.ucb_width * q.std(0, correction=0)
             is_random = torch.rand_like(value[:, :1]) < self.epsilon
             value = torch.where(is_random, torch.rand_like(value), value)
+        value = masked_values(value, None if mask is None else mask.flatten(0, -2))
         return value.argmax(-1).reshape(observation.shape[:-1])
 
     @torch.no_grad()
     def ends(self, td: TensorDictBase) -> Tensor:
         """Return where another option is worth more than the held one, bool `[*B]`."""
         value = self.critics(td.get(keys.OBSERVATION).flatten(0, -2)).mean(0).reshape(*td.batch_size, -1)
-        return value.argmax(-1) != td.get(keys.OPTION)
+        return masked_values(value, td.get(keys.OPTION_MASK, None)).argmax(-1) != td.get(keys.OPTION)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions and, after the warm-up, make the updates that are due."""
@@ -162,13 +165,16 @@ class MetaCritic(Selector):
             "next_state": after.get(keys.OBSERVATION),
             "discount": self.next_discount(decisions),
         }
+        if self.specs.has_option_mask:
+            rows["next_option_mask"] = after.get(keys.OPTION_MASK)
         return TensorDict(rows, batch_size=decisions.shape)
 
     def _update(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the critics from decisions `[batch_size]`; return the loss."""
         q = self.critics(rows["state"])
         with torch.no_grad():
-            next_value = self.target_critics(rows["next_state"]).mean(0).amax(-1)
+            next_q = self.target_critics(rows["next_state"]).mean(0)
+            next_value = masked_values(next_q, rows.get("next_option_mask", None)).amax(-1)
             target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
             is_chosen = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)
             # Each member sees a random half of the decisions, which keeps the members apart.

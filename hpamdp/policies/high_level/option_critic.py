@@ -1,6 +1,6 @@
 """Option-critic: values of options, learned within them, and terminations that follow the gradient of these values.
 
-With `agent.option_length=learned`, the held option o ends in state s with the learned probability beta(s, o), and the
+With `agent.termination=learned`, the held option o ends in state s with the learned probability beta(s, o), and the
 next one is chosen epsilon-greedily by Q(s, o). Any learner can be the policy within the options.
 
 Source: Bacon, Harb and Precup 2017, *The Option-Critic Architecture*, arXiv 1609.05140, algorithm 1 and theorem 2;
@@ -29,6 +29,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import masked_values, random_choice
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.replay import linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -125,16 +126,20 @@ class OptionCritic(Selector):
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the choices `[*B]`: the highest Q if the policy is greedy, else a random option at times."""
-        best = self.critic(td.get(keys.OBSERVATION)).argmax(-1)
+        mask = td.get(keys.OPTION_MASK, None)
+        best = masked_values(self.critic(td.get(keys.OBSERVATION)), mask).argmax(-1)
         if is_greedy():
             return best
         is_random = torch.rand(best.shape, device=best.device) < self.epsilon
-        return torch.where(is_random, torch.randint_like(best, self.specs.num_options), best)
+        return torch.where(is_random, random_choice(best.shape, self.specs.num_options, mask, best.device), best)
 
     @torch.no_grad()
     def ends(self, td: TensorDictBase) -> Tensor:
-        """Return where the held option ends, bool `[*B]`: sampled, or where it is likely if the policy is greedy."""
-        beta = self._beta(td.get(keys.OBSERVATION), td.get(keys.OPTION))
+        """Return where the held option ends, bool `[*B]`: sampled, or where it is likely if the policy is greedy.
+
+        It does where it is forbidden.
+        """
+        beta = self._beta(td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None))
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
@@ -168,11 +173,20 @@ class OptionCritic(Selector):
             "discount": self.gamma * ~done,
             "is_ended": after.get(keys.OPTION_ENDED).squeeze(-1) if keys.OPTION_ENDED in after.keys() else done,
         }
+        if self.specs.has_option_mask:
+            rows["next_option_mask"] = after.get(keys.OPTION_MASK)
         return TensorDict(rows, batch_size=batch.shape)
 
-    def _beta(self, state: Tensor, option: Tensor) -> Tensor:
-        """Return the probabilities `[*B]` that the options `[*B]` end in states `[*B, observation_dim]`."""
-        return self.termination(state).gather(-1, option.unsqueeze(-1)).squeeze(-1).sigmoid()
+    def _beta(self, state: Tensor, option: Tensor, mask: Tensor | None) -> Tensor:
+        """Return the probabilities `[*B]` that options end: 1 where they are forbidden.
+
+        Args:
+            state: where, `[*B, observation_dim]`.
+            option: `[*B]`.
+            mask: the options that may be chosen, bool `[*B, num_options]`; None: all.
+        """
+        beta = self.termination(state).gather(-1, option.unsqueeze(-1)).squeeze(-1).sigmoid()
+        return beta if mask is None else torch.where(mask.gather(-1, option.unsqueeze(-1)).squeeze(-1), beta, 1.0)
 
     def _target(self, rows: TensorDictBase) -> Tensor:
         """Return r + discount ((1 - beta) Q'(s', o) + beta max Q'(s', .)), `[B]`.
@@ -182,8 +196,11 @@ class OptionCritic(Selector):
         with torch.no_grad():
             q = self.target_critic(rows["next_state"])
             held = q.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
-            beta = self._beta(rows["next_state"], rows["option"]) if self.decides_ends else rows["is_ended"].float()
-            following = held.lerp(q.amax(-1), beta)
+            mask = rows.get("next_option_mask", None)
+            beta = rows["is_ended"].float()
+            if self.decides_ends:
+                beta = self._beta(rows["next_state"], rows["option"], mask)
+            following = held.lerp(masked_values(q, mask).amax(-1), beta)
             return rows["reward"] + rows["discount"] * following
 
     def _update_critic(self, rows: TensorDictBase) -> Tensor:
@@ -202,11 +219,12 @@ class OptionCritic(Selector):
         Args:
             rows: steps `[batch_size]`.
         """
-        state, option = rows["next_state"], rows["option"]
+        state, option, mask = rows["next_state"], rows["option"], rows.get("next_option_mask", None)
         with torch.no_grad():
             q = self.critic(state)
-            advantage = q.gather(-1, option.unsqueeze(-1)).squeeze(-1) - q.amax(-1) + self.deliberation_cost
-        beta = self._beta(state, option)
+            best = masked_values(q, mask).amax(-1)
+            advantage = q.gather(-1, option.unsqueeze(-1)).squeeze(-1) - best + self.deliberation_cost
+        beta = self._beta(state, option, mask)
         loss = (beta * advantage * (rows["discount"] > 0.0)).mean()
         self.optimizers["termination"].zero_grad(set_to_none=True)
         loss.backward()

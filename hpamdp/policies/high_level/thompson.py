@@ -13,6 +13,7 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
+from hpamdp.policies.shared.masks import masked_values
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -37,11 +38,11 @@ class Thompson(Bandit):
         super().__init__(specs, memory, discount, window)
         self.exploration = exploration
 
-    def sample(self, num: int) -> Tensor:
+    def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
         """Return `num` choices, each from samples of its own."""
         statistics = self.statistics
         noise = torch.randn(num, self.specs.num_options, dtype=torch.float64, device=statistics.counts.device)
         deviation = self.exploration * statistics.deviation / statistics.counts.clamp(min=1e-9).sqrt()
         sampled_means = statistics.means + deviation * noise
         # Untried options come first, in random order.
-        return torch.where(statistics.is_untried, 1e9 + noise, sampled_means).argmax(-1)
+        return masked_values(torch.where(statistics.is_untried, 1e9 + noise, sampled_means), allowed).argmax(-1)

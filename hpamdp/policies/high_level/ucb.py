@@ -43,7 +43,7 @@ class UCB(Bandit):
         super().__init__(specs, memory, discount, window)
         self.exploration = exploration
 
-    def sample(self, num: int) -> Tensor:
+    def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
         """Return `num` choices made one after another, in random order."""
         statistics = self.statistics
         chosen_before = statistics.counts + self.pending
@@ -56,5 +56,7 @@ class UCB(Bandit):
         # bounds[i, j] is the bound of option i after j of these choices. It falls with j, so choosing the highest bound
         # `num` times in a row means choosing the `num` highest bounds.
         bounds = means.unsqueeze(-1) + self.exploration * statistics.deviation * width
+        if allowed is not None:
+            bounds = bounds.masked_fill(~allowed.unsqueeze(-1), -torch.inf)
         chosen = bounds.flatten().topk(num).indices // num
         return chosen[torch.randperm(num, device=chosen.device)]

@@ -70,7 +70,7 @@ class BC(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Make one step up the log-likelihood of transitions `[batch_size]`; return scalars."""
-        distribution: HybridDistribution = self.actor(sample["state"])
+        distribution: HybridDistribution = self.actor(sample["state"], self.allowed(sample))
         discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
         self.optimizer_step("actor", -(discrete_log_prob + parameter_log_prob).mean())
         return {"discrete_log_prob": discrete_log_prob.mean(), "parameter_log_prob": parameter_log_prob.mean()}

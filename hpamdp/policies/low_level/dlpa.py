@@ -40,12 +40,16 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 FractionBelowOne = Annotated[float, Field(ge=0.0, lt=1.0)]
 Form = Literal["parallel", "masking", "sequential"]
+
+# What the model learns from; beside it, where a step's window goes on.
+_STORED = ("state", "discrete", "unit", "reward", "next_state")
 
 _CHUNK_ROWS = 4096  # states predicted at once when planning: fits the cache and bounds the memory
 
@@ -116,14 +120,30 @@ class Planner:
         self.precision: torch.dtype = getattr(torch, precision)
 
     @torch.no_grad()
-    def plan(self, state: Tensor) -> Plan:
-        """Return the final distributions for states `[N, observation_dim]`."""
-        plans = [self._plan(rows) for rows in state.split(max(1, _CHUNK_ROWS // self.num_samples))]
+    def plan(self, state: Tensor, action_mask: Tensor | None = None) -> Plan:
+        """Return the final distributions for states `[N, observation_dim]`.
+
+        Args:
+            state: where the plans begin.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything. What it will
+                allow in predicted states is unknown, and taken to be everything.
+        """
+        size = max(1, _CHUNK_ROWS // self.num_samples)
+        masks = [None] * len(state) if action_mask is None else action_mask.split(size)
+        plans = [self._plan(rows, mask) for rows, mask in zip(state.split(size), masks, strict=False)]
         return Plan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
 
-    def _plan(self, state: Tensor) -> Plan:
+    def _plan(self, state: Tensor, action_mask: Tensor | None) -> Plan:
         shape = state.shape[0], self.horizon
         probability = state.new_full((*shape, self.specs.num_discrete), 1.0 / self.specs.num_discrete)
+        later = self.specs.allowed(state)
+        if later is not None:
+            probability = probability * later.unsqueeze(1)
+        if action_mask is not None:
+            probability[:, 0] *= action_mask
+        if later is not None or action_mask is not None:
+            # The iterations never leave these actions: what is not sampled is no elite.
+            probability = probability / probability.sum(-1, keepdim=True)
         mean = state.new_zeros(*shape, self.specs.num_parameters)
         plan = Plan(probability, mean, torch.ones_like(mean))
         for _ in range(self.num_iterations):
@@ -204,7 +224,10 @@ class DLPAPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).flatten(0, -2)
-        discrete = torch.randint(self.specs.num_discrete, state.shape[:1], device=state.device)
+        mask = td.get(keys.ACTION_MASK, None)
+        mask = None if mask is None else mask.flatten(0, -2)
+        allowed = self.specs.allowed(state, mask)
+        discrete = random_choice(state.shape[:1], self.specs.num_discrete, allowed, state.device)
         unit = 2.0 * torch.rand(state.shape[0], self.specs.num_parameters, device=state.device) - 1.0
         is_planned = self.is_trained.expand(state.shape[0])
         done = td.get(keys.DONE, None)
@@ -214,14 +237,15 @@ class DLPAPolicy(TensorDictModuleBase):
         if exploring:
             is_planned = is_planned & (torch.rand(state.shape[0], device=state.device) >= self.epsilon)
         if is_planned.any():
-            discrete[is_planned], unit[is_planned] = self.first_action(state[is_planned], exploring)
+            mask = None if mask is None else mask[is_planned]
+            discrete[is_planned], unit[is_planned] = self.first_action(state[is_planned], exploring, mask)
         shape = td.batch_size
         parameters = self.specs.from_unit(unit).reshape(*shape, self.specs.num_parameters)
         return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": parameters}})
 
-    def first_action(self, state: Tensor, exploring: bool) -> tuple[Tensor, Tensor]:
+    def first_action(self, state: Tensor, exploring: bool, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the discrete action `[N]` and the parameters `[N, num_parameters]` in [-1, 1] of the first step."""
-        probability, mean, deviation = (part[:, 0] for part in self.planner.plan(state))
+        probability, mean, deviation = (part[:, 0] for part in self.planner.plan(state, action_mask))
         if not exploring:
             return probability.argmax(-1), mean
         unit = mean + deviation * torch.randn_like(mean)
@@ -303,7 +327,7 @@ class DLPA(ReplayLearner):
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`."""
-        rows = super().transitions(batch).exclude("discount", "option_ended", "option", "next_option")
+        rows = super().transitions(batch).select(*_STORED)
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:

@@ -57,7 +57,9 @@ class HPPOPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters `[*B, num_parameters]` and what their ratios need."""
-        distribution: HybridDistribution = self.actor(td.get(keys.OBSERVATION))
+        observation = td.get(keys.OBSERVATION)
+        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        distribution: HybridDistribution = self.actor(observation, allowed)
         discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
         discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, raw)
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
@@ -175,7 +177,7 @@ class HPPO(OnPolicy, Learner):
             )
         return advantage.squeeze(-1), target.squeeze(-1)
 
-    def value(self, observation: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return V(s), `[N]`."""
         return self.critic(observation).squeeze(-1)
 
@@ -186,14 +188,17 @@ class HPPO(OnPolicy, Learner):
             return next_value
         is_ended = option_ended.squeeze(-1) & mask
         next_observation = batch.get(("next", keys.OBSERVATION))[is_ended]
-        value = self.following.value(next_observation, batch.get(keys.NEXT_OPTION)[is_ended])
+        masks = [batch.get(("next", keys.ACTION_MASK))[is_ended]] if self.specs.has_action_mask else []
+        value = self.following.value(next_observation, batch.get(keys.NEXT_OPTION)[is_ended], *masks)
         return next_value.index_put((is_ended,), value.unsqueeze(-1))
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what an update needs of the rows in `mask`, `[N]`."""
         advantage, target = self.advantages(batch, mask)
+        masks = {keys.ACTION_MASK: batch.get(keys.ACTION_MASK)[mask]} if self.specs.has_action_mask else {}
         return TensorDict(
             {
+                **masks,
                 keys.OBSERVATION: batch.get(keys.OBSERVATION)[mask],
                 "discrete": batch.get(keys.DISCRETE)[mask],
                 RAW: batch.get(RAW)[mask],
@@ -207,7 +212,8 @@ class HPPO(OnPolicy, Learner):
 
     def _update(self, rows: TensorDictBase, entropy_weight: float) -> dict[str, Tensor]:
         """Make one optimisation step of actors and critic from a minibatch `[B]`; return scalars."""
-        distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION])
+        allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
+        distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION], allowed)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
         discrete_log_ratio = discrete_log_prob - rows[DISCRETE_LOG_PROB]
         parameter_log_ratio = parameter_log_prob - rows[PARAMETER_LOG_PROB]

@@ -36,6 +36,7 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridDistribution
+from hpamdp.policies.shared.masks import masked_logits, random_choice
 from hpamdp.policies.shared.networks import HybridCritics, InitialLayer, InitialParameters, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
@@ -69,12 +70,17 @@ class HSACActor(nn.Module):
         self.initial.shrink(self.net[-1], means)
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
-    def forward(self, state: Tensor) -> HybridDistribution:
-        """Return the distribution of the action for states `[*B, observation_dim]`."""
+    def forward(self, state: Tensor, mask: Tensor | None = None) -> HybridDistribution:
+        """Return the distribution of the action for states `[*B, observation_dim]`.
+
+        Args:
+            state: the observations.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
+        """
         logits, mean, raw_scale = self.net(state).split(self.sizes, -1)
         mean = mean + self.initial(state)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
-        return HybridDistribution(logits.log_softmax(-1), mean, log_scale, self.owner)
+        return HybridDistribution(masked_logits(logits, mask).log_softmax(-1), mean, log_scale, self.owner)
 
 
 class HSACPolicy(TensorDictModuleBase):
@@ -93,10 +99,12 @@ class HSACPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
-        distribution: HybridDistribution = self.actor(td.get(keys.OBSERVATION))
+        observation = td.get(keys.OBSERVATION)
+        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        distribution: HybridDistribution = self.actor(observation, allowed)
         if self.is_random and not is_greedy():
             unit = 2.0 * torch.rand_like(distribution.mean) - 1.0
-            discrete = torch.randint(self.specs.num_discrete, unit.shape[:-1], device=unit.device)
+            discrete = random_choice(unit.shape[:-1], self.specs.num_discrete, allowed, unit.device)
         else:
             discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
             unit = raw.tanh()
@@ -150,7 +158,8 @@ class HSAC(ReplayLearner):
             updates_per_frame=updates_per_frame,
             augment=augment,
         )
-        self.discrete_target_entropy = discrete_target_entropy * math.log(specs.num_discrete)
+        self.discrete_target_entropy = discrete_target_entropy
+        self.most_discrete_entropy = math.log(specs.num_discrete)
         self.parameter_target_entropy = parameter_target_entropy
         self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
         self.policy_delay = policy_delay
@@ -182,14 +191,21 @@ class HSAC(ReplayLearner):
         """Return the weights of the discrete entropy and of the parameters' entropy, without gradients."""
         return self.log_discrete_temperature.detach().exp(), self.log_parameter_temperature.detach().exp()
 
-    def soft_value(self, critics: HybridCritics, state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def soft_value(
+        self, critics: HybridCritics, state: Tensor, allowed: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the soft value V of states `[B, observation_dim]`, and both entropies minus their targets, each `[B]`.
 
         V = sum_k pi(k) [min Q(k, x_k) - a log pi(k) - b log pi(x_k)] with sampled x_k and temperatures a and b. The
         expectation over discrete actions is exact; the parameters' entropy is that of the executed action's own.
+
+        Args:
+            critics: that say Q.
+            state: `[B, observation_dim]`.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
         """
         discrete_weight, parameter_weight = self.temperatures()
-        distribution: HybridDistribution = self.actor(state)
+        distribution: HybridDistribution = self.actor(state, allowed)
         unit, log_density = distribution.sample_squashed()
         log_probs = distribution.discrete_log_probs
         # Of each discrete action's own parameters together, `[B, num_discrete]`.
@@ -197,7 +213,8 @@ class HSAC(ReplayLearner):
         own_target = self.parameter_target_entropy * self.parameter_dims
         q = critics(state, unit).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
         probs = log_probs.exp()
-        discrete_excess = -(probs * log_probs).sum(-1) - self.discrete_target_entropy
+        most_entropy = self.most_discrete_entropy if allowed is None else allowed.sum(-1).log()
+        discrete_excess = -(probs * log_probs).sum(-1) - self.discrete_target_entropy * most_entropy
         parameter_excess = -(probs * (own_log_density + own_target)).sum(-1)
         return (probs * q).sum(-1), discrete_excess, parameter_excess
 
@@ -214,25 +231,25 @@ class HSAC(ReplayLearner):
             "parameter_temperature": parameter_temperature,
         }
         if self.updates % self.policy_delay == 0:
-            scalars |= self._update_actor(sample["state"])
+            scalars |= self._update_actor(sample["state"], self.allowed(sample))
             self._update_temperatures(scalars["discrete_excess"], scalars["parameter_excess"])
         polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
 
     @torch.no_grad()
-    def value(self, observation: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the soft value V'(s) by the target critics, `[B]`."""
-        value, _, _ = self.soft_value(self.target_critics, observation)
+        value, _, _ = self.soft_value(self.target_critics, observation, self.specs.allowed(observation, action_mask))
         return value
 
     def _target(self, batch: TensorDictBase) -> Tensor:
         """Return r + discount V'(s'), `[B]`, where the discount is 0 after a termination."""
         return batch["reward"] + batch["discount"] * self.next_value(batch)
 
-    def _update_actor(self, state: Tensor) -> dict[str, Tensor]:
+    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
         """Update the actor to increase the soft value; return the loss and the mean entropies minus their targets."""
         self.critics.requires_grad_(False)
-        value, discrete_excess, parameter_excess = self.soft_value(self.critics, state)
+        value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed)
         loss = -value.mean()
         self.optimizer_step("actor", loss)
         self.critics.requires_grad_(True)

@@ -47,6 +47,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -86,9 +87,29 @@ class HybridCodec(nn.Module):
         """The embedding of each discrete action, `[num_discrete, embedding_dim]` in (-1, 1)."""
         return self.table.tanh()
 
-    def nearest_discrete(self, e: Tensor) -> Tensor:
-        """Return the discrete action `[B]` whose embedding is nearest to e."""
-        return torch.cdist(e, self.embeddings).argmin(-1)
+    def nearest_discrete(self, e: Tensor, allowed: Tensor | None = None) -> Tensor:
+        """Return the discrete action `[B]` whose embedding is nearest to e.
+
+        Args:
+            e: `[B, embedding_dim]`.
+            allowed: the discrete actions to choose from, bool `[B, num_discrete]`; None: all.
+        """
+        return masked_values(-torch.cdist(e, self.embeddings), allowed).argmax(-1)
+
+    def of_allowed(self, proposals: Tensor, allowed: Tensor | None) -> Tensor:
+        """Return latent actions whose e stands for an allowed discrete action, `[B, N, embedding_dim + latent_dim]`.
+
+        Where it does not, e is the embedding of the nearest allowed one; gradients pass as if it were as it was.
+        """
+        if allowed is None:
+            return proposals
+        e, z = proposals.split([self.table.shape[-1], self.latent_dim], -1)
+        is_allowed = allowed.unsqueeze(1).expand(-1, e.shape[1], -1).flatten(0, 1)
+        rows = e.flatten(0, 1).detach()
+        nearest = self.nearest_discrete(rows, is_allowed)
+        is_moved = self.nearest_discrete(rows) != nearest
+        moved = torch.where(is_moved.unsqueeze(-1), self.embeddings.detach()[nearest], rows)
+        return torch.cat([e + (moved - rows).unflatten(0, e.shape[:2]), z], -1)
 
     def encode(self, state: Tensor, discrete: Tensor, parameters: Tensor) -> tuple[Tensor, Tensor]:
         """Return the mean and log-variance of z, each `[B, latent_dim]`."""
@@ -187,27 +208,36 @@ class HyARPolicy(TensorDictModuleBase):
         The latent action is `[*B, embedding_dim + latent_dim]`.
         """
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
+        allowed = allowed_rows(self.specs, td)
         is_exploring = not is_greedy()
         proposals = self.actor(state, self.codec.embeddings, self.noise if is_exploring else 0.0)
+        if not self.actor.is_greedy:
+            proposals = self.codec.of_allowed(proposals, allowed)
         latent = proposals[:, 0]
         if proposals.shape[1] > 1:
-            best = self.critics(state, proposals).amin(0).argmax(-1)
+            best = masked_values(self.critics(state, proposals).amin(0), allowed).argmax(-1)
             latent = proposals[torch.arange(len(best), device=best.device), best]
-        discrete, unit = self.decode(state, latent)
+        discrete, unit = self.decode(state, latent, allowed)
         if is_exploring and self.epsilon > 0.0:
             is_random = torch.rand_like(unit[:, :1]) < self.epsilon
             unit = torch.where(is_random, 2.0 * torch.rand_like(unit) - 1.0, unit)
-            random_discrete = torch.randint_like(discrete, self.specs.num_discrete)
+            random_discrete = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
             discrete = torch.where(is_random.squeeze(-1), random_discrete, discrete)
             latent = torch.where(is_random, torch.nan, latent)
         td.set(LATENT, latent.reshape(*td.batch_size, -1))
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
-    def decode(self, state: Tensor, latent: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the discrete action `[B]` and the parameters `[B, num_parameters]` in [-1, 1] of a latent action."""
+    def decode(self, state: Tensor, latent: Tensor, allowed: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return the discrete action `[B]` and the parameters `[B, num_parameters]` in [-1, 1] of a latent action.
+
+        Args:
+            state: `[B, observation_dim]`.
+            latent: `[B, embedding_dim + latent_dim]`.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
+        """
         e, z = latent.split([self.codec.table.shape[-1], self.codec.latent_dim], -1)
-        discrete = self.codec.nearest_discrete(e)
+        discrete = self.codec.nearest_discrete(e, allowed)
         unit, _ = self.codec.decode(state, discrete, self.codec.z_from_unit(z))
         return discrete, unit
 
@@ -339,7 +369,7 @@ class HyAR(ReplayLearner):
         self.optimizer_step("critics", critic_loss)
         scalars = {"critic": critic_loss, "redone": is_corrected.float().mean(), "epsilon": self.policy.epsilon}
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(sample["state"])
+            scalars["actor"] = self._update_actor(sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         if self.updates % self.codec_every == 0:
@@ -380,23 +410,29 @@ class HyAR(ReplayLearner):
         return torch.cat([e, z], -1), ~(is_same_discrete & is_same_change)
 
     @torch.no_grad()
-    def value(self, observation: Tensor) -> Tensor:
-        """Return the max over the target actor's proposals a of min Q'(s, a), `[B]`.
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the max over the target actor's allowed proposals a of min Q'(s, a), `[B]`.
 
         The proposals carry clipped noise.
         """
+        allowed = self.specs.allowed(observation, action_mask)
         proposals = self.target_actor(observation, self.codec.embeddings, self.target_noise, self.target_noise_clip)
-        return self.target_critics(observation, proposals).amin(0).amax(-1)
+        if not self.actor.is_greedy:
+            return self.target_critics(observation, self.codec.of_allowed(proposals, allowed)).amin(0).amax(-1)
+        return masked_values(self.target_critics(observation, proposals).amin(0), allowed).amax(-1)
 
     def _target(self, batch: TensorDictBase) -> Tensor:
         """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
         return batch["reward"] + batch["discount"] * self.next_value(batch)
 
-    def _update_actor(self, state: Tensor) -> Tensor:
-        """Update the actor towards higher values of its proposals by the first critic; return the loss."""
+    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> Tensor:
+        """Update the actor towards higher values of its allowed proposals by the first critic; return the loss."""
         self.critics.requires_grad_(False)
         proposals = self.actor(state, self.codec.embeddings.detach())
-        loss = -self.critics(state, proposals, num_members=1).sum(-1).mean()
+        if not self.actor.is_greedy:
+            proposals = self.codec.of_allowed(proposals, allowed)
+        q = self.critics(state, proposals, num_members=1)
+        loss = -(q if allowed is None or not self.actor.is_greedy else q * allowed).sum(-1).mean()
         self.optimizer_step("actor", loss)
         self.critics.requires_grad_(True)
         return loss

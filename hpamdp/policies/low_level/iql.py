@@ -87,7 +87,7 @@ class IQL(ReplayLearner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
 
-    def value(self, observation: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return V(s), `[B]`."""
         return self.state_value(observation).squeeze(-1)
 
@@ -112,7 +112,7 @@ class IQL(ReplayLearner):
         polyak_update(self.target_critics, self.critics, self.tau)
 
         weight = (self.temperature * advantage).exp().clamp(max=self.max_weight)
-        distribution: HybridDistribution = self.actor(state)
+        distribution: HybridDistribution = self.actor(state, self.allowed(sample))
         discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, unit)
         self.optimizer_step("actor", -(weight * (discrete_log_prob + parameter_log_prob)).mean())
         return {"critic": critic_loss, "value": value_loss, "q": q.mean(), "advantage_weight": weight.mean()}

@@ -34,6 +34,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import masked_values
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InitialLayer,
@@ -66,6 +67,19 @@ class PADDPGActor(nn.Module):
         return InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1))
 
 
+def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:
+    """Return an actor's outputs with the lowest score for forbidden discrete actions, so that critics know no other.
+
+    Args:
+        output: scores and parameters, `[*B, num_discrete + num_parameters]` in [-1, 1].
+        allowed: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
+    """
+    if allowed is None:
+        return output
+    scores, parameters = output.tensor_split([allowed.shape[-1]], -1)
+    return torch.cat([scores.masked_fill(~allowed, -1.0), parameters], -1)
+
+
 class PADDPGPolicy(TensorDictModuleBase):
     """Takes the discrete action with the highest score; explores with random outputs and noise on the actor's."""
 
@@ -83,13 +97,16 @@ class PADDPGPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, all parameters `[*B, num_parameters]`, all scores `[*B, num_discrete]`."""
-        output = self.actor(td.get(keys.OBSERVATION))
+        observation = td.get(keys.OBSERVATION)
+        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        output = self.actor(observation)
         if not is_greedy():
             is_random = torch.rand_like(output[..., :1]) < self.epsilon
             noisy = (output + self.noise * torch.randn_like(output)).clamp(-1.0, 1.0)
             output = torch.where(is_random, 2.0 * torch.rand_like(output) - 1.0, noisy)
-        scores, unit = output.tensor_split([self.specs.num_discrete], -1)
-        action = {"discrete": scores.argmax(-1), "parameters": self.specs.from_unit(unit)}
+        scores, unit = with_lowest_scores(output, allowed).tensor_split([self.specs.num_discrete], -1)
+        discrete = masked_values(scores, allowed).argmax(-1)
+        action = {"discrete": discrete, "parameters": self.specs.from_unit(unit)}
         return td.update({keys.ACTION: action, SCORES: scores})
 
 
@@ -154,9 +171,10 @@ class PADDPG(ReplayLearner):
         }
 
     @torch.no_grad()
-    def value(self, observation: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return min Q'(s, a), `[B]`, with a the target actor's output, smoothed with `twin`."""
         output = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
+        output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
         return self._q(self.target_critics, observation, output).amin(0)
 
     def explore(self, frames: int) -> None:
@@ -175,7 +193,7 @@ class PADDPG(ReplayLearner):
         self.optimizer_step("critics", critic_loss, self.max_grad_norm)
         scalars = {"critic": critic_loss, "q": q.mean(), "epsilon": self.policy.epsilon}
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(state)
+            scalars["actor"] = self._update_actor(state, self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
@@ -184,10 +202,10 @@ class PADDPG(ReplayLearner):
         """Return the critics' values `[E, B]` of an actor's outputs `[B, num_discrete + num_parameters]`."""
         return critics(torch.cat([state, output], -1)).squeeze(-1)
 
-    def _update_actor(self, state: Tensor) -> Tensor:
+    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> Tensor:
         """Update the actor towards higher values of the first critic; return the loss."""
         self.critics.requires_grad_(False)
-        loss = -self._q(self.critics, state, self.actor(state))[0].mean()
+        loss = -self._q(self.critics, state, with_lowest_scores(self.actor(state), allowed))[0].mean()
         self.optimizer_step("actor", loss, self.max_grad_norm)
         self.critics.requires_grad_(True)
         return loss

@@ -37,6 +37,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
@@ -87,13 +88,15 @@ class PDQNPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
+        allowed = allowed_rows(self.specs, td)
         unit = self.actor(state)
-        discrete = self.critics(state, unit).amin(0).argmax(-1)
+        discrete = masked_values(self.critics(state, unit).amin(0), allowed).argmax(-1)
         if not is_greedy():
             is_random = torch.rand(discrete.shape, device=discrete.device) < self.epsilon
             noisy = (unit + self.noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
             unit = torch.where(is_random.unsqueeze(-1), 2.0 * torch.rand_like(unit) - 1.0, noisy)
-            discrete = torch.where(is_random, torch.randint_like(discrete, self.specs.num_discrete), discrete)
+            anything = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
+            discrete = torch.where(is_random, anything, discrete)
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
@@ -199,6 +202,9 @@ class PDQN(ReplayLearner):
         for name in ("option_ended", "next_option"):
             if name in rows.keys():
                 rows[name] = rows[name].gather(-1, last)
+        if "next_action_mask" in rows.keys():
+            mask = rows["next_action_mask"]
+            rows["next_action_mask"] = mask.gather(-2, last.unsqueeze(-1).expand_as(mask))
         return rows
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
@@ -209,29 +215,31 @@ class PDQN(ReplayLearner):
         self.optimizer_step("critics", critic_loss, self.max_grad_norm)
         scalars = {"critic": critic_loss, "q": q.mean(), "epsilon": self.policy.epsilon}
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(state)
+            scalars["actor"] = self._update_actor(state, self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.actor_tau)
             polyak_update(self.target_critics, self.critics, self.critic_tau)
         return scalars
 
-    def _update_actor(self, state: Tensor) -> Tensor:
-        """Update the actor to increase the sum of the discrete actions' values; return the loss."""
+    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> Tensor:
+        """Update the actor to increase the sum of the allowed discrete actions' values; return the loss."""
         self.critics.requires_grad_(False)
-        loss = -self.critics(state, self.actor(state)).amin(0).sum(-1).mean()
+        q = self.critics(state, self.actor(state)).amin(0)
+        loss = -(q if allowed is None else q * allowed).sum(-1).mean()
         if loss.requires_grad:  # not if no discrete action has parameters
             self.optimizer_step("actor", loss, self.max_grad_norm)
         self.critics.requires_grad_(True)
         return loss
 
     @torch.no_grad()
-    def value(self, observation: Tensor) -> Tensor:
-        """Return max_k Q'(s, k, x'(s)), `[B]`.
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`.
 
         With `double_q`, the learned critics choose k instead of the target critics.
         """
         unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
         q = self.target_critics(observation, unit).amin(0)
         choosing_q = self.critics(observation, unit).amin(0) if self.double_q else q
+        choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
         return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
 
     def _target(self, batch: TensorDictBase) -> Tensor:

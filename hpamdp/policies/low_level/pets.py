@@ -40,6 +40,7 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.frame import CanonicalFrame
+from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.networks import EnsembleLinear
 from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, discounted_return
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -317,14 +318,18 @@ class PETSPolicy(TensorDictModuleBase):
         state = td.get(keys.OBSERVATION)[..., self.entries].flatten(0, -2)
         num, device = len(state), state.device
         member = self._members(td, num, device)
-        discrete = torch.randint(self.specs.num_discrete, (num,), device=device)
+        mask = td.get(keys.ACTION_MASK, None)
+        mask = None if mask is None else mask.flatten(0, -2)
+        allowed = self.specs.allowed(state, mask)
+        discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed, device)
         unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device) - 1.0
         is_planned = self.is_trained.expand(num)
         done = td.get(keys.DONE, None)
         if done is not None:
             is_planned = is_planned & ~done.flatten()
         if is_planned.any():
-            found = self.plan(state[is_planned], None if is_greedy() else member[is_planned])
+            mask = None if mask is None else mask[is_planned]
+            found = self.plan(state[is_planned], None if is_greedy() else member[is_planned], mask)
             own = found.own
             if not is_greedy():
                 own = (own + self.noise * torch.randn_like(own)).clamp(-1.0, 1.0)
@@ -345,21 +350,45 @@ class PETSPolicy(TensorDictModuleBase):
             return held.flatten()
         return torch.where(begins.flatten(), fresh, held.flatten())
 
-    def plan(self, state: Tensor, member: Tensor | None = None) -> Found:
-        """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all."""
+    def plan(self, state: Tensor, member: Tensor | None = None, action_mask: Tensor | None = None) -> Found:
+        """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all.
+
+        Args:
+            state: where the plans begin.
+            member: of each of them.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything. What it will
+                allow in predicted states is unknown, and taken to be everything.
+        """
+        allowed = self._allowed(state, action_mask)
         if member is None:
-            return self._plan(state, _ALL)
+            return self._plan(state, _ALL, allowed)
         order = member.argsort(stable=True)
-        parts = [self._plan(state[member == each], slice(each, each + 1)) for each in member.unique().tolist()]
+        parts = []
+        for each in member.unique().tolist():
+            rows = member == each
+            own = None if allowed is None else allowed[rows]
+            parts.append(self._plan(state[rows], slice(each, each + 1), own))
         found = [torch.cat(part) for part in zip(*parts, strict=True)]
         place = torch.empty_like(order)
         place[order] = torch.arange(len(order), device=order.device)
         return Found(*(part[place] for part in found))
 
-    def _plan(self, state: Tensor, members: slice) -> Found:
-        rows = self.search.num_sequences * self.search.num_samples
-        pieces = state.split(max(1, _CHUNK_ROWS // rows))
-        found = [self.search(self._returns(piece, members), len(piece), state.device) for piece in pieces]
+    def _allowed(self, state: Tensor, action_mask: Tensor | None) -> Tensor | None:
+        """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`; None: all."""
+        first = self.specs.allowed(state, action_mask)
+        if first is None:
+            return None
+        later = self.specs.allowed(state)
+        later = torch.ones_like(first) if later is None else later
+        return torch.stack([first] + [later] * (self.search.horizon - 1), 1)
+
+    def _plan(self, state: Tensor, members: slice, allowed: Tensor | None) -> Found:
+        size = max(1, _CHUNK_ROWS // (self.search.num_sequences * self.search.num_samples))
+        found = []
+        for begin in range(0, len(state), size):
+            piece = state[begin : begin + size]
+            own = None if allowed is None else allowed[begin : begin + size]
+            found.append(self.search(self._returns(piece, members), len(piece), state.device, own))
         return Found(*(torch.cat(part) for part in zip(*found, strict=True)))
 
     def _returns(self, state: Tensor, members: slice) -> Returns:
@@ -466,7 +495,7 @@ class PETS(ReplayLearner):
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated."""
-        rows = super().transitions(batch).exclude("discount")
+        rows = super().transitions(batch).exclude("discount", "action_mask", "next_action_mask")
         for name in ("state", "next_state"):
             rows.set(name, rows[name][..., self.entries])
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))

@@ -45,6 +45,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData, num_fourier_features
 from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
+from hpamdp.policies.shared.masks import masked_logits, masked_values
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
 from hpamdp.specs import PAMDPSpecs
 
@@ -115,7 +116,9 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and their raw sample, each `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
-        q = self.phi(observation) @ self.w.T
+        q = masked_values(
+            self.phi(observation) @ self.w.T, self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        )
         raw = self.mean(observation)
         is_exploring = not is_greedy()
         discrete = sample_index(q / self.temperature) if is_exploring and self.samples_discrete else q.argmax(-1)
@@ -162,7 +165,8 @@ class SarsaLambda(SizedByData):
         Args:
             w: weights `[num_discrete, num_features]`.
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
-                `done` and `mask` `[N, T]`; only the rows in `mask` count.
+                `done` and `mask` `[N, T]`; only the rows in `mask` count. `next_allowed` `[N, T, num_discrete]`: the
+                discrete actions that may be taken in the next states, if not all.
             temperature: of the softmax policy, `[]`.
             step_scale: factors on the steps of the features' weights, `[num_features]`.
 
@@ -210,7 +214,8 @@ class SarsaLambda(SizedByData):
         next_q = next_phi @ w.T
         is_known = (next_discrete >= 0) & ~row["done"]
         taken = F.one_hot(next_discrete.clamp(min=0), len(w))
-        next_probs = torch.where(is_known.unsqueeze(-1), taken, (next_q / temperature).softmax(-1))
+        next_logits = masked_logits(next_q / temperature, row.get("next_allowed"))
+        next_probs = torch.where(is_known.unsqueeze(-1), taken, next_logits.softmax(-1))
         next_weight = self.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
         error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
 
@@ -477,10 +482,11 @@ class QPAMDP(Learner):
         self.policy.widen()
 
     @torch.no_grad()
-    def value(self, observation: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the expected value of the softmax policy's discrete action, `[N]`."""
         q = self.policy.phi(observation) @ self.policy.w.T
-        return ((q / self.policy.temperature).softmax(-1) * q).sum(-1)
+        logits = masked_logits(q / self.policy.temperature, self.specs.allowed(observation, action_mask))
+        return (logits.softmax(-1) * q).sum(-1)
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what the phase's update needs of a batch `[N, T]`.
@@ -495,7 +501,8 @@ class QPAMDP(Learner):
         if option_ended is not None:
             is_followed = (option_ended & ~batch["next", keys.DONE]).squeeze(-1) & mask
             next_observation = batch["next", keys.OBSERVATION][is_followed]
-            value = self.following.value(next_observation, batch[keys.NEXT_OPTION][is_followed])
+            masks = [batch["next", keys.ACTION_MASK][is_followed]] if self.specs.has_action_mask else []
+            value = self.following.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
             reward = reward.index_put((is_followed,), self.sarsa.gamma * value, accumulate=True)
             terminated = terminated | is_followed
         rows = {
@@ -507,7 +514,11 @@ class QPAMDP(Learner):
             "mask": mask,
         }
         if self.phase == SARSA:
-            rows["next_phi"] = self.policy.phi(batch["next", keys.OBSERVATION])
+            next_observation = batch["next", keys.OBSERVATION]
+            rows["next_phi"] = self.policy.phi(next_observation)
+            allowed = self.specs.allowed(next_observation, batch.get(("next", keys.ACTION_MASK), None))
+            if allowed is not None:
+                rows["next_allowed"] = allowed
         else:
             psi = self.policy.psi(observation)
             score = (

@@ -8,11 +8,12 @@ from tensordict.nn import TensorDictModuleBase
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
+from hpamdp.policies.shared.masks import random_choice
 from hpamdp.specs import PAMDPSpecs
 
 
 class RandomPolicy(TensorDictModuleBase):
-    """Takes a uniformly random discrete action with uniformly random parameters."""
+    """Takes a uniformly random allowed discrete action with uniformly random parameters."""
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
@@ -24,7 +25,8 @@ class RandomPolicy(TensorDictModuleBase):
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         device = td.get(keys.OBSERVATION).device
         unit = 2.0 * torch.rand(*td.batch_size, self.specs.num_parameters, device=device) - 1.0
-        discrete = torch.randint(self.specs.num_discrete, td.batch_size, device=device)
+        allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
+        discrete = random_choice(td.batch_size, self.specs.num_discrete, allowed, device)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}})
 
 

@@ -31,6 +31,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.masks import allowed_rows, masked_logits
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
@@ -69,14 +70,16 @@ class TD3BCPolicy(TensorDictModuleBase):
         self.log_threshold = torch.tensor(discrete_threshold).log().item()  # -inf where the threshold is 0
         self.parameter_noise = parameter_noise
 
-    def is_rare(self, state: Tensor) -> Tensor:
-        """Return which discrete actions are too rare in the data, bool `[B, num_discrete]`.
+    def is_refused(self, state: Tensor, allowed: Tensor | None) -> Tensor:
+        """Return which discrete actions are forbidden or too rare in the data, bool `[B, num_discrete]`.
 
         Args:
             state: `[B, observation_dim]`.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
         """
-        log_probs = self.behaviour(state).log_softmax(-1)
-        return log_probs < log_probs.amax(-1, keepdim=True) + self.log_threshold
+        log_probs = masked_logits(self.behaviour(state), allowed).log_softmax(-1)
+        is_rare = log_probs < log_probs.amax(-1, keepdim=True) + self.log_threshold
+        return is_rare if allowed is None else is_rare | ~allowed
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -84,7 +87,7 @@ class TD3BCPolicy(TensorDictModuleBase):
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         unit = self.actor(state)
         q = self.critics(state, unit).amin(0)
-        discrete = q.masked_fill(self.is_rare(state), -torch.inf).argmax(-1)
+        discrete = q.masked_fill(self.is_refused(state, allowed_rows(self.specs, td)), -torch.inf).argmax(-1)
         if not is_greedy():
             unit = (unit + self.parameter_noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
@@ -157,21 +160,22 @@ class TD3BC(ReplayLearner):
         q = self.critics.of_discrete(state, discrete, unit)
         critic_loss = F.mse_loss(q, self._target(sample).expand_as(q))
         self.optimizer_step("critics", critic_loss)
-        behaviour_loss = F.cross_entropy(self.behaviour(state), discrete)
+        allowed = self.allowed(sample)
+        behaviour_loss = F.cross_entropy(masked_logits(self.behaviour(state), allowed), discrete)
         self.optimizer_step("behaviour", behaviour_loss)
         scalars = {"critic": critic_loss, "q": q.mean(), "behaviour": behaviour_loss}
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(state, discrete, unit)
+            scalars["actor"] = self._update_actor(state, discrete, unit, allowed)
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
 
-    def _update_actor(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
+    def _update_actor(self, state: Tensor, discrete: Tensor, unit: Tensor, allowed: Tensor | None) -> Tensor:
         """Update the actor towards higher values and towards the data; return the loss."""
         own_unit = self.actor(state)
         self.critics.requires_grad_(False)
         with torch.no_grad():
-            frequency = self.behaviour(state).softmax(-1)
+            frequency = masked_logits(self.behaviour(state), allowed).softmax(-1)
         q = (self.critics(state, own_unit).amin(0) * frequency).sum(-1)
         distance = ((own_unit - unit).square() * (self.owner == discrete.unsqueeze(-1))).sum(-1)
         # Values are divided by their mean size, so that the weight does not depend on the scale of the reward.
@@ -181,11 +185,12 @@ class TD3BC(ReplayLearner):
         return loss
 
     @torch.no_grad()
-    def value(self, observation: Tensor) -> Tensor:
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`."""
         unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
         q = self.target_critics(observation, unit).amin(0)
-        return q.masked_fill(self.policy.is_rare(observation), -torch.inf).amax(-1)
+        is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, action_mask))
+        return q.masked_fill(is_refused, -torch.inf).amax(-1)
 
     def _target(self, sample: TensorDictBase) -> Tensor:
         """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.shared.masks import masked_values
 from hpamdp.specs import PAMDPSpecs
 
 Memory = Literal["all", "discounted", "sliding_window"]
@@ -73,9 +74,11 @@ class RewardStatistics(nn.Module):
         """Whether no reward of an option is known, bool `[num_options]`; options become untried again if forgotten."""
         return self.counts < 1e-9
 
-    def best(self) -> int:
-        """Return the option with the highest mean reward."""
-        return int(torch.where(self.is_untried, -torch.inf, self.means).argmax())
+    def best(self, allowed: Tensor | None = None) -> int:
+        """Return the option with the highest mean reward, among the allowed ones, bool `[num_options]`."""
+        # An untried option comes before a forbidden one, whose value is -inf.
+        means = torch.where(self.is_untried, torch.finfo(torch.float64).min, self.means)
+        return int(masked_values(means, allowed).argmax())
 
     def weights(self, num: int) -> Tensor:
         """Return the weights of the last `num` decisions, oldest first, `[num]`."""
@@ -123,23 +126,49 @@ class Bandit(Selector):
         self.statistics = RewardStatistics(specs.num_options, memory, discount, window)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
 
-    def sample(self, num: int) -> Tensor:
-        """Return `num` exploring choices, int64 `[num]`, for decisions that are due at the same time."""
+    def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
+        """Return `num` exploring choices, int64 `[num]`, for decisions that are due at the same time.
+
+        Args:
+            num: how many.
+            allowed: the options that may be chosen, bool `[num_options]`; None: all.
+        """
         raise NotImplementedError
 
-    def best(self) -> int:
+    def best(self, allowed: Tensor | None = None) -> int:
         """Return the greedy choice."""
-        return self.statistics.best()
+        return self.statistics.best(allowed)
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the choices `[*B]`: the best option if the policy is greedy, else samples where a decision is due."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
+        mask = td.get(keys.OPTION_MASK, None)
+        if mask is not None:
+            return self._select_allowed(is_decision, mask)
         if is_greedy():
             return torch.full_like(is_decision, self.best(), dtype=torch.long)
         choices = torch.zeros_like(is_decision, dtype=torch.long)
         chosen = self.sample(int(is_decision.sum()))
         self.pending += torch.bincount(chosen, minlength=self.specs.num_options)
         choices[is_decision] = chosen
+        return choices
+
+    def _select_allowed(self, is_decision: Tensor, mask: Tensor) -> Tensor:
+        """Return allowed choices `[*B]`: environments that allow the same options are served together.
+
+        Args:
+            is_decision: where a choice is due, bool `[*B]`; elsewhere it is ignored.
+            mask: the options that may be chosen, bool `[*B, num_options]`.
+        """
+        choices = torch.zeros_like(is_decision, dtype=torch.long)
+        for allowed in mask.flatten(0, -2).unique(dim=0):
+            rows = is_decision & (mask == allowed).all(-1)
+            if is_greedy():
+                choices[rows] = self.best(allowed)
+                continue
+            chosen = self.sample(int(rows.sum()), allowed)
+            self.pending += torch.bincount(chosen, minlength=self.specs.num_options)
+            choices[rows] = chosen
         return choices
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:

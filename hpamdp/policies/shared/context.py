@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.bandit_statistics import Discount, Memory, RewardStatistics
+from hpamdp.policies.shared.masks import masked_values
 from hpamdp.specs import PAMDPSpecs
 
 Features = Literal["polynomial", "random_fourier"]
@@ -178,6 +179,8 @@ class LinearBandit(Selector):
             # Untried options come first, in random order.
             first = 1e9 + torch.rand_like(mean)
             mean = torch.where(self.statistics.is_untried, first, self.sample(mean, deviation))
+        mask = td.get(keys.OPTION_MASK, None)
+        mean = masked_values(mean, None if mask is None else mask.flatten(0, -2))
         return mean.argmax(-1).reshape(observation.shape[:-1])
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:

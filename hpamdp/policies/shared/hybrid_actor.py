@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
+from hpamdp.policies.shared.masks import masked_logits
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
 from hpamdp.specs import PAMDPSpecs
 
@@ -132,13 +133,19 @@ class HybridActor(nn.Module):
             self.parameter_head.bias[specs.num_parameters :] = math.log(fraction / (1.0 - fraction))
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
-    def forward(self, observation: Tensor) -> HybridDistribution:
-        """Return the distribution of the action for observations `[*B, observation_dim]`."""
+    def forward(self, observation: Tensor, mask: Tensor | None = None) -> HybridDistribution:
+        """Return the distribution of the action for observations `[*B, observation_dim]`.
+
+        Args:
+            observation: of the states.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
+        """
         hidden = self.encoder(observation)
         mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
         mean = mean + self.initial(observation)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
-        return HybridDistribution(self.discrete_head(hidden).log_softmax(-1), mean, log_scale, self.owner)
+        logits = masked_logits(self.discrete_head(hidden), mask)
+        return HybridDistribution(logits.log_softmax(-1), mean, log_scale, self.owner)
 
     def set_min_scale(self, min_scale: float) -> None:
         """Set the smallest standard deviation."""
@@ -158,7 +165,9 @@ class HybridPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
-        distribution: HybridDistribution = self.actor(td.get(keys.OBSERVATION))
+        observation = td.get(keys.OBSERVATION)
+        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        distribution: HybridDistribution = self.actor(observation, allowed)
         discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})

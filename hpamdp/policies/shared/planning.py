@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from hpamdp.policies.shared.masks import random_choice
+
 
 class Prediction(NamedTuple):
     """What a model predicts for one step; E is the number of its members, where they differ."""
@@ -129,7 +131,13 @@ class SequenceSearch:
         sampled[..., 0] = (begin + torch.arange(self.num_sequences, device=device)) % self.num_discrete
         return sampled
 
-    def __call__(self, returns: Returns, num_states: int, device: torch.device) -> Found:
+    def _allowed_sequences(self, discrete: Tensor, allowed: Tensor) -> Tensor:
+        """Return sequences `[N, Q, horizon]` with random allowed actions in the place of forbidden ones."""
+        mask = allowed.unsqueeze(1).expand(-1, discrete.shape[1], -1, -1)
+        others = random_choice(discrete.shape, self.num_discrete, mask, discrete.device)
+        return torch.where(mask.gather(-1, discrete.unsqueeze(-1)).squeeze(-1), discrete, others)
+
+    def __call__(self, returns: Returns, num_states: int, device: torch.device, allowed: Tensor | None = None) -> Found:
         """Search for `num_states` states at once.
 
         Args:
@@ -137,9 +145,12 @@ class SequenceSearch:
                 `[N, Q, S, horizon, D]` to returns `[N, Q, S]`.
             num_states: N.
             device: where to search.
+            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
         """
         has_slot = self.has_slot.to(device)
         discrete = self.sequences(num_states, device)
+        if allowed is not None:
+            discrete = self._allowed_sequences(discrete, allowed)
         mask = has_slot[discrete]
         mean = torch.zeros_like(mask)
         deviation = torch.ones_like(mask)

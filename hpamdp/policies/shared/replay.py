@@ -153,6 +153,10 @@ class ReplayLearner(Learner):
             },
             batch_size=batch.shape,
         )
+        if self.specs.has_action_mask:
+            everything = torch.ones(*batch.shape, self.specs.num_discrete, dtype=torch.bool, device=self.frames.device)
+            rows["action_mask"] = batch.get(keys.ACTION_MASK, everything)
+            rows["next_action_mask"] = batch.get(("next", keys.ACTION_MASK), everything)
         option_ended = batch.get(("next", keys.OPTION_ENDED), None)
         if option_ended is not None:
             rows["option_ended"] = option_ended.squeeze(-1)
@@ -167,15 +171,20 @@ class ReplayLearner(Learner):
         learner: the selector has learned since.
         """
         state = sample["next_state"]
-        value = self.value(state)
+        masks = [sample["next_action_mask"]] if self.specs.has_action_mask else []
+        value = self.value(state, *masks)
         if "option_ended" not in sample.keys():
             return value
         is_ended = sample["option_ended"] | self.following.decides_ends
         if is_ended.any():
             state = state[is_ended]
             option = self.following.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
-            value[is_ended] = self.following.value(state, option)
+            value[is_ended] = self.following.value(state, option, *(mask[is_ended] for mask in masks))
         return value
+
+    def allowed(self, sample: TensorDictBase) -> Tensor | None:
+        """Return which discrete actions may be taken in a sample's states, bool `[B, num_discrete]`; None: all."""
+        return self.specs.allowed(sample["state"], sample.get("action_mask", None))
 
     def start(self) -> None:
         """Prepare for the first update, from the transitions that the warm-up stored."""

@@ -1,0 +1,57 @@
+"""Each option may have a learner of another class: `low.per_option`."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import make_config
+from test_assemble import QUICK_CRITIC, make, train
+from test_grid import SHORT, SMALL
+
+from hpamdp import keys
+from hpamdp.config import ConfigError, compose_saved, read
+from hpamdp.policies.low_level.hppo import HPPO
+from hpamdp.policies.low_level.paddpg import PADDPG
+
+WORDS = [*SMALL, "env=platform", "+env.options=default", *QUICK_CRITIC, "low=hppo", *SHORT["hppo"]]
+PER_OPTION = "+low.per_option={jump: {name: paddpg, hidden_dims: [16], warmup_frames: 10, batch_size: 16}}"
+
+
+def test_learners_of_two_classes_train_side_by_side(tmp_path):
+    config = make_config([*WORDS, PER_OPTION, "agent.termination=steps", "agent.option_length=2"])
+    parts = train(config, tmp_path / "run")
+    assert [type(learner) for learner in parts.agent.learners] == [HPPO, PADDPG]
+    assert parts.agent.learners[1].updates > 0
+    batch = parts.env.rollout(30, parts.policy, break_when_any_done=False)
+    jumps = batch[keys.OPTION] == 1
+    assert jumps.any() and (~jumps).any()
+    assert (batch["scores"][jumps].abs().sum(-1) > 0).all()
+    assert parts.evaluation.run_agent(parts.agent)["option_scores"].shape[1] == 2
+
+
+def test_the_other_options_keep_the_learner_of_the_run():
+    config = make_config([*WORDS, "+low.per_option={jump: random}"])
+    assert config.low.name == "hppo" and {name: low.name for name, low in config.low_of.items()} == {"jump": "random"}
+    assert read(*compose_saved(config.to_dict())) == config
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["+low.per_option={fly: random}"], "low.per_option: env=platform has no option fly; it has run, jump"),
+        (["+low.per_option={jump: nothing}"], "low.per_option.jump=nothing: there is no conf/low/nothing.yaml"),
+        (
+            ["+low.per_option={jump: {lr: 3}}"],
+            'low.per_option.jump={"lr": 3}: must be the name of a learner, or its name',
+        ),
+        (["+low.per_option={jump: {name: random, lr: 3}}"], "low.lr: no such option of Random (conf/low/random.yaml)"),
+        (["+low.per_option={jump: bc}"], "mode=train: low=bc learns from data sets only"),
+        (
+            ["+low.per_option={jump: random}", "agent.sharing=shared"],
+            "low.per_option: agent.sharing=shared has one learner for all; use agent.sharing=per_option",
+        ),
+    ],
+)
+def test_a_learner_that_an_option_cannot_have_is_told_in_one_line(words, complaint, tmp_path):
+    with pytest.raises(ConfigError) as error:
+        make(make_config([*WORDS, *words]), tmp_path)
+    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)

@@ -1,0 +1,226 @@
+"""Forbidden actions and options are neither taken nor counted in a target; options can be sets of actions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from conftest import make_config
+from tensordict import TensorDict
+from test_following_options import LEARNERS
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_masks import NUM_DISCRETE, Forbidden
+
+from hpamdp import keys
+from hpamdp.env.base import ProblemError
+from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Selector
+from hpamdp.policies.low_level.random import Random
+from hpamdp.specs import PAMDPSpecs
+
+CPU = torch.device("cpu")
+SHORT = {
+    **LEARNERS,
+    "hyar": [*LEARNERS["hyar"], "low.warmup_frames=100", "low.epsilon_frames=100"],
+    "dlpa": [
+        "low.hidden_dims=[16]",
+        "low.warmup_frames=100",
+        "low.num_samples=32",
+        "low.num_elites=8",
+        "low.num_iterations=2",
+        "low.horizon=2",
+        "low.batch_size=32",
+    ],
+    "pets": [
+        "low.transition_dims=[16]",
+        "low.outcome_dims=[16]",
+        "low.num_members=2",
+        "low.warmup_frames=100",
+        "low.batch_size=32",
+        "low.max_sequences=9",
+        "low.num_kept=2",
+        "low.num_samples=8",
+        "low.num_elites=2",
+        "low.num_iterations=2",
+        "low.horizon=2",
+    ],
+    "random": [],
+}
+CASES = {
+    **{name: (name, words) for name, words in SHORT.items()},
+    "hyar_nearest": ("hyar", [*SHORT["hyar"], "low.discrete=nearest"]),
+    "pdqn_n_step": ("pdqn", [*SHORT["pdqn"], "low.n_step=3", "low.double_q=true"]),
+    "paddpg_twin": ("paddpg", [*SHORT["paddpg"], "low.twin=true"]),
+}
+
+
+def make_learner(name: str, specs: PAMDPSpecs):
+    torch.manual_seed(0)
+    low, words = CASES[name]
+    words = [word for word in words if "updates_per_frame" not in word]
+    rate = ["low.updates_per_frame=0.1"] if any("batch_size" in word for word in words) and low != "hppo" else []
+    return make_config([f"low={low}", "high=none", "env=platform", *words, *rate]).low.build(specs=specs, device=CPU)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_forbidden_action_is_never_taken(name):
+    env = with_decisions(Forbidden(16), 1.0)
+    specs = PAMDPSpecs.from_env(env)
+    assert specs.has_action_mask and not specs.has_option_mask
+    learner = make_learner(name, specs)
+    agent = HierarchicalAgent(None, [learner], specs)
+    td = env.reset()
+    for _ in range(6):
+        with torch.no_grad():
+            batch = env.rollout(12, agent.policy, break_when_any_done=False, auto_reset=False, tensordict=td)
+        td = env.step_mdp(batch[:, -1])
+        agent.learn(batch)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        env.rollout(8, agent.policy, break_when_any_done=False)
+    assert env.base_env.violations == 0
+    parameters = [part for part in learner.state_dict().values() if torch.is_tensor(part) and part.is_floating_point()]
+    assert not any(part.isnan().any() for part in parameters)
+
+
+def inflate(learner, k: int) -> None:
+    """Make action `k` look far better than all others, to everything that the learner bootstraps from."""
+    networks = {
+        "PDQN": ["critics", "target_critics"],
+        "TD3BC": ["target_critics"],
+        "HSAC": ["target_critics"],
+        "PADDPG": ["target_actor"],
+    }
+    for network in networks.get(type(learner).__name__, []):
+        part = getattr(learner, network)
+        last = part.net[-1] if network == "target_actor" else part.net.layers[-1]
+        last.bias.data[..., k] += 1000.0
+    if hasattr(learner, "sarsa"):
+        learner.policy.w[k] += 1000.0
+
+
+@pytest.mark.parametrize("name", ["pdqn", "pdqn_n_step", "paddpg", "hsac", "td3_bc", "qpamdp"])
+def test_what_a_forbidden_action_is_worth_does_not_change_a_value(name):
+    learner = make_learner(name, PAMDPSpecs.from_env(Forbidden(2)))
+    observation = torch.eye(NUM_DISCRETE)
+    if name == "qpamdp":
+        learner._warm_up(torch.rand(10, NUM_DISCRETE))
+        learner.policy.w.normal_()
+    mask = torch.arange(NUM_DISCRETE).expand(3, -1) != 1
+
+    def value() -> torch.Tensor:
+        torch.manual_seed(1)
+        return learner.value(observation, mask)
+
+    before = value()
+    inflate(learner, 1)
+    torch.testing.assert_close(value(), before)
+    inflate(learner, 2)
+    assert (value() - before).abs().max() > 1e-4
+
+
+@pytest.mark.parametrize("name", ["hyar", "hyar_nearest"])
+def test_a_latent_action_is_worth_what_its_allowed_action_is_worth(name):
+    learner = make_learner(name, PAMDPSpecs.from_env(Forbidden(2)))
+    observation = torch.eye(NUM_DISCRETE)
+
+    def value(*allowed: int) -> torch.Tensor:
+        torch.manual_seed(1)
+        return learner.value(observation, torch.isin(torch.arange(NUM_DISCRETE), torch.tensor(allowed)).expand(3, -1))
+
+    single = torch.stack([value(0), value(1), value(2)])
+    assert (single - single[0]).abs().max() > 0.0
+    pair = value(0, 2)
+    if name == "hyar":
+        torch.testing.assert_close(pair, single[[0, 2]].amax(0))
+    embeddings = learner.codec.embeddings.detach()
+    latent = torch.cat([embeddings, torch.zeros(3, learner.codec.latent_dim)], -1).unsqueeze(1)
+    moved = learner.codec.of_allowed(latent, torch.tensor([False, True, False]).expand(3, -1))
+    torch.testing.assert_close(moved[:, 0, : embeddings.shape[1]], embeddings[[1, 1, 1]])
+
+
+@pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
+@pytest.mark.parametrize("name", [*SHORT])
+def test_an_option_that_is_a_set_of_actions_takes_no_other_action(name, is_shared):
+    problem = Forbidden(8)
+    problem.option_names = ()
+    # Whatever is forbidden, each option allows something else.
+    problem.group_actions({"low": [0, 1], "high": [1, 2], "ends": [0, 2]})
+    env = with_decisions(problem, 1.0, 2)
+    specs = PAMDPSpecs.from_env(env)
+    assert specs.option_names == ("low", "high", "ends")
+    parts = [specs.with_option_observed()] if is_shared else [specs.of_option(i) for i in range(3)]
+    selector = make_config(["high=uniform", "low=random"]).high.build(specs=specs, device=CPU)
+    agent = HierarchicalAgent(selector, [make_learner(name, each) for each in parts], specs, is_shared=is_shared)
+    td = env.reset()
+    for _ in range(4):
+        with torch.no_grad():
+            batch = env.rollout(8, agent.policy, break_when_any_done=False, auto_reset=False, tensordict=td)
+        td = env.step_mdp(batch[:, -1])
+        allowed = torch.tensor(specs.option_actions)[batch[keys.OPTION], batch[keys.DISCRETE]]
+        assert allowed.all() and problem.violations == 0
+        if name not in ("dlpa", "pets"):  # they have no value for the others to go on from
+            agent.learn(batch)
+
+
+SELECTORS = {
+    "uniform": [],
+    "fixed": ["high.option=first"],
+    "epsilon_greedy": [],
+    "ucb": [],
+    "thompson": [],
+    "exp3": [],
+    "linucb": ["high.inputs=null"],
+    "lin_thompson": ["high.inputs=null"],
+    "meta_critic": ["high.warmup_decisions=32", "high.batch_size=16", "high.epsilon_decisions=50"],
+    "option_critic": ["high.warmup_steps=64", "high.batch_size=16", "high.epsilon_steps=100"],
+    "actor": ["high.minibatch_size=32"],
+}
+
+
+@pytest.mark.parametrize("high", SELECTORS)
+def test_a_forbidden_option_is_never_chosen(high):
+    env = with_decisions(Forbidden(16, has_option=True), 1.0)
+    specs = PAMDPSpecs.from_env(env)
+    assert specs.has_option_mask
+    torch.manual_seed(0)
+    config = make_config([f"high={high}", "low=random", *SELECTORS[high]])
+    selector: Selector = config.high.build(specs=specs, device=CPU)
+    agent = HierarchicalAgent(selector, [Random(specs)], specs)
+    td = env.reset()
+    for i in range(8):
+        selector.is_uniform.fill_(i == 0)
+        with torch.no_grad():
+            batch = env.rollout(9, agent.policy, break_when_any_done=False, auto_reset=False, tensordict=td)
+        td = env.step_mdp(batch[:, -1])
+        agent.learn(batch)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        env.rollout(8, agent.policy, break_when_any_done=False)
+    assert env.base_env.violations == 0
+
+
+def test_a_mask_that_allows_nothing_is_told_in_one_line_that_names_the_environment():
+    env = with_decisions(Forbidden(3, is_empty=True))
+    with pytest.raises(ProblemError, match=r"^Forbidden: environment 0 gave an action_mask that allows nothing$"):
+        env.reset()
+
+
+def test_where_an_episode_is_over_a_mask_allows_everything():
+    env = with_decisions(Forbidden(2))
+    specs = PAMDPSpecs.from_env(env)
+    rows = env.rollout(4, Random(specs).policy)
+    assert rows["next", keys.ACTION_MASK][:, -1].all() and not rows["next", keys.ACTION_MASK][:, 0].all(-1).any()
+
+
+def test_a_problem_without_masks_has_none():
+    config = make_config(["env=platform", "high=none", "low=random"])
+    specs = PAMDPSpecs.from_env(config.env.build(num_envs=2, device=CPU, seed=0))
+    assert not specs.has_action_mask and not specs.has_option_mask
+    assert specs.allowed(torch.zeros(2, specs.observation_dim)) is None
+    learner = config.low.build(specs=specs)
+    assert HierarchicalAgent(None, [learner], specs).router.in_keys == [keys.OBSERVATION]
+    td = TensorDict({keys.OBSERVATION: torch.zeros(4, specs.observation_dim)}, [4])
+    torch.manual_seed(0)
+    taken = learner.policy(td)[keys.DISCRETE]
+    torch.manual_seed(0)
+    torch.rand(4, specs.num_parameters)
+    assert torch.equal(taken, torch.randint(specs.num_discrete, (4,))), "the same random numbers as without masks"
