@@ -93,6 +93,7 @@ class PETSModel(nn.Module):
     change_scale: Tensor
     is_predicted: Tensor
     is_changing: Tensor
+    is_input: Tensor
     derivation: Tensor
     reward_mean: Tensor
     reward_scale: Tensor
@@ -129,12 +130,16 @@ class PETSModel(nn.Module):
         in_dim = dim + action_dim
         self.transition = MemberNet(num_members, in_dim, transition_dims, dim * (2 if is_probabilistic else 1))
         self.outcome = MemberNet(num_members, in_dim + dim + feature_dim, outcome_dims, 3)
+        # What a context means for a turned state is its direction alone: one model serves all of them.
+        is_input = torch.ones(dim)
+        if self.frame.turns and self.frame.geometry is not None:
+            is_input[self.frame.geometry.entries_of_contexts] = 0.0
         buffers = {
             "state_mean": torch.zeros(dim),
             "state_scale": torch.ones(dim),
             "change_scale": torch.ones(dim),
-            "is_predicted": torch.ones(dim),
-            "is_changing": torch.ones(dim),
+            "is_predicted": is_input.clone(),
+            "is_changing": is_input.clone(),
             "derivation": torch.eye(dim),
             "reward_mean": torch.zeros(2),
             "reward_scale": torch.ones(2),
@@ -143,6 +148,7 @@ class PETSModel(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value)
+        self.register_buffer("is_input", is_input, persistent=False)
 
     def forward(
         self, state: Tensor, discrete: Tensor, own: Tensor, precision: torch.dtype = torch.float32
@@ -192,7 +198,7 @@ class PETSModel(nn.Module):
             What the transition networks say, the change of the state `[E, B, observation_dim]` and what the outcome
             networks say: logit, scaled reward if the step terminates, and if it does not.
         """
-        x = joined((turned - self.state_mean) / self.state_scale, action)
+        x = joined((turned - self.state_mean) / self.state_scale * self.is_input, action)
         transition = self.transition(x, precision)
         scaled = transition.detach()
         if self.is_probabilistic:
@@ -242,7 +248,7 @@ class PETSModel(nn.Module):
         change = (next_turned - turned)[~terminated]
         if len(change) > 1:
             self.change_scale.copy_(_scale_of(change))
-            self.is_changing.copy_((change.abs().amax(0) > 1e-6).float())
+            self.is_changing.copy_((change.abs().amax(0) > 1e-6).float() * self.is_input)
             self._derive(change / self.change_scale)
         for place, rows in enumerate((reward[~terminated], reward[terminated])):
             if len(rows) > 1:
@@ -258,8 +264,9 @@ class PETSModel(nn.Module):
         is_predicted = [False] * dim
         derivation = torch.zeros(dim, dim, dtype=torch.float64, device=change.device)
         columns = change.double()
-        if len(columns) < 4 * dim:
-            return  # too few to tell
+        if len(columns) < 4 * dim:  # too few to tell
+            self.is_predicted.copy_(self.is_input)
+            return
         for entry in range(dim):
             if self.is_changing[entry] == 0.0:
                 continue
@@ -349,6 +356,19 @@ class PETSPolicy(TensorDictModuleBase):
         if begins is None:
             return held.flatten()
         return torch.where(begins.flatten(), fresh, held.flatten())
+
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the expected returns `[N]` of the plans from observations `[N, *]`.
+
+        Greedily that is by the mean of all members; exploring, by a random member for each observation, so that what
+        members disagree on is tried. As long as nothing is planned, it is 0, and exploring infinite.
+        """
+        num = len(observation)
+        if not bool(self.is_trained):
+            return torch.full((num,), 0.0 if is_greedy() else torch.inf, device=observation.device)
+        member = torch.randint(self.model.num_members, (num,), device=observation.device)
+        return self.plan(observation[:, self.entries], None if is_greedy() else member).value
 
     def plan(self, state: Tensor, member: Tensor | None = None) -> Found:
         """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all."""
@@ -494,6 +514,10 @@ class PETS(ReplayLearner):
         for name in ("state", "next_state"):
             rows.set(name, rows[name][..., self.entries])
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the expected returns `[N]` of the plans from observations `[N, *]`, see `PETSPolicy.value`."""
+        return self.policy.value(observation)
 
     def explore(self, frames: int) -> None:
         """Let the policy plan, as soon as there are different rewards to plan for."""
