@@ -23,6 +23,7 @@ HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"
 BOTH_BOATS = -1  # in the column `controller` of these
 BLOCK_EPISODES = 60
 BOATS = ("congruent", "incongruent")
+TASKS = {"congruent": "congruent", "incongruent": "incongruent", "choose": "chosen by the agent"}
 HUMAN_SCORE = HUMAN["chosen"]["score"]
 BEST_SCORE = BEST_PERSON["score"]
 SETTINGS = {
@@ -68,7 +69,7 @@ def table(curves: Rows) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     for (augment, reward), label in SETTINGS.items():
-        for boat in BOATS:
+        for boat, task in TASKS.items():
             rows = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == (augment, reward, boat)]
             if not rows:
                 continue
@@ -78,7 +79,7 @@ def table(curves: Rows) -> str:
             after = [[row["score"] for row in rows if row["presses"] == presses] for presses in (256, 384)]
             scores = " | ".join(spread(score) if len(score) == len(runs) else "" for score in after)
             lines.append(
-                f"| {label} | {boat} | {len(runs)} | {_presses(human, 'median')} | {_presses(human, 'slowest')} | "
+                f"| {label} | {task} | {len(runs)} | {_presses(human, 'median')} | {_presses(human, 'slowest')} | "
                 f"{_presses(best, 'median')} | {scores} |"
             )
     return "\n".join(lines)

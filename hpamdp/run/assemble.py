@@ -300,6 +300,8 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
             f"agent.option_length=learned: {config.high} does not decide where options end; use high=option_critic, "
             "high=meta_critic or a number of steps"
         )
+    if getattr(config.high.cls, "asks_learners", False) and getattr(config.low.cls, "value", None) is Learner.value:
+        raise ConfigError(f"{config.high}: {config.low} has no value to compare; use another low or another high")
 
 
 def check_modes(config: Config) -> None:
