@@ -77,7 +77,7 @@ class SequenceSearch:
     cross-entropy planning over mixed actions, sequences whose parameters should differ share one Gaussian.
 
     Samples are stratified, one for each of as many equally likely intervals, as in a Latin hypercube: McKay, Beckman
-    and Conover 1979, *Technometrics* 21(2). Half as many then find as good a plan as independent ones.
+    and Conover 1979, *Technometrics* 21(2).
 
     Args:
         parameter_dims: number of parameters of each discrete action.
