@@ -36,6 +36,16 @@ class Contexts:
             return observation.new_zeros(observation.shape[:-1], dtype=torch.long)
         return observation[..., self.context_entry].round().long().clamp(0, self.num_contexts - 1)
 
+    @property
+    def entries_of_contexts(self) -> list[int]:
+        """The entries of the observation that say which of several contexts holds."""
+        if self.num_contexts == 1:
+            return []
+        entries = [] if self.context_entry is None else [self.context_entry]
+        if self.one_hot_entry is not None:
+            entries += range(self.one_hot_entry, self.one_hot_entry + self.num_contexts)
+        return entries
+
     def _entries_in(self, place: Mapping[int, int]) -> dict[str, Any]:
         """Return where the context lies among other entries, by their places."""
         names = ("context_entry", "one_hot_entry")

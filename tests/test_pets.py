@@ -61,17 +61,50 @@ def learn(learner: PETS, batch: TensorDict) -> dict[str, float]:
 # The search.
 
 
+def whole(steps) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the sequences that the steps make up, `[N, Q, H]` and `[N, Q, S, H, D]`."""
+    num = steps[-1].discrete.shape[1]
+    parts = [[part.repeat_interleave(num // part.shape[1], 1) for part in step] for step in steps]
+    return torch.stack([discrete for discrete, _ in parts], -1), torch.stack([own for _, own in parts], -2)
+
+
 def test_all_sequences_are_tried_where_there_are_few():
     search = SequenceSearch(SPECS.parameter_dims, **SEARCH)
-    sequences = search.sequences(2, CPU)
-    assert sequences.shape == (2, 9, 2)
-    assert sequences[0].tolist() == [[first, second] for first in range(3) for second in range(3)]
-    assert torch.equal(sequences[0], sequences[1])
+    first, second = search.sequences(2, CPU)
+    assert first.tolist() == [[0, 1, 2]] * 2
+    assert second.tolist() == [[0, 1, 2] * 3] * 2, "each first step is shared by the sequences that begin with it"
+
+
+def test_sequences_that_begin_alike_share_their_first_steps_parameters():
+    seen = []
+
+    def returns(steps):
+        seen.append(steps)
+        return torch.rand(4, 9, 16) if len(seen) == 1 else torch.rand(4, 3, 16)
+
+    SequenceSearch(SPECS.parameter_dims, **SEARCH)(returns, 4, CPU)
+    assert [[tuple(step.own.shape[:3]) for step in steps] for steps in seen] == [
+        [(4, 3, 16), (4, 9, 16)],
+        [(4, 3, 16), (4, 3, 16)],
+        [(4, 3, 16), (4, 3, 16)],
+    ]
+
+
+def test_samples_are_spread_evenly():
+    seen = []
+
+    def returns(steps):
+        seen.append(steps[0].own)
+        return -steps[1].own.square().sum(-1)
+
+    SequenceSearch((1, 1), **{**SEARCH, "num_kept": 4, "num_iterations": 1})(returns, 5, CPU)
+    place = ((seen[0][..., 0] + 1.0) * 8.0).floor().sort(-1).values
+    assert (place == torch.arange(16)).all(), "one of 16 in each sixteenth of the bounds"
 
 
 def test_of_many_sequences_random_ones_are_tried_in_which_first_actions_occur_equally_often():
     search = SequenceSearch((1,) * 8, **{**SEARCH, "horizon": 5, "max_sequences": 32})
-    sequences = search.sequences(50, CPU)
+    sequences = torch.stack(search.sequences(50, CPU), -1)
     assert sequences.shape == (50, 32, 5)
     for state in sequences[..., 0]:
         assert state.bincount(minlength=8).tolist() == [4] * 8
@@ -80,13 +113,14 @@ def test_of_many_sequences_random_ones_are_tried_in_which_first_actions_occur_eq
 
 def test_more_actions_than_sequences_get_their_turn():
     search = SequenceSearch((1,) * 100, **SEARCH)
-    assert len(search.sequences(200, CPU)[..., 0].unique()) == 100
+    assert len(search.sequences(200, CPU)[0].unique()) == 100
 
 
 @pytest.mark.parametrize("max_sequences", [2, 64])
 def test_the_search_finds_the_best_sequence_and_its_parameters(max_sequences):
     # Worth most: action 1 with (.5, -.3), then action 0 with .2; of two random sequences one has the right beginning.
-    def returns(discrete, unit):
+    def returns(steps):
+        discrete, unit = whole(steps)
         error = (unit[..., 0, 0] - 0.5).square() + (unit[..., 0, 1] + 0.3).square() + (unit[..., 1, 0] - 0.2).square()
         is_best = (discrete[..., 0] == 1) & ((discrete[..., 1] == 0) | (max_sequences == 2))
         return is_best.float().unsqueeze(-1) - error
@@ -101,9 +135,9 @@ def test_the_search_finds_the_best_sequence_and_its_parameters(max_sequences):
 def test_what_an_action_has_no_parameter_for_is_0_in_every_sample():
     seen = []
 
-    def returns(discrete, unit):
-        seen.append((discrete, unit))
-        return torch.rand(unit.shape[:3])
+    def returns(steps):
+        seen.append(whole(steps))
+        return torch.rand(seen[-1][1].shape[:3])
 
     SequenceSearch(SPECS.parameter_dims, **SEARCH)(returns, 5, CPU)
     dims = torch.tensor(SPECS.parameter_dims)
@@ -115,7 +149,7 @@ def test_what_an_action_has_no_parameter_for_is_0_in_every_sample():
 
 def test_actions_without_any_parameters_can_be_searched():
     found = SequenceSearch((0, 0), **SEARCH)(
-        lambda discrete, unit: discrete.sum(-1, keepdim=True).float().expand(unit.shape[:3]), 4, CPU
+        lambda steps: whole(steps)[0].sum(-1, keepdim=True).float().expand(whole(steps)[1].shape[:3]), 4, CPU
     )
     assert found.own.shape == (4, 0) and (found.discrete == 1).all()
 
@@ -236,7 +270,7 @@ def test_the_plan_of_a_turned_state_is_the_turned_plan(number):
 
     def plan(seen, order):
         # Random numbers belong to places in the list of sequences: list the turned sequences in the same order.
-        search.sequences = lambda num, device: order[plain(num, device)]
+        search.sequences = lambda num, device: [order[part] for part in plain(num, device)]
         torch.manual_seed(1)
         return learner.policy.plan(seen[:, entries])
 
@@ -284,26 +318,32 @@ def test_an_environment_follows_one_member_until_its_episode_ends():
     assert member[:, 0].bincount(minlength=5).min() > 0
 
 
+def with_opinions(learner: PETS, rewards: list[float]) -> PETS:
+    """Let each member predict its own constant reward, whatever is done."""
+    with torch.no_grad():
+        for part in learner.model.outcome.layers[-1:]:
+            part.weight.zero_()
+            part.bias.copy_(torch.tensor(rewards)[:, None, None].expand_as(part.bias))
+            part.bias[..., 0] = -20.0  # no step terminates
+    return learner
+
+
 def test_exploring_plans_with_the_environments_own_member_and_greedy_ones_with_all():
-    learner = make(num_members=3, parameter_noise=0.0)
+    learner = with_opinions(make(num_members=3), [1.0, 2.0, 6.0])
+    state, member = torch.randn(6, 4), torch.tensor([2, 0, 2, 2, 0, 0])
+    two_steps = 1.0 + learner.gamma
+    own = learner.policy.plan(state, member).value
+    torch.testing.assert_close(own, two_steps * torch.tensor([1.0, 2.0, 6.0])[member], atol=1e-3, rtol=0.0)
+    together = learner.policy.plan(state).value
+    torch.testing.assert_close(together, two_steps * torch.full((6,), 3.0), atol=1e-3, rtol=0.0)
     asked = []
-    search = learner.policy._plan
-    learner.policy._plan = lambda state, members: asked.append((len(state), members)) or search(state, members)
-    td = TensorDict(
-        {
-            keys.OBSERVATION: torch.randn(6, 4),
-            MEMBER: torch.tensor([2, 0, 2, 2, 0, 0]),
-            keys.IS_DECISION: torch.zeros(6, 1, dtype=torch.bool),
-            keys.DONE: torch.zeros(6, 1, dtype=torch.bool),
-        },
-        [6],
-    )
+    plan = learner.policy.plan
+    learner.policy.plan = lambda state, member=None: asked.append(member) or plan(state, member)
+    td = TensorDict({keys.OBSERVATION: state, MEMBER: member, keys.IS_DECISION: torch.zeros(6, 1).bool()}, [6])
     acting(learner, td.clone())
-    assert asked == [(3, slice(0, 1)), (3, slice(2, 3))]
-    asked.clear()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acting(learner, td.clone())
-    assert asked == [(6, slice(None))]
+    assert torch.equal(asked[0], member) and asked[1] is None
 
 
 def test_plans_with_own_members_come_back_in_the_order_of_the_states():

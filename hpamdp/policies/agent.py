@@ -98,6 +98,38 @@ class OptionRouter(TensorDictModuleBase):
         return td.select(*self.in_keys, strict=False)
 
 
+class OptionValues(nn.Module):
+    """What the learners expect of each option.
+
+    A module, so that the learners' weights reach the selector's copies in other processes.
+
+    Args:
+        learners: one for each option, or a single one that observes the option.
+        num_options: how many options there are.
+    """
+
+    def __init__(self, learners: Sequence[Learner], num_options: int) -> None:
+        super().__init__()
+        self.learners = nn.ModuleList(learners)
+        self.num_options = num_options
+
+    @torch.no_grad()
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return the values `[N, num_options]` of observations `[N, observation_dim]`."""
+        if len(self.learners) == self.num_options:
+            values = [learner.value(observation) for learner in self._learners()]
+        else:
+            (learner,) = self._learners()
+            one_hot = torch.eye(self.num_options, device=observation.device)
+            values = [learner.value(torch.cat([observation, row.expand(len(observation), -1)], -1)) for row in one_hot]
+        return torch.stack(values, -1)
+
+    def _learners(self) -> Iterator[Learner]:
+        for learner in self.learners:
+            assert isinstance(learner, Learner)
+            yield learner
+
+
 class HeldOption(TensorDictModuleBase):
     """The same option in every environment at every step; the first allowed one where it is forbidden."""
 
@@ -256,6 +288,8 @@ class HierarchicalAgent(nn.Module):
         self.next_options: NextOptions | None = None
         if selector is not None:
             selector.decides_ends = selector_ends_options
+            if selector.asks_learners:
+                selector.option_values = OptionValues(learners, specs.num_options)
             self.next_options = NextOptions(selector, learners, is_shared)
             for learner in learners:
                 learner.following = self.next_options

@@ -111,6 +111,9 @@ class Selector(TensorDictModuleBase):
             writes more than its observation: with `oracle` its planner's best action for each option (the `ORACLE_`
             keys of `hpamdp.keys`), with `human` the probabilities of the human choices (`HUMAN_OPTION`). Append the
             keys that `select` reads to `in_keys`. Environments without such an argument are refused.
+        asks_learners: whether the selector wants `option_values`.
+        option_values: maps observations `[N, observation_dim]` to what the learners themselves expect of each option,
+            `[N, num_options]`; the agent sets it, if `asks_learners`.
         gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
             it, and so is the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
@@ -128,6 +131,7 @@ class Selector(TensorDictModuleBase):
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
+    asks_learners: ClassVar[bool] = False
     is_bandit: ClassVar[bool] = False
     ends_options: ClassVar[bool] = False
     decides_ends: bool = False
@@ -135,6 +139,7 @@ class Selector(TensorDictModuleBase):
     gamma: float = 1.0
     is_uniform: Tensor
     pending: Tensor
+    option_values: nn.Module
 
     in_keys: list[NestedKey]
     out_keys: list[NestedKey]

@@ -338,6 +338,8 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
             f"agent.termination=learned: {config.high} does not decide where options end; use high=option_critic, "
             "high=meta_critic or agent.termination=steps"
         )
+    if getattr(config.high.cls, "asks_learners", False) and getattr(config.low.cls, "value", None) is Learner.value:
+        raise ConfigError(f"{config.high}: {config.low} has no value to compare; use another low or another high")
 
 
 def check_learners_of_options(config: Config, env: PAMDPEnv) -> None:

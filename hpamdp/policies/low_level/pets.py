@@ -25,7 +25,7 @@ Differs from the sources:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import ClassVar, Literal
 
@@ -39,23 +39,22 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
-from hpamdp.policies.shared.frame import CanonicalFrame
+from hpamdp.policies.shared.frame import CanonicalFrame, joined
 from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.networks import EnsembleLinear
-from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, discounted_return
+from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, SequenceStep, discounted_return
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
 MEMBER = "member"  # which member an environment follows, int64 [*B]
 
 _CHUNK_ROWS = 8192  # states predicted at once when planning: fits the cache and bounds the memory
-_ALL = slice(None)
 _LOG_VARIANCE_LOW, _LOG_VARIANCE_HIGH = -10.0, 1.0  # of a scaled change
 _LARGEST_COPIES = 16  # of a stored step under the problem's symmetries
 
 
 class MemberNet(nn.Module):
-    """Independent networks with SiLU, one for each member, `[E, B, in]` -> `[E, B, out]`."""
+    """Independent networks with ReLU, one for each member, `[E, B, in]` -> `[E, B, out]`."""
 
     def __init__(self, num_members: int, in_dim: int, hidden_dims: list[int], out_dim: int) -> None:
         super().__init__()
@@ -66,14 +65,16 @@ class MemberNet(nn.Module):
             nn.init.zeros_(layer.bias)
         self.layers = nn.ModuleList(layers)
 
-    def forward(self, x: Tensor, members: slice) -> Tensor:
-        """Apply the given members, each to its own slice of `x`."""
+    def forward(self, x: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
+        """Apply each member to its own slice of `x`, with this precision."""
+        x = x.mT.to(precision)  # [E, in, B]: see `joined`
         for place, layer in enumerate(self.layers):
             assert isinstance(layer, EnsembleLinear)
-            x = torch.baddbmm(layer.bias[members], x, layer.weight[members])
+            bias, weight = layer.bias.to(precision), layer.weight.to(precision)
+            x = torch.baddbmm(bias.mT, weight.mT, x)
             if place < len(self.layers) - 1:
-                x = F.silu(x)
-        return x
+                x = x.relu_()
+        return x.mT.float()
 
 
 class PETSModel(nn.Module):
@@ -93,6 +94,7 @@ class PETSModel(nn.Module):
     change_scale: Tensor
     is_predicted: Tensor
     is_changing: Tensor
+    is_input: Tensor
     derivation: Tensor
     reward_mean: Tensor
     reward_scale: Tensor
@@ -129,12 +131,16 @@ class PETSModel(nn.Module):
         in_dim = dim + action_dim
         self.transition = MemberNet(num_members, in_dim, transition_dims, dim * (2 if is_probabilistic else 1))
         self.outcome = MemberNet(num_members, in_dim + dim + feature_dim, outcome_dims, 3)
+        # What a context means for a turned state is its direction alone: one model serves all of them.
+        is_input = torch.ones(dim)
+        if self.frame.turns and self.frame.geometry is not None:
+            is_input[self.frame.geometry.entries_of_contexts] = 0.0
         buffers = {
             "state_mean": torch.zeros(dim),
             "state_scale": torch.ones(dim),
             "change_scale": torch.ones(dim),
-            "is_predicted": torch.ones(dim),
-            "is_changing": torch.ones(dim),
+            "is_predicted": is_input.clone(),
+            "is_changing": is_input.clone(),
             "derivation": torch.eye(dim),
             "reward_mean": torch.zeros(2),
             "reward_scale": torch.ones(2),
@@ -143,21 +149,24 @@ class PETSModel(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value)
+        self.register_buffer("is_input", is_input, persistent=False)
 
-    def forward(self, state: Tensor, discrete: Tensor, own: Tensor, members: slice = _ALL) -> Prediction:
-        """Predict one step with some of the members, each from states of its own.
+    def forward(
+        self, state: Tensor, discrete: Tensor, own: Tensor, precision: torch.dtype = torch.float32
+    ) -> Prediction:
+        """Predict one step with every member, each from states of its own.
 
         Args:
             state: `[E, B, observation_dim]`.
             discrete: `[E, B]`.
             own: parameters of the discrete actions, `[E, B, D]` in [-1, 1].
-            members: which ones, E of them.
+            precision: of the networks.
         """
         direction = self.frame.direction(state, discrete)
         turned = self.frame.turn(state, direction)
         action = self.action_inputs(self.frame.kind[discrete], own)
-        change, outcome = self.in_frame(turned, action, members)[1:]
-        logit, terminating, continuing = outcome.float().unbind(-1)
+        change, outcome = self.in_frame(turned, action, precision)[1:]
+        logit, terminating, continuing = outcome.unbind(-1)
         mean, scale = self.reward_mean, self.reward_scale
         return Prediction(
             self.frame.turn_back(turned + change, direction),
@@ -172,34 +181,36 @@ class PETSModel(nn.Module):
         That is the kind, and each kind's own parameters and their squares, 0 for the other kinds.
         """
         if not self.has_kinds:
-            return torch.cat([own, own.square()], -1)
+            return joined(own, own.square())
         value = own[..., self.slot_number] * (kind.unsqueeze(-1) == self.slot_kind)
-        return torch.cat([F.one_hot(kind, self.frame.num_kinds).to(own.dtype), value, value.square()], -1)
+        return joined(F.one_hot(kind, self.frame.num_kinds).to(own.dtype), value, value.square())
 
-    def in_frame(self, turned: Tensor, action: Tensor, members: slice = _ALL) -> tuple[Tensor, Tensor, Tensor]:
+    def in_frame(
+        self, turned: Tensor, action: Tensor, precision: torch.dtype = torch.float32
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Predict a step in the canonical frame.
 
         Args:
             turned: states `[E, B, observation_dim]`.
             action: of `action_inputs`, `[E, B, *]`.
-            members: which ones, E of them.
+            precision: of the networks.
 
         Returns:
             What the transition networks say, the change of the state `[E, B, observation_dim]` and what the outcome
             networks say: logit, scaled reward if the step terminates, and if it does not.
         """
-        x = torch.cat([(turned - self.state_mean) / self.state_scale, action], -1)
-        transition = self.transition(x, members).float()
+        x = joined((turned - self.state_mean) / self.state_scale * self.is_input, action)
+        transition = self.transition(x, precision)
         scaled = transition.detach()
         if self.is_probabilistic:
             mean, log_variance = self.moments(scaled)
             scaled = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
-        scaled = scaled * self.is_predicted
-        change = (scaled * self.change_scale) @ self.derivation
+        derivation = (self.is_predicted * self.change_scale).unsqueeze(-1) * self.derivation
+        change = (derivation.mT @ scaled.mT).mT
         next_turned = turned + change
         next_x = (next_turned - self.state_mean) / self.state_scale * self.is_changing
         features = (self.features(turned, next_turned) - self.feature_mean) / self.feature_scale
-        return transition, change, self.outcome(torch.cat([x, next_x, features], -1), members)
+        return transition, change, self.outcome(joined(x, next_x, features), precision)
 
     def moments(self, transition: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance of the scaled change, from what the transition networks say."""
@@ -215,14 +226,14 @@ class PETSModel(nn.Module):
         """
         if not self.frame.num_vectors:
             both = [(state - self.state_mean) / self.state_scale for state in (turned, next_turned)]
-            return torch.cat([both[0], both[1] * self.is_changing], -1).square()
+            return joined(both[0], both[1] * self.is_changing).square()
         x, y = self.frame.vectors(turned)
         next_x, next_y = self.frame.vectors(next_turned)
         way_x, way_y = next_x - x, next_y - y
         along = -(x * way_x + y * way_y) / (way_x.square() + way_y.square()).clamp(min=1e-12)
         along = along.clamp(0.0, 1.0)
         lengths = [torch.hypot(x + share * way_x, y + share * way_y) for share in (0.0, 1.0, along)]
-        return torch.cat([*lengths, y.abs()], -1)
+        return joined(*lengths, y.abs())
 
     @torch.no_grad()
     def fit_scales(self, turned: Tensor, next_turned: Tensor, reward: Tensor, terminated: Tensor) -> None:
@@ -238,7 +249,7 @@ class PETSModel(nn.Module):
         change = (next_turned - turned)[~terminated]
         if len(change) > 1:
             self.change_scale.copy_(_scale_of(change))
-            self.is_changing.copy_((change.abs().amax(0) > 1e-6).float())
+            self.is_changing.copy_((change.abs().amax(0) > 1e-6).float() * self.is_input)
             self._derive(change / self.change_scale)
         for place, rows in enumerate((reward[~terminated], reward[terminated])):
             if len(rows) > 1:
@@ -254,8 +265,9 @@ class PETSModel(nn.Module):
         is_predicted = [False] * dim
         derivation = torch.zeros(dim, dim, dtype=torch.float64, device=change.device)
         columns = change.double()
-        if len(columns) < 4 * dim:
-            return  # too few to tell
+        if len(columns) < 4 * dim:  # too few to tell
+            self.is_predicted.copy_(self.is_input)
+            return
         for entry in range(dim):
             if self.is_changing[entry] == 0.0:
                 continue
@@ -315,21 +327,22 @@ class PETSPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action, the member `[*B]` and the parameters `[*B, num_parameters]`."""
-        state = td.get(keys.OBSERVATION)[..., self.entries].flatten(0, -2)
+        observation = td.get(keys.OBSERVATION).flatten(0, -2)
+        state = observation[:, self.entries]
         num, device = len(state), state.device
         member = self._members(td, num, device)
         mask = td.get(keys.ACTION_MASK, None)
-        mask = None if mask is None else mask.flatten(0, -2)
-        allowed = self.specs.allowed(state, mask)
-        discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed, device)
+        allowed = self._allowed(observation, None if mask is None else mask.flatten(0, -2))
+        allowed_now = None if allowed is None else allowed[:, 0]
+        discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed_now, device)
         unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device) - 1.0
         is_planned = self.is_trained.expand(num)
         done = td.get(keys.DONE, None)
         if done is not None:
             is_planned = is_planned & ~done.flatten()
         if is_planned.any():
-            mask = None if mask is None else mask[is_planned]
-            found = self.plan(state[is_planned], None if is_greedy() else member[is_planned], mask)
+            allowed = None if allowed is None else allowed[is_planned]
+            found = self.plan(state[is_planned], None if is_greedy() else member[is_planned], allowed)
             own = found.own
             if not is_greedy():
                 own = (own + self.noise * torch.randn_like(own)).clamp(-1.0, 1.0)
@@ -350,68 +363,108 @@ class PETSPolicy(TensorDictModuleBase):
             return held.flatten()
         return torch.where(begins.flatten(), fresh, held.flatten())
 
-    def plan(self, state: Tensor, member: Tensor | None = None, action_mask: Tensor | None = None) -> Found:
+    @torch.no_grad()
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
+
+        Greedily that is by the mean of all members; exploring, by a random member for each observation, so that what
+        members disagree on is tried. As long as nothing is planned, it is 0, and exploring infinite.
+        """
+        num = len(observation)
+        if not bool(self.is_trained):
+            return torch.full((num,), 0.0 if is_greedy() else torch.inf, device=observation.device)
+        member = torch.randint(self.model.num_members, (num,), device=observation.device)
+        allowed = self._allowed(observation, action_mask)
+        return self.plan(observation[:, self.entries], None if is_greedy() else member, allowed).value
+
+    def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> Found:
         """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all.
 
         Args:
             state: where the plans begin.
             member: of each of them.
-            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything. What it will
-                allow in predicted states is unknown, and taken to be everything.
+            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
         """
-        allowed = self._allowed(state, action_mask)
+        num_members = self.model.num_members
         if member is None:
-            return self._plan(state, _ALL, allowed)
-        order = member.argsort(stable=True)
-        parts = []
-        for each in member.unique().tolist():
-            rows = member == each
-            own = None if allowed is None else allowed[rows]
-            parts.append(self._plan(state[rows], slice(each, each + 1), own))
-        found = [torch.cat(part) for part in zip(*parts, strict=True)]
-        place = torch.empty_like(order)
-        place[order] = torch.arange(len(order), device=order.device)
-        return Found(*(part[place] for part in found))
+            return self._plan(state.expand(num_members, -1, -1), allowed, is_mean=True)
+        # All members at once, each with as many states as the one with the most, some of them zeros.
+        is_own = member.unsqueeze(-1) == torch.arange(num_members, device=member.device)
+        place = (is_own.cumsum(0) - 1).gather(1, member.unsqueeze(-1)).squeeze(-1)
+        num_places = int(place.max()) + 1
+        stacked = state.new_zeros(num_members, num_places, state.shape[-1])
+        stacked[member, place] = state
+        if allowed is not None:
+            of_members = allowed.new_ones(num_members, num_places, *allowed.shape[1:])
+            of_members[member, place] = allowed
+            allowed = of_members
+        found = self._plan(stacked, allowed, is_mean=False)
+        row = member * num_places + place
+        return Found(*(part[row] for part in found))
 
-    def _allowed(self, state: Tensor, action_mask: Tensor | None) -> Tensor | None:
-        """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`; None: all."""
-        first = self.specs.allowed(state, action_mask)
+    def _allowed(self, observation: Tensor, action_mask: Tensor | None) -> Tensor | None:
+        """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`; None: all.
+
+        What the environment will allow in predicted states is unknown, and taken to be everything.
+        """
+        first = self.specs.allowed(observation, action_mask)
         if first is None:
             return None
-        later = self.specs.allowed(state)
+        later = self.specs.allowed(observation)
         later = torch.ones_like(first) if later is None else later
         return torch.stack([first] + [later] * (self.search.horizon - 1), 1)
 
-    def _plan(self, state: Tensor, members: slice, allowed: Tensor | None) -> Found:
-        size = max(1, _CHUNK_ROWS // (self.search.num_sequences * self.search.num_samples))
+    def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> Found:
+        """Plan from states `[E, N, observation_dim]`: N plans by the mean of all members, or one for each state.
+
+        `allowed` is bool `[N, horizon, num_discrete]`, or `[E, N, horizon, num_discrete]`.
+        """
+        rows = self.search.num_sequences * self.search.num_samples
+        size = max(1, _CHUNK_ROWS // rows)
         found = []
-        for begin in range(0, len(state), size):
-            piece = state[begin : begin + size]
-            own = None if allowed is None else allowed[begin : begin + size]
-            found.append(self.search(self._returns(piece, members), len(piece), state.device, own))
-        return Found(*(torch.cat(part) for part in zip(*found, strict=True)))
+        for begin in range(0, state.shape[1], size):
+            piece = state[:, begin : begin + size]
+            own = allowed
+            if own is not None:
+                own = own[begin : begin + size] if is_mean else own[:, begin : begin + size].flatten(0, 1)
+            num_plans = piece.shape[1] if is_mean else piece.shape[:2].numel()
+            part = self.search(self._returns(piece, is_mean), num_plans, state.device, own)
+            found.append(part if is_mean else Found(*(each.unflatten(0, piece.shape[:2]) for each in part)))
+        joined_found = Found(*(torch.cat(part, 0 if is_mean else 1) for part in zip(*found, strict=True)))
+        return joined_found if is_mean else Found(*(part.flatten(0, 1) for part in joined_found))
 
-    def _returns(self, state: Tensor, members: slice) -> Returns:
-        num_members = self.model.num_members if members == _ALL else 1
+    def _returns(self, state: Tensor, is_mean: bool) -> Returns:
+        num_members, num_states = state.shape[:2]
 
-        def returns(discrete: Tensor, unit: Tensor) -> Tensor:
-            shape = unit.shape[:3]
-            rows = state[:, None, None].expand(*shape, -1).reshape(-1, state.shape[-1])
-            rows = rows.expand(num_members, *rows.shape)
+        def for_members(part: Tensor) -> Tensor:
+            """Return `[N, ...]` or `[E * N, ...]` as `[E, N, ...]`."""
+            return part.expand(num_members, *part.shape) if is_mean else part.unflatten(0, (num_members, num_states))
 
-            def steps() -> Iterator[Prediction]:
-                nonlocal rows
-                for h in range(self.search.horizon):
-                    action = discrete[:, :, None, h].expand(shape).reshape(-1).expand(num_members, -1)
-                    own = unit[..., h, :].reshape(-1, unit.shape[-1]).expand(num_members, -1, -1)
-                    with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
-                        predicted = self.model(rows, action, own, members)
-                    rows = predicted.next_state
-                    yield predicted
+        def returns(steps: Sequence[SequenceStep]) -> Tensor:
+            num_sequences = steps[-1].discrete.shape[1]
 
-            return discounted_return(steps(), self.gamma).mean(0).reshape(shape)
+            def predictions() -> Iterator[Prediction]:
+                # [E, observation_dim, N, Q_h, S]: see `joined`
+                rows = state.mT[..., None, None].expand(-1, -1, -1, 1, steps[0].own.shape[2])
+                for step in steps:
+                    shape = num_states, *step.own.shape[1:3]
+                    rows = _each_repeated(rows, shape[1] // rows.shape[-2]).flatten(2)
+                    discrete = for_members(step.discrete).unsqueeze(-1).expand(num_members, *shape).flatten(1)
+                    own = for_members(step.own).flatten(1, 3)
+                    ahead = self.model(rows.mT, discrete, own, self.precision)
+                    rows = ahead.next_state.mT.unflatten(-1, shape)
+                    parts = (part.unflatten(1, shape) for part in ahead[1:])
+                    yield Prediction(rows, *(_each_repeated(part, num_sequences // shape[1]) for part in parts))
+
+            total = discounted_return(predictions(), self.gamma)
+            return total.mean(0) if is_mean else total.flatten(0, 1)
 
         return returns
+
+
+def _each_repeated(rows: Tensor, times: int) -> Tensor:
+    """Return `[..., Q, S]` with each of Q repeated, `[..., Q * times, S]`."""
+    return rows if times == 1 else rows.unsqueeze(-2).expand(*rows.shape[:-1], times, -1).flatten(-3, -2)
 
 
 class PETS(ReplayLearner):
@@ -499,6 +552,10 @@ class PETS(ReplayLearner):
         for name in ("state", "next_state"):
             rows.set(name, rows[name][..., self.entries])
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
+
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the expected returns `[N]` of the plans from observations `[N, *]`, see `PETSPolicy.value`."""
+        return self.policy.value(observation, action_mask)
 
     def explore(self, frames: int) -> None:
         """Let the policy plan, as soon as there are different rewards to plan for."""

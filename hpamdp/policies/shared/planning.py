@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from hpamdp.policies.shared.masks import random_choice
+
+# Of a sequence with a forbidden action: finite, so that the weights of the elites are numbers.
+_FORBIDDEN_RETURN = -1e9
 
 
 class Prediction(NamedTuple):
@@ -45,7 +48,18 @@ def elite_weights(returns: Tensor, num_elites: int, temperature: float) -> tuple
     return place, (best / temperature).softmax(-1)
 
 
-Returns = Callable[[Tensor, Tensor], Tensor]
+class SequenceStep(NamedTuple):
+    """One step of many sequences of parameterised actions, `Q_h` of them for each of N states.
+
+    Sequences that begin alike may share their first steps: with Q sequences in all, sequence q takes number
+    `q // (Q / Q_h)` of a step.
+    """
+
+    discrete: Tensor  # int64 [N, Q_h]
+    own: Tensor  # [N, Q_h, S, D] samples of the discrete action's parameters in [-1, 1], 0 past its own
+
+
+Returns = Callable[[Sequence[SequenceStep]], Tensor]
 
 
 class Found(NamedTuple):
@@ -59,13 +73,16 @@ class Found(NamedTuple):
 class SequenceSearch:
     """Find good sequences of parameterised actions: each sequence of discrete actions has Gaussians of its own.
 
-    At first, every sequence of discrete actions is tried with a few samples of the parameters; if there are more than
-    `max_sequences`, so many random ones, in which the first actions occur equally often. Then the best `num_kept` of
-    them are refined: in each iteration, samples from a Gaussian for every parameter, whose mean and deviation are those
-    of the elites of the iteration before.
+    At first, every sequence of discrete actions is tried with a few samples of the parameters, spread evenly over
+    their bounds; if there are more than `max_sequences`, so many random ones, in which the first actions occur equally
+    often. Then the best `num_kept` of them are refined: in each iteration, samples from a Gaussian for every parameter,
+    whose mean and deviation are those of the elites of the iteration before.
 
     A discrete action alone does not say what is done next: with a categorical distribution for each step, as in
     cross-entropy planning over mixed actions, sequences whose parameters should differ share one Gaussian.
+
+    Samples are stratified, one for each of as many equally likely intervals, as in a Latin hypercube: McKay, Beckman
+    and Conover 1979, *Technometrics* 21(2).
 
     Args:
         parameter_dims: number of parameters of each discrete action.
@@ -115,63 +132,98 @@ class SequenceSearch:
         self.has_slot = own.float()  # [num_discrete, D]
 
     @property
+    def tries_all(self) -> bool:
+        """Whether the first iteration tries every sequence of discrete actions."""
+        return self.num_discrete**self.horizon <= self.max_sequences
+
+    @property
     def num_sequences(self) -> int:
         """How many sequences the first iteration tries."""
         return min(self.max_sequences, self.num_discrete**self.horizon)
 
-    def sequences(self, num_states: int, device: torch.device) -> Tensor:
-        """Return the discrete sequences of the first iteration, int64 `[N, Q, horizon]`."""
-        if self.num_sequences == self.num_discrete**self.horizon:
-            number = torch.arange(self.num_sequences, device=device).expand(num_states, -1)
-            digits = [number // self.num_discrete**h % self.num_discrete for h in reversed(range(self.horizon))]
-            return torch.stack(digits, -1)
-        shape = num_states, self.num_sequences, self.horizon
+    def sequences(self, num_states: int, device: torch.device, allowed: Tensor | None = None) -> list[Tensor]:
+        """Return the discrete actions of the first iteration's sequences, int64 `[N, Q_h]` for each step.
+
+        If all are tried, there is one first step for each discrete action, one second step for each two, and so on,
+        forbidden ones among them. Otherwise random allowed actions stand in the place of forbidden ones.
+        """
+        if self.tries_all:
+            each = torch.arange(self.num_discrete, device=device)
+            return [each.repeat(self.num_discrete**h).expand(num_states, -1) for h in range(self.horizon)]
+        shape = self.horizon, num_states, self.num_sequences
         sampled = torch.randint(self.num_discrete, shape, device=device)
         begin = torch.randint(self.num_discrete, (num_states, 1), device=device)
-        sampled[..., 0] = (begin + torch.arange(self.num_sequences, device=device)) % self.num_discrete
-        return sampled
+        sampled[0] = (begin + torch.arange(self.num_sequences, device=device)) % self.num_discrete
+        if allowed is not None:
+            mask = allowed.movedim(1, 0).unsqueeze(2).expand(-1, -1, self.num_sequences, -1)
+            others = random_choice(sampled.shape, self.num_discrete, mask, device)
+            sampled = torch.where(mask.gather(-1, sampled.unsqueeze(-1)).squeeze(-1), sampled, others)
+        return list(sampled)
 
-    def _allowed_sequences(self, discrete: Tensor, allowed: Tensor) -> Tensor:
-        """Return sequences `[N, Q, horizon]` with random allowed actions in the place of forbidden ones."""
-        mask = allowed.unsqueeze(1).expand(-1, discrete.shape[1], -1, -1)
-        others = random_choice(discrete.shape, self.num_discrete, mask, discrete.device)
-        return torch.where(mask.gather(-1, discrete.unsqueeze(-1)).squeeze(-1), discrete, others)
+    def _are_allowed(self, steps: Sequence[SequenceStep], allowed: Tensor) -> Tensor:
+        """Return which sequences take allowed actions alone, bool `[N, Q]`."""
+        is_allowed = torch.ones(len(allowed), self.num_sequences, dtype=torch.bool, device=allowed.device)
+        for h, step in enumerate(steps):
+            is_step_allowed = allowed[:, h].gather(1, step.discrete)
+            is_allowed &= is_step_allowed.repeat_interleave(self.num_sequences // step.discrete.shape[1], 1)
+        return is_allowed
 
     def __call__(self, returns: Returns, num_states: int, device: torch.device, allowed: Tensor | None = None) -> Found:
         """Search for `num_states` states at once.
 
         Args:
-            returns: maps sequences of discrete actions int64 `[N, Q, horizon]` and samples of their own parameters
-                `[N, Q, S, horizon, D]` to returns `[N, Q, S]`.
+            returns: maps the steps of Q sequences to their returns `[N, Q, S]`.
             num_states: N.
             device: where to search.
             allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
         """
         has_slot = self.has_slot.to(device)
-        discrete = self.sequences(num_states, device)
-        if allowed is not None:
-            discrete = self._allowed_sequences(discrete, allowed)
-        mask = has_slot[discrete]
-        mean = torch.zeros_like(mask)
-        deviation = torch.ones_like(mask)
-        for iteration in range(self.num_iterations):
-            shape = (*mask.shape[:2], self.num_samples, *mask.shape[2:])
-            unit = mean.unsqueeze(2) + deviation.unsqueeze(2) * torch.randn(shape, device=device)
-            unit[:, :, 0] = mean
-            unit = unit.clamp_(-1.0, 1.0) * mask.unsqueeze(2)
-            value = returns(discrete, unit)
-            if iteration == 0 and self.num_kept < value.shape[1]:
-                kept = value.amax(-1).topk(self.num_kept, -1).indices
-                value = value.take_along_dim(kept.unsqueeze(-1), 1)
-                unit = unit.take_along_dim(kept[..., None, None, None], 1)
-                discrete = discrete.take_along_dim(kept.unsqueeze(-1), 1)
-                mask = has_slot[discrete]
-            place, weight = elite_weights(value, self.num_elites, self.temperature)
-            elites = unit.take_along_dim(place[..., None, None], 2)
-            weight = weight[..., None, None]
-            mean = (weight * elites).sum(2)
-            variance = (weight * (elites - mean.unsqueeze(2)).square()).sum(2)
-            deviation = variance.sqrt().clamp(min=self.min_deviation)
-        best_value, best = value.amax(-1).max(-1)
+        steps = []
+        for number in self.sequences(num_states, device, allowed):
+            mask = has_slot[number].unsqueeze(2)
+            shape = *number.shape, self.num_samples, has_slot.shape[-1]
+            steps.append(SequenceStep(number, (2.0 * _stratified(shape, device) - 1.0) * mask))
+        value = returns(steps)
+        is_allowed = None if allowed is None else self._are_allowed(steps, allowed)
+        value = _without_forbidden(value, is_allowed)
+        kept = value.amax(-1).topk(min(self.num_kept, value.shape[1]), -1).indices
+        value = value.take_along_dim(kept.unsqueeze(-1), 1)
+        is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
+        # From here on [N, Q, H] and [N, Q, S, H, D], with Q sequences kept.
+        prefixes = [kept // (self.num_sequences // step.discrete.shape[1]) for step in steps]
+        parts = list(zip(steps, prefixes, strict=True))
+        discrete = torch.stack([step.discrete.gather(1, prefix) for step, prefix in parts], -1)
         row = torch.arange(num_states, device=device)
+        unit = torch.stack([step.own[row.unsqueeze(-1), prefix] for step, prefix in parts], -2)
+        mask = has_slot[discrete].unsqueeze(2)
+        mean, deviation = self._gaussians(value, unit)
+        for _ in range(self.num_iterations - 1):
+            normal = torch.special.ndtri(_stratified(unit.shape, device))
+            unit = mean.unsqueeze(2) + deviation.unsqueeze(2) * normal
+            unit[:, :, 0] = mean
+            unit = unit.clamp_(-1.0, 1.0) * mask
+            value = returns([SequenceStep(discrete[..., h], unit[..., h, :]) for h in range(self.horizon)])
+            value = _without_forbidden(value, is_allowed)
+            mean, deviation = self._gaussians(value, unit)
+        best_value, best = value.amax(-1).max(-1)
         return Found(discrete[row, best, 0], mean[row, best, 0], best_value)
+
+    def _gaussians(self, value: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and deviation `[N, Q, H, D]` of the elites, of returns `[N, Q, S]` of `[N, Q, S, H, D]`."""
+        place, weight = elite_weights(value, self.num_elites, self.temperature)
+        elites = unit.take_along_dim(place[..., None, None], 2)
+        weight = weight[..., None, None]
+        mean = (weight * elites).sum(2)
+        variance = (weight * (elites - mean.unsqueeze(2)).square()).sum(2)
+        return mean, variance.sqrt().clamp(min=self.min_deviation)
+
+
+def _without_forbidden(value: Tensor, is_allowed: Tensor | None) -> Tensor:
+    """Return the returns `[N, Q, S]` with those of forbidden sequences, bool `[N, Q]`, below all others."""
+    return value if is_allowed is None else value.masked_fill(~is_allowed.unsqueeze(-1), _FORBIDDEN_RETURN)
+
+
+def _stratified(shape: Sequence[int], device: torch.device) -> Tensor:
+    """Return uniform samples in (0, 1), `[N, Q, S, ...]`: for each place, one in each of S equal intervals."""
+    stratum = torch.rand(shape, device=device).argsort(2)
+    return ((stratum + torch.rand(shape, device=device)) / shape[2]).clamp_(1e-6, 1.0 - 1e-6)

@@ -1,0 +1,126 @@
+"""Draw and tabulate how many presses PETS needs to play as well as people, beside people's own learning.
+
+python experiments/few_steps/study.py FOLDER...    gathers the runs of experiment=few_steps in these folders into
+                                                   curves.csv, then draws and tabulates
+python experiments/few_steps/study.py              draws and tabulates the stored csv file
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from hpamdp.analysis.study import Rows, Run, finished, groups, read_csv, spread, write_tables
+from hpamdp.env.boatdock.harbour import CONTROLLERS
+from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
+
+HERE = Path(__file__).resolve().parent
+HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"
+BOTH_BOATS = -1  # in the column `controller` of these
+BLOCK_EPISODES = 60
+BOATS = ("congruent", "incongruent")
+TASKS = {"congruent": "congruent", "incongruent": "incongruent", "chosen": "chosen by the agent"}
+HUMAN_SCORE = HUMAN["chosen"]["score"]
+BEST_SCORE = BEST_PERSON["score"]
+SETTINGS = {
+    ("auto", "shaped"): "symmetry declared",
+    ("auto", "sparse"): "symmetry declared, sparse reward",
+    ("False", "shaped"): "told nothing of symmetry",
+}
+COLUMNS = {"frames": "presses", "eval/score": "score", "eval/success": "success", "wall_s": "wall_s"}
+
+
+def gather(runs: Sequence[Run]) -> dict[str, Rows]:
+    """Return a row of `curves` for each evaluation."""
+    curves: Rows = []
+    for run in runs:
+        name = {
+            "boat": run.summary["controller"],
+            "reward": "sparse" if run.config.env.reward == "sparse" else "shaped",
+            "augment": str(run.config.low.augment),
+            "seed": run.summary["seed"],
+        }
+        for row in run.evaluations():
+            curves.append({**name, **{short: round(row[column], 4) for column, short in COLUMNS.items()}})
+    return {"curves": curves}
+
+
+def first_at(rows: Rows, score: float) -> float:
+    """Return a run's presses at its first evaluation with this score or more, infinity if there is none."""
+    return next((row["presses"] for row in rows if row["score"] >= score), float("inf"))
+
+
+def _presses(counts: Sequence[float], statistic: str) -> str:
+    """Return the median or the largest number of presses in words, with the share of runs that got there."""
+    value = float(np.median(counts)) if statistic == "median" else max(counts)
+    reached = sum(np.isfinite(counts))
+    share = "" if reached == len(counts) else f" ({reached} of {len(counts)} seeds)"
+    return f"{value:,.0f}{share}" if np.isfinite(value) else f"not reached{share}"
+
+
+def table(curves: Rows) -> str:
+    """Return a line for each setting and boat."""
+    lines = [
+        "| | boat | seeds | presses to 1.97, median | slowest | to 3.02, median | score after 256 | after 384 |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for (augment, reward), label in SETTINGS.items():
+        for boat, task in TASKS.items():
+            rows = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == (augment, reward, boat)]
+            if not rows:
+                continue
+            runs = list(groups(rows, "seed").values())
+            human = [first_at(run, HUMAN_SCORE) for run in runs]
+            best = [first_at(run, BEST_SCORE) for run in runs]
+            after = [[row["score"] for row in rows if row["presses"] == presses] for presses in (256, 384)]
+            scores = " | ".join(spread(score) if len(score) == len(runs) else "" for score in after)
+            lines.append(
+                f"| {label} | {task} | {len(runs)} | {_presses(human, 'median')} | {_presses(human, 'slowest')} | "
+                f"{_presses(best, 'median')} | {scores} |"
+            )
+    return "\n".join(lines)
+
+
+def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a person's presses up to the middle of each block of episodes, and the mean score in it with this boat."""
+    blocks = read_csv(HUMAN_BLOCKS)
+    presses = np.array([row["presses"] for row in blocks if row["controller"] == BOTH_BOATS]) * BLOCK_EPISODES
+    scores = np.array([row["score"] for row in blocks if row["controller"] == CONTROLLERS.index(boat)])
+    return presses.cumsum() - presses / 2, scores
+
+
+def draw(curves: Rows, path: Path) -> None:
+    """Draw score against presses, a line for each seed, with people's own learning beside them."""
+    figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+    for boat, axes in zip(BOATS, figure.subplots(1, 2, sharey=True), strict=True):
+        chosen = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == ("auto", "shaped", boat)]
+        for number, run in enumerate(groups(chosen, "seed").values()):
+            x, y = [row["presses"] for row in run], [row["score"] for row in run]
+            axes.plot(x, y, color="#56B4E9", linewidth=1.2, label=None if number else "PETS, a line for each seed")
+        axes.plot(*human_by_block(boat), "s--", color="#D98200", markersize=4, label="a person, 60 episodes a square")
+        for height, name in ((HUMAN_SCORE, "people's mean"), (BEST_SCORE, "the best person")):
+            axes.axhline(height, color="#8c8c8c", linestyle=":", linewidth=1.0)
+            axes.annotate(f"{name} {height:.2f}", (1180, height), xytext=(0, 2), textcoords="offset points", ha="right")
+        axes.set(xlabel="presses", xlim=(0, 1200), ylim=(-1.1, 3.7))
+        axes.set_title(f"{boat} boat", loc="left", fontweight="bold", fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(loc="lower right", fontsize=8, frameon=False)
+        axes.set_ylabel(f"score (people: {HUMAN[boat]['score']:.2f} with this boat)")
+    figure.savefig(path, dpi=130)
+
+
+def main(folders: Sequence[str]) -> None:
+    """Gather, draw, tabulate."""
+    if folders:
+        write_tables(HERE, gather(finished(folders)))
+    curves = read_csv(HERE / "curves.csv")
+    draw(curves, HERE / "curves.png")
+    print(table(curves))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

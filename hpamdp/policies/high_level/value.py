@@ -1,0 +1,52 @@
+"""The option that the learners themselves expect most of: there is nothing for the selector to learn.
+
+A critic, or a plan in a learned model, tells the value of a state under each option before any of them has been chosen
+there. Bandits need thousands of decisions to learn as much. In a hierarchy it is the greedy policy over option values:
+Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, Artificial Intelligence 112. A learner such as PETS, whose
+value is that of a random member of its ensemble when exploring, makes it posterior sampling over options: Osband,
+Russo and Van Roy 2013, arXiv 1306.0940.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.shared.fractions import Fraction
+from hpamdp.specs import PAMDPSpecs
+
+
+class Value(Selector):
+    """Choose the option whose learner expects most; exploring, a random one with probability `epsilon`.
+
+    Args:
+        specs: sizes of the problem.
+        epsilon: probability of a random option.
+    """
+
+    modes: ClassVar[tuple[str, ...]] = ("train",)
+    asks_learners = True
+
+    def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:
+        super().__init__(specs)
+        self.epsilon = epsilon
+
+    def select(self, td: TensorDictBase) -> Tensor:
+        """Return an option for every environment, int64 `[*B]`; 0 where no decision is due."""
+        is_decision = td.get(keys.IS_DECISION).squeeze(-1)
+        value = self.option_values(td.get(keys.OBSERVATION)[is_decision])
+        if is_greedy():
+            best = value.argmax(-1)
+        else:
+            is_best = value == value.amax(-1, keepdim=True)
+            best = torch.where(is_best, torch.rand_like(value), -1.0).argmax(-1)  # a random one of equals
+            is_random = torch.rand(best.shape, device=best.device) < self.epsilon
+            best = torch.where(is_random, torch.randint_like(best, self.specs.num_options), best)
+        option = torch.zeros_like(is_decision, dtype=torch.long)
+        option[is_decision] = best
+        return option

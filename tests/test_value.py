@@ -1,0 +1,108 @@
+"""The selector that asks the learners what they expect, and PETS as a learner that can say."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from test_pets import OPTIONS
+from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import keys
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.high_level.value import Value
+from hpamdp.policies.low_level.pets import PETS
+from hpamdp.specs import PAMDPSpecs
+
+CPU = torch.device("cpu")
+BOATS = PAMDPSpecs.from_env(BoatDockEnv(1, controller="choose"))
+GREEDY = ExplorationType.DETERMINISTIC
+
+
+class Expects(nn.Module):
+    """Expects of option i the observation's entry i."""
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def forward(self, observation):
+        self.asked.append(len(observation))
+        return observation[:, :2]
+
+
+def selector(epsilon=0.0) -> Value:
+    chosen = Value(BOATS, epsilon=epsilon)
+    chosen.option_values = Expects()
+    return chosen
+
+
+def seen(values, is_decision=None) -> TensorDict:
+    values = torch.tensor(values)
+    due = torch.ones(len(values), dtype=torch.bool) if is_decision is None else torch.tensor(is_decision)
+    return TensorDict({keys.OBSERVATION: values, keys.IS_DECISION: due.unsqueeze(-1)}, [len(values)])
+
+
+def test_the_option_of_which_its_learner_expects_most_is_chosen():
+    td = seen([[1.0, 2.0], [3.0, -1.0], [0.0, 0.5]])
+    for mode in (GREEDY, ExplorationType.RANDOM):
+        with set_exploration_type(mode):
+            assert selector()(td.clone())[keys.OPTION].tolist() == [1, 0, 1]
+
+
+def test_learners_are_asked_only_where_a_decision_is_due():
+    chosen = selector()
+    td = seen([[1.0, 2.0]] * 4, [True, False, False, True]).set(keys.OPTION, torch.zeros(4, dtype=torch.long))
+    assert chosen(td)[keys.OPTION].tolist() == [1, 0, 0, 1]
+    assert chosen.option_values.asked == [2]
+
+
+def test_of_equal_options_exploring_takes_a_random_one():
+    torch.manual_seed(0)
+    values = [[torch.inf, torch.inf]] * 400
+    assert 150 < selector()(seen(values))[keys.OPTION].sum() < 250
+
+
+def test_epsilon_is_the_share_of_random_options():
+    torch.manual_seed(0)
+    chosen = selector(epsilon=0.5)(seen([[0.0, 1.0]] * 2000))[keys.OPTION]
+    assert 0.2 < (chosen == 0).float().mean() < 0.3
+
+
+def make_agent(is_shared: bool) -> HierarchicalAgent:
+    torch.manual_seed(0)
+    specs = [BOATS.with_option_observed()] if is_shared else [BOATS.of_option(i) for i in range(2)]
+    learners = [PETS(own, CPU, **OPTIONS) for own in specs]
+    return HierarchicalAgent(Value(BOATS, epsilon=0.0), learners, BOATS, is_shared=is_shared)
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+def test_plans_choose_the_boat(is_shared):
+    agent = make_agent(is_shared)
+    env = with_decisions(BoatDockEnv(16, controller="choose"))
+    torch.manual_seed(0)
+    rolled = env.rollout(8, agent.policy, break_when_any_done=False)
+    assert set(rolled[keys.OPTION].unique().tolist()) == {0, 1}, "nothing is known: either one"
+    agent.learn(rolled)
+    observation = env.reset()[keys.OBSERVATION]
+    for learner in agent.learners:
+        learner.policy.is_trained.fill_(True)
+    with set_exploration_type(GREEDY):
+        value = agent.selector.option_values(observation)
+    assert value.shape == (16, 2) and value.isfinite().all()
+    assert len(value.argmax(-1).unique()) == 2 or not is_shared, "another boat for another layout"
+
+
+def test_one_model_of_both_boats_sees_directions_alone():
+    (learner,) = make_agent(is_shared=True).learners
+    model = learner.model
+    contexts = model.frame.geometry.entries_of_contexts
+    assert len(contexts) == 3, "which boat it is, and the option"
+    state = torch.rand(3, 20, model.state_mean.numel())
+    action = model.action_inputs(torch.zeros(3, 20, dtype=torch.long), torch.rand(3, 20, 1))
+    changed = state.clone()
+    changed[..., contexts] = torch.rand(3, 20, 3)
+    with torch.no_grad():
+        for part, other in zip(model.in_frame(state, action), model.in_frame(changed, action), strict=True):
+            torch.testing.assert_close(part[..., :1], other[..., :1])
