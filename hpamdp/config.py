@@ -58,6 +58,8 @@ _MOST_COMPLAINTS = 3
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
 # Entries of a learner's yaml that are not options of its class.
 _NO_OPTIONS = ("budget", "checkpoint", "freeze")
+# Options whose names have changed since a config may have been saved: old name to new.
+_RENAMED = {"compile_physics": "compile_rules"}
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
 
@@ -354,7 +356,7 @@ def compose_saved(saved: Mapping[str, Any]) -> tuple[DictConfig, dict[str, str]]
     today = _compose([f"{group}={name}" for group, name in choices.items()])
     values = dict(saved)
     for group in GROUPS:
-        options = {name: value for name, value in saved[group].items() if name != "name"}
+        options = {_RENAMED.get(name, name): value for name, value in saved[group].items() if name != "name"}
         values[group] = {**{str(key): value for key, value in today[group].items()}, **options}
     return OmegaConf.create(values), choices
 

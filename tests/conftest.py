@@ -1,9 +1,11 @@
 """What the tests share."""
 
+import multiprocessing
+import os
 import random
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +18,9 @@ from omegaconf import DictConfig
 
 from hpamdp.cli import main
 from hpamdp.config import Config, read
+from hpamdp.data.human import released_file
+from hpamdp.data.human.released_file import HumanData
+from hpamdp.env.boatdock import harbour
 
 # Tests that are started in the background or under nohup inherit ignored signals, and so would what they start.
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU):
@@ -61,6 +66,51 @@ def global_generators_unmoved() -> Iterator[None]:
     before = states()
     yield
     assert states() == before
+
+
+@pytest.fixture(scope="session", autouse=True)
+def draw_all() -> Iterator[Callable[..., object]]:
+    """Have runs draw no figures, which takes longer than the runs of most tests."""
+    from hpamdp.analysis import figures  # matplotlib takes long to import
+
+    with pytest.MonkeyPatch.context() as patch:
+        drawing = figures.draw_all
+        patch.setattr(figures, "draw_all", lambda folder, env: [])
+        yield drawing
+
+
+@pytest.fixture
+def with_figures(draw_all, monkeypatch) -> None:
+    """Have runs draw their figures."""
+    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", draw_all)
+
+
+@pytest.fixture(scope="session")
+def people() -> HumanData:
+    """The released recording, which takes seconds to read."""
+    if not os.environ.get(released_file.PATH_VARIABLE):
+        pytest.skip(f"{released_file.PATH_VARIABLE} is not set")
+    return released_file.read()
+
+
+@pytest.fixture(scope="session")
+def people_in_one_frame(people) -> HumanData:
+    """The same with `one_frame=True`."""
+    episodes, presses = (table.clone() for table in people)
+    shift = torch.tensor(harbour.CENTRE) - episodes["centre"]
+    for name in ("start", "goal", "centre"):
+        episodes[name] += shift
+    for name in ("position", "next_position"):
+        presses[name] += shift[presses["episode"]]
+    return HumanData(episodes, presses)
+
+
+def forked(function: Callable[..., object], *arguments: object) -> int | None:
+    """Call a function in a process forked from this one, which has its imports done; return the exit code."""
+    child = multiprocessing.get_context("fork").Process(target=function, args=arguments)
+    child.start()
+    child.join()
+    return child.exitcode
 
 
 @pytest.fixture

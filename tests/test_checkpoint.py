@@ -91,6 +91,12 @@ def test_a_policy_file_is_never_executed_either(trained, parts, tmp_path):
     assert not (tmp_path / "executed").exists()
 
 
+def test_a_policy_file_of_another_format_is_refused(trained, parts, tmp_path):
+    saved = torch.load(trained / "policy.pt", weights_only=True)
+    torch.save({**saved, "format": 1}, tmp_path / "policy.pt")
+    assert "format 1, but this version reads 2" in refusal(tmp_path / "policy.pt", parts)
+
+
 def damaged(data: bytes, number: int) -> bytes:
     """Return a checkpoint's bytes with the damage of a number: a flipped bit, a cut, or a run of zeros."""
     chance = random.Random(number)
@@ -171,7 +177,7 @@ def test_a_checkpoint_without_the_replay_is_smaller_and_can_be_resumed(tmp_path,
     assert run(compose_config(given), tmp_path / "a", given) == 0
     words = [f"resume={tmp_path / 'a'}", "total_frames=320"]
     assert run(compose_config(words), tmp_path / "b", words) == 0
-    assert "holds no replay" in capsys.readouterr().err
+    assert "holds no replay (checkpoint_replay=false)" in capsys.readouterr().err
 
 
 def test_a_policy_file_is_scored_like_the_run_that_it_is_of(trained, tmp_path):

@@ -176,6 +176,13 @@ def test_a_saved_config_has_names_instead_of_modules_and_is_read_back_the_same(w
     assert read(*compose_saved(saved)) == config
 
 
+def test_a_config_that_was_saved_before_an_option_was_renamed_is_read():
+    config = make_config([])
+    saved = config.to_dict()
+    saved["env"]["compile_physics"] = saved["env"].pop("compile_rules")
+    assert read(*compose_saved(saved)) == config
+
+
 def test_a_name_of_a_saved_config_that_is_nowhere_is_told_in_one_line():
     saved = make_config([]).to_dict()
     saved["low"]["name"] = "gone"

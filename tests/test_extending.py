@@ -1,7 +1,6 @@
 """The examples of examples/extending run from outside the package, by the commands that their README gives."""
 
 import json
-import multiprocessing
 import os
 import re
 import shlex
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import forked
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import cli
@@ -24,10 +24,7 @@ def run(words: list[str], folder: Path) -> dict:
     """Run `python -m hpamdp.cli ...` in the examples' folder, in a process of its own."""
     assert words[:2] == ["-m", "hpamdp.cli"]
     # Forked, because the imports take longer than the run.
-    child = multiprocessing.get_context("fork").Process(target=_main, args=([*words[2:], f"hydra.run.dir={folder}"],))
-    child.start()
-    child.join()
-    assert child.exitcode == 0
+    assert forked(_main, [*words[2:], f"hydra.run.dir={folder}"]) == 0
     return json.loads((folder / "summary.json").read_text())
 
 

@@ -278,6 +278,16 @@ def test_the_middle_shots_are_no_slip_of_goal():
         GoalEnv(repaired=["middle_shots"])
 
 
+def test_a_repair_of_the_middle_shots_is_refused_on_goal_in_one_line_and_made_on_hard_goal():
+    goal, hard_goal = (
+        make_config([f"env={name}", "high=none", "low=pdqn", "env.repaired=[middle_shots]"]).env
+        for name in ("goal", "hard_goal")
+    )
+    with pytest.raises(ConfigError, match=r"repaired=\['middle_shots'\], but may only have kick_to, .*goal\.yaml"):
+        goal.build(num_envs=2)
+    assert hard_goal.build(num_envs=2).repaired == ("middle_shots",)
+
+
 def test_repairs_change_what_is_done_and_seen():
     plain, repaired = (HardGoalEnv(200, repaired=slips) for slips in ((), HardGoalEnv.slips))
     for env in (plain, repaired):
@@ -301,7 +311,7 @@ def test_global_generators_are_neither_moved_nor_read():
 
 @pytest.mark.slow
 def test_compiled_ticks_play_the_same_episodes():
-    envs = [GoalEnv(64, compile_physics=compiled, noise=0.0) for compiled in (False, True)]
+    envs = [GoalEnv(64, compile_rules=compiled, noise=0.0) for compiled in (False, True)]
     readings = []
     for env in envs:
         env.reset()
@@ -315,7 +325,7 @@ def test_the_yaml_makes_the_published_domain_and_names_a_wrong_repair(name):
     assert (made.max_steps, made.noise, made.repaired) == (100, 1.0, ())
     with pytest.raises(ConfigError, match="repaired"):
         make_config([f"env={name}", "high=none", "low=pdqn", "env.repaired=[kick]"])
-    assert compose_config([f"env={name}"]).env.compile_physics is False
+    assert compose_config([f"env={name}"]).env.compile_rules is False
 
 
 @pytest.mark.parametrize("env_id", ["hpamdp/Goal-v0", "hpamdp/HardGoal-v0"])

@@ -71,8 +71,7 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("high", "low"), PAIRS)
-def test_every_pair_trains_and_is_scored(high, low, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
+def test_every_pair_trains_and_is_scored(high, low, tmp_path):
     assert run(compose_config(words(high, low)), tmp_path, words(high, low)) == 0
     assert (tmp_path / "summary.json").is_file()
     if low not in FIXED:
@@ -90,7 +89,7 @@ ELSEWHERE = {
 
 @pytest.mark.parametrize("env", list(ELSEWHERE))
 @pytest.mark.parametrize("low", [low for low in TRAINED if low != "planner"])
-def test_every_learner_works_on_other_problems(low, env, tmp_path, monkeypatch):
+def test_every_learner_works_on_other_problems(low, env, tmp_path):
     given = [f"env={env}", "high=none", f"low={low}", *ELSEWHERE[env], *SHORT.get(low, []), *SMALL]
     if low == "qpamdp":
         # Boat x, y and goal - boat x, y: all entries would make thousands of features.
@@ -103,8 +102,7 @@ def test_every_learner_works_on_other_problems(low, env, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])
-def test_learners_work_for_each_option_and_shared(sharing, tmp_path, monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
+def test_learners_work_for_each_option_and_shared(sharing, tmp_path):
     assert run(compose_config([*words("ucb", "hyar"), f"agent.sharing={sharing}"]), tmp_path) == 0
 
 

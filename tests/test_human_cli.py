@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-import os
 import re
 import threading
 from collections.abc import Iterator
@@ -20,10 +19,8 @@ from tensordict import TensorDict
 from hpamdp.data.errors import DataError
 from hpamdp.data.human import cli
 from hpamdp.data.human.download import download
-from hpamdp.data.human.released_file import PATH_VARIABLE, read
+from hpamdp.data.human.released_file import read
 from hpamdp.data.human.transitions import transitions
-
-REAL = os.environ.get(PATH_VARIABLE)
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +56,8 @@ def test_check_and_summary_print_what_a_file_holds(capsys, path):
     assert figures["all"]["episodes"] == 210 and len(figures["person"]) == 3
 
 
-@pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")
-def test_check_and_summary_of_the_released_file_print_its_known_figures(capsys):
+def test_check_and_summary_of_the_released_file_print_its_known_figures(capsys, people, monkeypatch):
+    monkeypatch.setattr(cli, "read", lambda *_, **__: people)
     output = printed(capsys, "check")
     for line in (
         "40 people, 14400 episodes, 46757 presses",

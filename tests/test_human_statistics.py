@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import numpy as np
 import pytest
 import synthetic_human
@@ -11,22 +9,14 @@ import torch
 
 from hpamdp.data.human import statistics, validation
 from hpamdp.data.human.episodes import keep, score, scores_by_person
-from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
+from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.validation import Singles
 from hpamdp.env.boatdock import harbour, physics, reference
-
-REAL = os.environ.get(PATH_VARIABLE)
-needs_real = pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> HumanData:
     return read(synthetic_human.write(tmp_path_factory.mktemp("human") / "people.mat"), checksum=None)
-
-
-@pytest.fixture(scope="module")
-def people() -> HumanData:
-    return read(REAL)
 
 
 def test_scores_are_five_times_the_tank_left_or_minus_one(data):
@@ -59,7 +49,6 @@ def test_choice_curve_is_the_share_of_congruent_choices_by_bearing(data):
     assert np.isnan(statistics.choice_curve(data, none)).all()
 
 
-@needs_real
 def test_figures_of_the_released_file_are_the_built_in_references(people):
     figures = statistics.figures(people)
     for name, value in reference.HUMAN["chosen"].items():
@@ -78,14 +67,12 @@ def test_figures_of_the_released_file_are_the_built_in_references(people):
     assert curve == pytest.approx(reference.HUMAN_CONGRUENT_BY_OFFSET, abs=1e-3)
 
 
-@needs_real
 def test_single_presses_of_people_end_in_our_physics_as_recorded(people):
     singles = validation.single_presses(people)
     assert len(singles.outcome) == 204
     assert validation.agreement(singles) >= 0.94
 
 
-@needs_real
 def test_first_presses_of_people_go_as_far_as_our_physics_allows(people):
     ways = validation.first_presses(people)
     assert len(ways.is_inside) == 427
@@ -120,7 +107,6 @@ def test_fit_finds_the_constants_that_made_the_presses():
     assert fit.agreement.max() > 0.9
 
 
-@needs_real
 def test_our_constants_lie_in_the_intervals_fitted_to_peoples_presses(people):
     fit = validation.fit(validation.single_presses(people), num_bootstraps=100)
     for name in ("likely_glide", "agreeing_glide"):

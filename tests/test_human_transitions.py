@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 from pathlib import Path
 
 import pytest
@@ -17,15 +16,12 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human import minari
 from hpamdp.data.human.dataset import HumanExperienceReplay, slices, whole_episodes
 from hpamdp.data.human.episodes import keep, scores_by_person, select
-from hpamdp.data.human.released_file import PATH_VARIABLE, HumanData, read
+from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.episode import FUEL
 from hpamdp.env.decisions import with_decisions
-
-REAL = os.environ.get(PATH_VARIABLE)
-needs_real = pytest.mark.skipif(not REAL, reason=f"{PATH_VARIABLE} is not set")
 
 
 @pytest.fixture(scope="module")
@@ -94,9 +90,8 @@ def test_the_return_of_a_fully_logged_episode_is_the_sum_of_its_rewards(data, re
         assert torch.equal(decided["next", name], rows["next", name][ends])
 
 
-@needs_real
-def test_the_mean_return_of_peoples_episodes_is_their_score_and_the_progress():
-    data = read(REAL, one_frame=True)
+def test_the_mean_return_of_peoples_episodes_is_their_score_and_the_progress(people_in_one_frame):
+    data = people_in_one_frame
     decided = decisions(data)["next"]
     assert len(decided) == 14_400
     assert decided[keys.OPTION_RETURN].mean().item() == pytest.approx(2.768, abs=0.002)
@@ -154,10 +149,8 @@ def test_two_frames_and_unknown_rewards_are_refused(path, data):
         transitions(data, reward="dense")
 
 
-@needs_real
-def test_first_observations_are_the_environments_and_second_ones_are_near_it():
-    data = read(REAL, one_frame=True)
-    data = select(data, complete=True)
+def test_first_observations_are_the_environments_and_second_ones_are_near_it(people_in_one_frame):
+    data = select(people_in_one_frame, complete=True)
     batch = transitions(data)
     near = []
     for number, rows in enumerate(replayed(data, controller="choose")):
@@ -170,10 +163,8 @@ def test_first_observations_are_the_environments_and_second_ones_are_near_it():
     assert near.median() < 8.0 and near.quantile(0.9) < 20.0
 
 
-@needs_real
-def test_all_recorded_transitions_are_finite_and_start_as_the_environment_does():
-    data = read(REAL, one_frame=True)
-    batch = transitions(data)
+def test_all_recorded_transitions_are_finite_and_start_as_the_environment_does(people_in_one_frame):
+    batch = transitions(people_in_one_frame)
     assert len(batch) == 46_757
     assert all(value.isfinite().all() for value in batch.values(True, True))
     # In five episodes not even the first press was logged, so the boat is already on its way.

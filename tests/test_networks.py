@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.policies.shared import networks
-from hpamdp.policies.shared.networks import EnsembleMLP, HybridCritics, InitialLayer, sample_index
+from hpamdp.policies.shared.networks import EnsembleMLP, HybridCritics, InitialLayer, sample_index, with_clipped_noise
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -107,3 +107,14 @@ def test_the_first_members_of_an_ensemble_give_alone_what_they_give_among_all():
     net = EnsembleMLP(3, 4, [8], 2)
     x = torch.randn(5, 4)
     torch.testing.assert_close(net(x, 2), net(x)[:2])
+
+
+def test_clipped_noise_keeps_to_its_bound_and_to_the_actions_and_no_noise_draws_nothing():
+    unit = torch.rand(1000) * 2 - 1
+    noisy = with_clipped_noise(unit, 10.0, 0.2)
+    assert noisy.abs().max() <= 1.0
+    assert (noisy - unit).abs().max() <= 0.2 + 1e-6
+    assert ((noisy - unit).abs() > 0.1).float().mean() > 0.8
+    before = torch.get_rng_state()
+    assert with_clipped_noise(unit, 0.0, 0.2) is unit
+    assert torch.equal(torch.get_rng_state(), before)

@@ -38,17 +38,12 @@ def human_batch(path: str, rest_to_rest: bool = False, **env):
     return HumanDemonstrations(BoatDockEnv(**env), path=path, rest_to_rest=rest_to_rest, **ALL).batch
 
 
-@pytest.fixture
-def no_pictures(monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
-
-
 def overrides(path: str, low: str, high: str = "human") -> list[str]:
     return [*SMALL, f"data.path={path}", f"low={low}", f"high={high}"]
 
 
 @pytest.mark.parametrize("low", ["bc", "iql", "td3_bc", "pdqn", "hsac"])
-def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, path, tmp_path, no_pictures):
+def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, path, tmp_path):
     given = overrides(path, low)
     assert run(compose_config(given), tmp_path, given) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -128,7 +123,7 @@ def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(hi
 
 
 @pytest.mark.parametrize("high", ["exp3", "actor"])
-def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path, tmp_path, no_pictures):
+def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path, tmp_path):
     words = [f"data.path={path}", "data=human", "data.checksum=null", "low=pdqn", f"high={high}", "eval.layouts=4"]
     words += ["num_envs=8", "steps_per_batch=4", "total_frames=256", "low.batch_size=16", "eval.every=0"]
     words += ["high.minibatch_size=8"] if high == "actor" else []
@@ -219,7 +214,7 @@ def test_impossible_configs_are_refused_in_one_line(given, line, tmp_path):
     assert "\n" not in str(refusal.value)
 
 
-def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path, no_pictures):
+def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path):
     given = overrides(path, "iql")
     assert run(compose_config(given), tmp_path / "a", given) == 0
     longer = ["mode=offline", f"resume={tmp_path / 'a'}", "offline.updates=9"]

@@ -2,18 +2,22 @@
 
 import itertools
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import IO, Any
 
 import pytest
 import torch
 from conftest import CONF, compose_config
 from test_grid import SHORT
 
-from hpamdp import keys
+from hpamdp import cli, keys
 from hpamdp.config import ConfigError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.policies.low_level.pdqn import PDQN
@@ -21,14 +25,11 @@ from hpamdp.run import checkpoint
 from hpamdp.run.train import DIVERGED_NAME, run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=512", "eval.layouts=4", "eval.every=0", "high=ucb"]
-PROGRAM = [
-    sys.executable,
-    str(CONF.parent / "run.py"),
-    "num_envs=8",
-    "steps_per_batch=4",
-    "eval.layouts=4",
-    "low=random",
-]
+PROGRAM = ["run.py", "num_envs=8", "steps_per_batch=4", "eval.layouts=4", "low=random"]
+
+
+def frames_of(folder) -> int:
+    return checkpoint.progress_of(folder / "checkpoint.zip")["frames"]
 
 
 def spoil_rewards(monkeypatch, value: float, after: int) -> None:
@@ -77,8 +78,9 @@ def test_an_error_in_the_environment_saves_what_was_learned_and_is_raised_as_it_
     with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="a bug in step"):
         patch.setattr(BoatDockEnv, "_step", failing)
         run(compose_config(given), tmp_path / "failed", given)
-    assert 0 < checkpoint.progress_of(tmp_path / "failed/checkpoint.zip")["frames"] < 8192
-    assert run(compose_config([f"resume={tmp_path / 'failed'}"]), tmp_path / "resumed", []) == 0
+    assert 0 < frames_of(tmp_path / "failed") < 8192
+    words = [f"resume={tmp_path / 'failed'}", f"total_frames={frames_of(tmp_path / 'failed') + 64}"]
+    assert run(compose_config(words), tmp_path / "resumed", words) == 0
 
 
 def test_a_loss_that_is_nan_stops_the_run_before_it_is_saved(tmp_path, monkeypatch, capsys):
@@ -98,29 +100,75 @@ def test_a_loss_that_is_nan_stops_the_run_before_it_is_saved(tmp_path, monkeypat
     assert not any(value.isnan().any() for value in members["agent"].values() if torch.is_tensor(value))
 
 
-def started(folder, *words, **streams) -> subprocess.Popen:
-    """Start an endless run and wait until it has logged."""
-    words = ["total_frames=100000000", "log_every=32", "eval.every=0", f"hydra.run.dir={folder}", *words]
+def program(folder: Path, words: Sequence[str], output: IO[str] | int) -> multiprocessing.Process:
+    """Start the program in a process forked from this one, as the imports take longer than a run.
+
+    Args:
+        folder: its working directory.
+        words: of the command line.
+        output: where its output and its errors go.
+    """
+    process = multiprocessing.get_context("fork").Process(target=_main, args=(folder, words, output))
+    process.start()
+    return process
+
+
+def _main(folder: Path, words: Sequence[str], output: IO[str] | int) -> None:
+    os.chdir(folder)
+    number = output if isinstance(output, int) else output.fileno()
+    os.dup2(number, 1)
+    os.dup2(number, 2)
+    os.closerange(3, 1000)  # as in a program of its own; a pipe would still have its reader
+    sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115  # pytest has replaced these
+    sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, where Ctrl-C is not ignored
+    sys.argv = [*PROGRAM, *words]
+    cli.main()
+
+
+def interpreter(folder: Path, words: Sequence[str], output: IO[str] | int) -> subprocess.Popen:
+    """Start the program as `program` does, but in an interpreter of its own, whose end counts."""
     # As in a terminal, where Ctrl-C is not ignored.
     reset = lambda: signal.signal(signal.SIGINT, signal.default_int_handler)  # noqa: E731
-    process = subprocess.Popen([*PROGRAM, *words], cwd=folder.parent, preexec_fn=reset, **streams)
+    command = [sys.executable, str(CONF.parent / PROGRAM[0]), *PROGRAM[1:], *words]
+    return subprocess.Popen(command, cwd=folder, preexec_fn=reset, stdout=output, stderr=output)
+
+
+def started(folder: Path, *words: str, output: IO[str] | int, start: Callable[..., Any] = program) -> Any:
+    """Start an endless run and wait until it has logged."""
+    endless = ["total_frames=100000000", "log_every=32", "eval.every=0", f"hydra.run.dir={folder}"]
+    process = start(folder.parent, [*endless, *words], output)
     metrics = folder / "metrics.csv"
     for _ in range(1200):
         if metrics.is_file() and len(metrics.read_text().splitlines()) > 3:
             return process
-        assert process.poll() is None
         time.sleep(0.05)
     process.kill()
     raise AssertionError("nothing was logged")
 
 
-def frames_of(folder) -> int:
-    return checkpoint.progress_of(folder / "checkpoint.zip")["frames"]
+def exit_code(process: multiprocessing.Process) -> int | None:
+    """Wait for the end of a forked process."""
+    process.join(60)
+    return process.exitcode
+
+
+@pytest.fixture
+def printed(tmp_path) -> Iterator[IO[str]]:
+    """A file for what a program prints."""
+    with (tmp_path / "printed.txt").open("w+") as file:
+        yield file
+
+
+def lines_of(printed: IO[str]) -> list[str]:
+    """Return what was printed, without empty lines."""
+    printed.seek(0)
+    return [line for line in printed.read().splitlines() if line]
 
 
 def test_ctrl_c_saves_when_the_reader_of_its_output_is_gone(tmp_path):
     read, write = os.pipe()
-    process = started(tmp_path / "run", stdout=write, stderr=write)
+    process = started(tmp_path / "run", output=write, start=interpreter)
     os.close(write)
     os.close(read)  # `tee` gets the Ctrl-C as well, and is gone first
     process.send_signal(signal.SIGINT)
@@ -132,32 +180,34 @@ def test_ctrl_c_saves_when_the_reader_of_its_output_is_gone(tmp_path):
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_run_whose_output_is_full_goes_on_and_saves(tmp_path):
     with open("/dev/full", "w") as full:
-        process = started(tmp_path / "run", stdout=full, stderr=full)
-        process.send_signal(signal.SIGTERM)
+        process = started(tmp_path / "run", output=full, start=interpreter)
+        process.terminate()
         assert process.wait(60) == 130
     assert frames_of(tmp_path / "run") > 0
 
 
-def test_a_killed_run_loses_no_more_than_the_minutes_between_two_checkpoints(tmp_path):
-    process = started(tmp_path / "run", "checkpoint_minutes=0.002", stderr=subprocess.DEVNULL)
+def test_a_killed_run_loses_no_more_than_the_minutes_between_two_checkpoints(tmp_path, printed):
+    process = started(tmp_path / "run", "checkpoint_minutes=0.002", output=printed)
     for _ in range(600):
         if (tmp_path / "run/checkpoint.zip").exists():
             break
         time.sleep(0.05)
     process.kill()
-    process.wait()
+    process.join()
     assert frames_of(tmp_path / "run") > 0
     words = [f"resume={tmp_path / 'run'}", f"total_frames={frames_of(tmp_path / 'run') + 64}"]
     assert run(compose_config(words), tmp_path / "resumed", words) == 0
 
 
-def test_a_second_run_in_the_folder_of_one_that_runs_is_refused(tmp_path):
-    process = started(tmp_path / "run", stderr=subprocess.DEVNULL)
-    done = subprocess.run([*PROGRAM, f"hydra.run.dir={tmp_path / 'run'}"], capture_output=True, text=True, cwd=tmp_path)
+def test_a_second_run_in_the_folder_of_one_that_runs_is_refused(tmp_path, printed):
+    with open(os.devnull, "w") as nothing:
+        process = started(tmp_path / "run", output=nothing)
+    second = program(tmp_path, [f"hydra.run.dir={tmp_path / 'run'}"], printed)
+    assert exit_code(second) == 2
     process.kill()
-    process.wait()
-    assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert "another process is at work in this folder" in done.stderr
+    process.join()
+    (line,) = lines_of(printed)
+    assert "another process is at work in this folder" in line
 
 
 def test_a_folder_with_results_is_refused_unless_they_may_be_overwritten(tmp_path):
@@ -183,10 +233,9 @@ def test_an_empty_folder_name_is_refused_in_one_line(word, line, command):
     assert code == 2 and err.count("\n") == 1 and line in err
 
 
-def test_a_folder_that_is_deleted_while_the_run_goes_on_ends_it_in_one_line(tmp_path):
-    process = started(tmp_path / "run", stderr=subprocess.PIPE, text=True)
+def test_a_folder_that_is_deleted_while_the_run_goes_on_ends_it_in_one_line(tmp_path, printed):
+    process = started(tmp_path / "run", output=printed)
     subprocess.run(["rm", "-rf", str(tmp_path / "run")], check=True)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 1
-    (line,) = [line for line in err.replace("\r", "\n").splitlines() if line and "steps/s" not in line]
+    assert exit_code(process) == 1
+    (line,) = [line for line in lines_of(printed) if "steps/s" not in line]
     assert str(tmp_path / "run") in line and "No such file" in line

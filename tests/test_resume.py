@@ -2,7 +2,6 @@
 
 import csv
 import itertools
-import multiprocessing
 import os
 import signal
 from collections.abc import Callable
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import TRAINED, compose_config
+from conftest import TRAINED, compose_config, forked
 from test_grid import SHORT
 
 from hpamdp.run import checkpoint
@@ -18,7 +17,7 @@ from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
 from hpamdp.run.train import run
 
-SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=640", "eval.layouts=6", "eval.every=256", "log_every=64"]
+SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=416", "eval.layouts=4", "eval.every=192", "log_every=64"]
 STOPPED_AFTER = 9  # batches, in the middle of a log interval
 SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
 QUICK = {"meta_critic": ["high.warmup_decisions=20", "high.batch_size=16"], "actor": ["high.minibatch_size=32"]}
@@ -89,22 +88,16 @@ def interrupt(given: list[str], folder: Path) -> None:
 def kill(given: list[str], folder: Path) -> None:
     """Run in a process of its own that is killed; what it saved last is some batches old."""
     words = [*given, "checkpoint_every=96"]
-    child = multiprocessing.get_context("fork").Process(target=run, args=(compose_config(words), folder, words))
-    child.start()
-    child.join()
-    assert child.exitcode == -signal.SIGKILL
+    assert forked(run, compose_config(words), folder, words) == -signal.SIGKILL
 
 
 def words_of(high: str, low: str) -> list[str]:
     return [f"high={high}", f"low={low}", *SHORT.get(low, []), *QUICK.get(high, []), *SMALL]
 
 
-@pytest.fixture(autouse=True)
-def no_figures(monkeypatch):
-    monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
-
-
-@pytest.mark.parametrize(("high", "low"), [*((high, "hppo") for high in SELECTORS), ("ucb", "pdqn")])
+@pytest.mark.parametrize(
+    ("high", "low"), [*((high, "random") for high in SELECTORS if high != "ucb"), ("ucb", "hppo"), ("ucb", "pdqn")]
+)
 def test_a_resumed_run_is_the_run_that_was_never_stopped(high, low, tmp_path, monkeypatch):
     stop_and_resume(words_of(high, low), tmp_path, monkeypatch, signal.SIGINT)
 
@@ -125,9 +118,8 @@ def test_a_killed_run_resumes_from_its_last_checkpoint_to_the_last_bit(tmp_path,
     stop_and_resume(words_of("ucb", "pdqn"), tmp_path, monkeypatch, signal.SIGKILL)
 
 
-@pytest.mark.parametrize(
-    "low", ["hppo", *(pytest.param(low, marks=pytest.mark.slow) for low in TRAINED if low != "hppo")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("low", TRAINED)
 def test_a_run_with_worker_processes_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
     stop_and_resume([*words_of("ucb", low), "collector=multi"], tmp_path, monkeypatch, signal.SIGTERM)
 

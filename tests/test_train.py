@@ -25,13 +25,6 @@ FILES = {"config.yaml", "metrics.csv", "summary.json", "evaluation.npz", "checkp
 PICTURES = {"learning_curves.png", "trajectories.png", "choices.png"}
 
 
-@pytest.fixture(autouse=True)
-def no_figures(request, monkeypatch):
-    """Draw nothing, which takes longer than the runs, but where pictures are the point."""
-    if "pictures" not in request.node.name:
-        monkeypatch.setattr("hpamdp.analysis.figures.draw_all", lambda folder, env: [])
-
-
 def start(output_dir, *overrides):
     return run(compose_config([*SMALL, *overrides]), output_dir, list(overrides))
 
@@ -41,7 +34,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
-def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys):
+def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys, with_figures):
     assert start(tmp_path, "high=uniform", "low=random") == 0
     assert {file.name for file in tmp_path.iterdir()} >= FILES | PICTURES
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -64,6 +57,7 @@ def test_the_planner_under_the_oracle_reaches_the_ceiling_with_nothing_to_learn(
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path):
     learner = ["low=hyar", "low.warmup_frames=256", "low.codec_pretrain_updates=5", "low.updates_per_frame=0.02"]
+    learner += ["total_frames=512", "eval.every=256"]
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         start(tmp_path / name, *learner, f"seed={seed}")
     first, second, third = (rows_of(tmp_path / name) for name in "abc")
@@ -127,7 +121,7 @@ def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, cap
     assert float(after[-1]["frames"]) == resumed["frames"]
 
 
-def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_path):
+def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_path, with_figures):
     start(tmp_path / "run", "low=random", "high=uniform")
     words = ["mode=eval", f"checkpoint={tmp_path / 'run'}"]
     assert run(compose_config(words), tmp_path / "scored", words) == 0

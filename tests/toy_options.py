@@ -62,8 +62,7 @@ class Crossing(PAMDPEnv):
         self.steps = torch.zeros(self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(self.batch_size)
+        mask = self.reset_mask(tensordict)
         fresh = torch.rand(self.batch_size, generator=self.generator) * self.start
         self.place = torch.where(mask, (fresh / SLOW).floor() * SLOW, self.place)
         self.steps = torch.where(mask, 0.0, self.steps)

@@ -107,12 +107,11 @@ class PuttingEnv(PAMDPEnv):
         self._ball = Ball(nothing.float(), nothing, nothing - 1)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
         episode = self._ball.episode + 1
         chance = counter_rng.key_for(self._seed, counter_rng.TRAINING, self._number, episode)
         distance = 1.0 + (FARTHEST - 1.0) * counter_rng.uniform(chance, 0)
         fresh = Ball(distance, torch.zeros_like(episode), episode)
-        self._ball = fresh if mask is None else where(mask.reshape(self.num_envs), fresh, self._ball)
+        self._ball = where(self.reset_mask(tensordict), fresh, self._ball)
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -86,7 +86,7 @@ def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[
 
 def env_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], object]:
     """Return a function that calls `step_and_maybe_reset` once."""
-    env = BoatDockEnv(num_envs, compile_physics=is_compiled, device=device)
+    env = BoatDockEnv(num_envs, compile_rules=is_compiled, device=device)
     actions = random_actions(env)
     td = env.reset()
 

@@ -64,6 +64,10 @@ class PAMDPEnv(EnvBase):
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
 
+    # Whether a reset of some environments returns the others as they are. Then TorchRL's merge of the two, which takes
+    # longer than simple physics of 65,536 environments, would change nothing and is left out.
+    reset_returns_all_rows: ClassVar[bool] = False
+
     # Settings that leave the choice of an option to the agent and that take it away, to name in an error.
     choice_setting: ClassVar[str] = ""
     no_choice_setting: ClassVar[str] = ""
@@ -193,6 +197,21 @@ class PAMDPEnv(EnvBase):
         )
         option = {keys.OPTION: Categorical(len(self.option_names), shape=n, device=device)} if has_option else {}
         return Composite(**option, action=action, shape=n)
+
+    def reset_mask(self, tensordict: TensorDictBase | None) -> Tensor:
+        """Return which environments `_reset` is asked to reset, bool `[N]`: all, where its argument does not say."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            return torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        return mask.reshape(self.batch_size)
+
+    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if not self.reset_returns_all_rows:
+            return super()._reset_proc_data(tensordict, tensordict_reset)
+        if tensordict is None:
+            return tensordict_reset
+        tensordict.pop("_reset", None)
+        return tensordict.update(tensordict_reset)
 
     def check_action(self, tensordict: TensorDictBase) -> None:
         """Check the action leaves' shapes and types; their values are the subclass's to check.

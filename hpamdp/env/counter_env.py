@@ -74,6 +74,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
     observation_names: tuple[str, ...]
     result_keys = (keys.OUTCOME,)
+    reset_returns_all_rows = True
     num_envs: int
     _state: EpisodeState
 
@@ -241,17 +242,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         return where(is_idle, state, after), torch.where(is_idle, 0.0, reward)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones_like(self._environment, dtype=torch.bool) if mask is None else mask.reshape(self.num_envs)
-        self._state = self._pure_reset(self._state, mask)
+        self._state = self._pure_reset(self._state, self.reset_mask(tensordict))
         return self._read()
-
-    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # `_reset` returns the rows that were not reset as they are, so TorchRL's merge by mask would change nothing.
-        if tensordict is None:
-            return tensordict_reset
-        tensordict.pop("_reset", None)
-        return tensordict.update(tensordict_reset)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         discrete, parameters = self._read_action(tensordict)

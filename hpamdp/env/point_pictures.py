@@ -11,7 +11,6 @@ import numpy as np
 from PIL import Image
 
 from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
-from hpamdp.env.point_agent import Located
 
 _FIELD, _RIM = "#ffffff", "#c9c5ba"
 _PATH, _BODY = "#2f6690", "#1d3f58"
@@ -44,11 +43,6 @@ class Scene:
     note: str = ""
     heading: float | None = None
     has_walls: bool = False
-
-
-def path_of(track: Sequence[Located]) -> list[Point]:
-    """Return the positions of one environment's states, columns `[1]`."""
-    return [(float(state.x), float(state.y)) for state in track]
 
 
 def draw(scene: Scene, size: int = 480) -> np.ndarray:

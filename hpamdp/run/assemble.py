@@ -178,7 +178,8 @@ def check_classes(config: Config) -> None:
 def check_run_memory(config: Config, device: torch.device) -> None:
     """Refuse more environments, steps or episodes than there is memory for, before any of them is built.
 
-    What counts are the tensors of a step, which an environment of its own gives, and the positions of an evaluation.
+    The estimate takes the tensors of a step, from a single environment that is built for it, and the paths that an
+    evaluation records.
 
     Raises:
         ConfigError: with the bytes that are surely needed.
@@ -227,7 +228,7 @@ def check_agent_memory(config: Config, specs: PAMDPSpecs, device: torch.device) 
 
 
 def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
-    """Refuse settings that need more bytes together than there are; the line names the one that needs most."""
+    """Refuse settings that together need more bytes than there are; the error names the one that needs most."""
     if not needs:
         return
     available = total_memory(device)
@@ -258,7 +259,7 @@ def memory_errors_explained(config: Config) -> Iterator[None]:
 
 
 def check_choice(config: Config, env: PAMDPEnv) -> None:
-    """Refuse a selector where there is nothing to choose, none where there is, and options of an impossible length.
+    """Refuse a needless or a missing selector, and options of a length that the environment does not allow.
 
     Raises:
         ConfigError: with the settings to change.
@@ -286,7 +287,7 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
 
 
 def check_modes(config: Config) -> None:
-    """Refuse a learner that cannot learn from what the run has: its own steps, batches of them, a data set or both.
+    """Refuse a run whose agent cannot learn from what there is: steps of its own, a data set or both.
 
     Raises:
         ConfigError: with the settings to change.

@@ -55,7 +55,15 @@ _DAMAGE = (
 
 
 def find(path: str | Path, where: str) -> Path:
-    """Return the checkpoint's file, given itself or the run's output folder; `where` names the setting in an error."""
+    """Return the file of a checkpoint.
+
+    Args:
+        path: the file itself or the output folder of its run.
+        where: the setting that gave the path, to name in an error.
+
+    Raises:
+        ConfigError: there is no checkpoint.
+    """
     path = Path(path).expanduser()
     file = path / FILE_NAME if path.is_dir() else path
     if not file.is_file():
@@ -67,11 +75,11 @@ def find(path: str | Path, where: str) -> Path:
 
 @dataclass(frozen=True)
 class Saved:
-    """What `load` gives back of a checkpoint, beside what it fills the agent with.
+    """What `load` returns; the agent itself is filled in place.
 
     Attributes:
         progress: JSON values that `save` was given.
-        states: what `save` was given, by name.
+        states: of the other parts of the run, by name, as `save` was given them.
         generators: the states of the random generators, for `set_generators`.
     """
 
@@ -230,8 +238,7 @@ def _read(
             if _MANIFEST not in archive.namelist():
                 return _read_policy(file, device)
             manifest = json.loads(archive.read(_MANIFEST))
-            if manifest["format"] != _FORMAT:
-                raise ValueError(f"format {manifest['format']}, but this version reads {_FORMAT}")
+            _check_format(manifest["format"])
             members = {}
             names = set(manifest["members"])
             for name in sorted(names if wanted is None else wanted & names):
@@ -252,10 +259,16 @@ def _read(
 def _read_policy(file: Path, device: torch.device | None) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
     """Read what `save_policy` wrote."""
     saved = torch.load(file, map_location=device, weights_only=True)
+    _check_format(saved["format"])
     progress = json.loads(saved["progress"])
     _check_progress(progress)
     _check_weights(file, saved["agent"])
     return progress, {"agent": saved["agent"]}
+
+
+def _check_format(number: int) -> None:
+    if number != _FORMAT:
+        raise ValueError(f"format {number}, but this version reads {_FORMAT}")
 
 
 def _check_progress(progress: Mapping[str, Any]) -> None:
@@ -277,7 +290,7 @@ def _replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
 
 def _fill_replay(buffer: ReplayBuffer, state: Mapping[str, Any] | None) -> None:
     if state is None:
-        warn("the checkpoint holds no replay (checkpoint.replay=false); the learner begins with an empty one")
+        warn("the checkpoint holds no replay (checkpoint_replay=false); the learner begins with an empty one")
         return
     if state["num_rows"]:
         buffer.extend(TensorDict(state["rows"], batch_size=[state["num_rows"]]))

@@ -33,7 +33,7 @@ _COMPRESSED = 15
 _FORMATS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 _DTYPES = {code: np.dtype(name) for code, name in _FORMATS.items()}
 _MAX_INFLATED = 64 * 2**20  # bytes; the released file takes about 20 million
-_MAX_OTHERS = 100  # variables skipped before the wanted one; the released file has no other
+_MAX_OTHERS = 100  # variables before the one that is looked for; the released file has no other
 
 _tag = struct.Struct("<II").unpack_from  # an element's type and size
 
@@ -102,7 +102,11 @@ class MatArray:
         self._start = name.end
 
     def numbers(self) -> np.ndarray:
-        """Return the values of a numeric array, column by column, float64 `[size]`."""
+        """Return the values of a numeric array, column by column, float64 `[size]`.
+
+        Raises:
+            DataError: it is not an array of real numbers, or its bytes are damaged.
+        """
         if self._kind not in _NUMERIC or self._is_complex:
             raise DataError(f"an array of class {self._kind} where real numbers were expected")
         values = _element(self._content, self._start)
@@ -112,13 +116,21 @@ class MatArray:
         return np.frombuffer(values.content, dtype).astype(np.float64)
 
     def cells(self) -> Iterator[MatArray]:
-        """Yield the arrays in a cell array, column by column."""
+        """Yield the arrays in a cell array, column by column.
+
+        Raises:
+            DataError: it is no cell array, or its bytes are damaged.
+        """
         if self._kind != _CELL:
             raise DataError(f"an array of class {self._kind} where a cell array was expected")
         yield from self._arrays(self._start, self.size)
 
     def fields(self) -> dict[str, MatArray]:
-        """Return the fields of a struct of size 1."""
+        """Return the fields of a struct of size 1, by their names.
+
+        Raises:
+            DataError: it is no such struct, or its bytes are damaged.
+        """
         if self._kind != _STRUCT or self.size != 1:
             raise DataError(f"an array of class {self._kind} and size {self.size} where one struct was expected")
         length = _element(self._content, self._start)

@@ -24,7 +24,7 @@ from hpamdp.data.human.released_file import FRAMES_PER_SECOND, FULL_TANK, HumanD
 from hpamdp.env.boatdock import harbour, physics
 
 TAP = 4.0  # px
-CENTRE = torch.tensor(harbour.CENTRE)
+_CENTRE = torch.tensor(harbour.CENTRE)
 
 
 def to_rest_to_rest(data: HumanData) -> HumanData:
@@ -64,8 +64,8 @@ def to_rest_to_rest(data: HumanData) -> HumanData:
 
 def _ends_as_recorded(presses: TensorDict, episodes: TensorDict, heading: Tensor) -> Tensor:
     """Return whether a press, from rest and with a full tank, ends as its episode did, bool `[N]`."""
-    x, y = (presses["position"] - CENTRE).unbind(1)
-    goal_x, goal_y = (episodes["goal"] - CENTRE).unbind(1)
+    x, y = (presses["position"] - _CENTRE).unbind(1)
+    goal_x, goal_y = (episodes["goal"] - _CENTRE).unbind(1)
     dir_x, dir_y = heading.unbind(1)
     tank = torch.full_like(presses["duration"], physics.TANK)
     sailed = physics.press(x, y, tank, goal_x, goal_y, dir_x, dir_y, presses["duration"])

@@ -155,14 +155,14 @@ def _episode_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
     x, y = directions(fields["boatchoice"][:, 0], fields["incongkm"][:, 0])
     expected = _DIRECTION_UNIT * np.stack([x, y], 2).reshape(-1, 6)
     error = np.abs(fields["boatdir"] - expected).max(1)
-    yield "boatdir are not the directions of this controller and key map", error < _EXACT
+    yield "boatdir does not hold the directions of this controller and key map", error < _EXACT
     start = fields["SG"][:, [0, 2]]
     goal = fields["SG"][:, [1, 3]]
     for name, point in (("start", start), ("goal", goal)):
         from_centre = np.linalg.norm(point - fields["center"], axis=1)
         yield f"the {name} is not within 110 px of the harbour's centre", from_centre <= harbour.LAYOUT_RADIUS + _EXACT
     separation = np.linalg.norm(start - goal, axis=1)
-    yield "start and goal are not 30 px apart", separation >= harbour.MIN_SEPARATION - _EXACT
+    yield "start and goal are less than 30 px apart", separation >= harbour.MIN_SEPARATION - _EXACT
     pressed = np.bincount(episode_of_press, fields["actions"].sum(1), minlength=len(separation))
     yield "its presses take more fuel than the tank lost", fields["tank"][:, 0] + 60 * pressed <= 360 + _MAX_OVERBURN
 

@@ -11,8 +11,8 @@ from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
 
-# The congruent controller is taken for the better one where the goal's bearing is less than this many degrees off its
-# nearest direction.
+# The congruent controller counts as the better one where the goal's bearing is less than this many degrees off the
+# nearest of its directions.
 _CONGRUENT_IS_BETTER_BELOW = 30.0
 
 
@@ -26,8 +26,8 @@ def layouts(data: HumanData) -> harbour.Layout:
 def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
     """Return the mean figures of the episodes of `mask` `[E]`, by the names of `hpamdp.env.boatdock.reference`.
 
-    What is `steps` there, the mean number of presses, is `presses` here.
-    `score_error` is the standard error of the mean score over episodes, `episodes` the number of episodes.
+    Beside them: `presses`, the mean number of presses (called `steps` there), `score_error`, the standard error of the
+    mean score, and `episodes`, the number of episodes.
     """
     if mask is None:
         mask = torch.ones(len(data.episodes), dtype=torch.bool)

@@ -58,7 +58,7 @@ class BoatDockEnv(PAMDPEnv):
             congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_physics: compile the pure step, reset and observation functions (takes about half a minute).
+        compile_rules: compile the pure step, reset and observation functions (takes about half a minute).
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
@@ -79,6 +79,7 @@ class BoatDockEnv(PAMDPEnv):
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
     result_keys = (keys.OUTCOME, episode.FUEL)
+    reset_returns_all_rows = True
     choice_setting: ClassVar[str] = "env.controller=choose"
     no_choice_setting: ClassVar[str] = "env.controller=congruent, incongruent, random"
     table_metrics: ClassVar[tuple[Metric, ...]] = (
@@ -112,7 +113,7 @@ class BoatDockEnv(PAMDPEnv):
         motor_noise: float | Pair = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
-        compile_physics: bool = False,
+        compile_rules: bool = False,
         oracle: bool = False,
         human: bool = False,
         device: torch.device | str | None = "cpu",
@@ -131,7 +132,7 @@ class BoatDockEnv(PAMDPEnv):
         self._pure_step = episode.step
         self._pure_reset = episode.reset
         self._pure_read = episode.read
-        if compile_physics:
+        if compile_rules:
             arguments: Any = counter_rng.COMPILE_ARGUMENTS
             self._pure_step = torch.compile(episode.step, **arguments)
             self._pure_reset = torch.compile(episode.reset, **arguments)
@@ -271,11 +272,10 @@ class BoatDockEnv(PAMDPEnv):
         self._has_layouts = False
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        mask, given = None, None
-        if tensordict is not None:
-            mask = tensordict.get("_reset", None)
-            given = self._given_layout(tensordict) if _LAYOUT_KEYS & set(tensordict.keys()) else None
-        mask = torch.ones_like(self._environment, dtype=torch.bool) if mask is None else mask.reshape(self.num_envs)
+        mask = self.reset_mask(tensordict)
+        given = None
+        if tensordict is not None and _LAYOUT_KEYS & set(tensordict.keys()):
+            given = self._given_layout(tensordict)
         self._state = self._pure_reset(self._state, mask, self._seed, self._environment, self.rules)
         if given is not None:
             self._state = where(mask, self._state._replace(**given), self._state)
@@ -283,14 +283,6 @@ class BoatDockEnv(PAMDPEnv):
             self._oracle.plan(self._state, mask)
         self._has_layouts = True
         return self._read()
-
-    def _reset_proc_data(self, tensordict: TensorDictBase | None, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # `_reset` gives the boats that were not reset as they are, so TorchRL's merge by mask, which takes longer than
-        # the physics of 65,536 boats, would change nothing.
-        if tensordict is None:
-            return tensordict_reset
-        tensordict.pop("_reset", None)
-        return tensordict.update(tensordict_reset)
 
     def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
         """Check a user's layout and return the state's columns that it sets."""

@@ -104,7 +104,7 @@ class BoatDockVector(VectorFace):
         autoreset_mode: when finished boats start again: in the next step (which ignores their actions), in the same
             step (the last observations and infos are `infos["final_obs"]` and `infos["final_info"]`), or only by
             `reset`.
-        compile_physics, device: as in BoatDockEnv.
+        compile_rules, device: as in BoatDockEnv.
 
     `reset` takes one integer seed for all boats; the layouts of boat i depend only on the seed and i, not on
     `num_envs`. The options of `reset` have one row for each boat; `reset_mask` (bool `[N]`) resets only these boats.
@@ -126,7 +126,7 @@ class BoatDockVector(VectorFace):
         slip: float = 0.0,
         action_format: ActionFormat = "dict",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        compile_physics: bool = False,
+        compile_rules: bool = False,
         device: torch.device | str = "cpu",
     ) -> None:
         env = BoatDockEnv(
@@ -138,7 +138,7 @@ class BoatDockVector(VectorFace):
             motor_noise=_one_or_two(motor_noise),
             sensor_noise=sensor_noise,
             slip=slip,
-            compile_physics=compile_physics,
+            compile_rules=compile_rules,
             device=device,
         )
         super().__init__(NumpyBoats(env, (num_envs,), action_format), num_envs, autoreset_mode)

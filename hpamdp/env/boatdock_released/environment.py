@@ -185,9 +185,8 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         )
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = self.reset_mask(tensordict)
         given = {} if tensordict is None else self._given_layout(tensordict)
-        mask = torch.ones_like(self._environment, dtype=torch.bool) if mask is None else mask.reshape(self.num_envs)
         before = self._state
         episode = before.episode + 1
         rng = counter_rng.key_for(self._seed, counter_rng.TRAINING, self._environment, episode)

@@ -9,20 +9,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.env import point_agent, point_pictures
+from hpamdp.env import point_agent
 from hpamdp.env.catch_point import rules
 from hpamdp.env.catch_point.rules import CatchPointState
-from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.point_env import PointEnv
 
 _CEILING = {25: 0.964, 30: 0.997}  # of success, by the limit of steps: who starts too far away cannot arrive
 
 
-class CatchPointEnv(CounterEnv[CatchPointState]):
+class CatchPointEnv(PointEnv[CatchPointState]):
     """Catch the target in `num_envs` planes at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 move, 1 catch; `("action", "parameters")` float32 `[N, 1]`:
@@ -52,6 +51,7 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
     discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     parameter_dims = (1, 0)
+    target_radius = point_agent.HIT_RADIUS
 
     def __init__(
         self,
@@ -93,11 +93,6 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
             return low, high
         return [*low, -1.0, -1.0], [*high, 1.0, self.max_steps / 12.0 - 0.99]
 
-    @property
-    def position(self) -> Tensor:
-        """Where the agents are, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
-
     def start(self, episode: Tensor, rng: Key) -> CatchPointState:
         """Return states with agent and target anywhere in the square."""
         return rules.start(episode, rng)
@@ -122,19 +117,7 @@ class CatchPointEnv(CounterEnv[CatchPointState]):
         is_published = (self.max_steps, self.catches, self.late_end) == (25, rules.PUBLISHED_CATCHES, True)
         return ({"scripted": {"score": 8.5, "success": 0.961}} if is_published else {}) | ceiling
 
-    def draw(self, track: Sequence[CatchPointState]) -> np.ndarray:
-        """Return a picture of the agent's way to the target, uint8 `[480, 480, 3]`."""
-        last = track[-1]
-        misses = int(last.misses)
-        return point_pictures.draw(
-            point_pictures.Scene(
-                path=point_pictures.path_of(track),
-                target=(float(last.target_x), float(last.target_y)),
-                radius=point_agent.HIT_RADIUS,
-                outcome=rules.OUTCOMES[int(last.outcome)],
-                is_over=int(last.outcome) != rules.GOING_ON,
-                is_success=int(last.outcome) == rules.CAUGHT,
-                steps=int(last.steps),
-                note=f"{misses} {'miss' if misses == 1 else 'misses'}",
-            )
-        )
+    def picture_note(self, state: CatchPointState) -> str:
+        """Return how many catches have missed."""
+        misses = int(state.misses)
+        return f"{misses} {'miss' if misses == 1 else 'misses'}"

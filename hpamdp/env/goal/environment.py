@@ -22,8 +22,7 @@ from hpamdp.env.counter_rng import Key
 from hpamdp.env.goal import rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
 
-GoalSlip = Literal["kick_to", "goal_distance", "keeper_projection"]
-HardGoalSlip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]
+Slip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]  # the last is Hard Goal's alone
 
 
 class GoalEnv(CounterEnv[GoalState]):
@@ -50,8 +49,8 @@ class GoalEnv(CounterEnv[GoalState]):
             100.
         observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
         noise: factor on the published noise of the motions; 0 is none. Starts are random all the same.
-        repaired: the slips to take out.
-        compile_physics: compile the ticks: faster with many pitches, but the first action takes about a minute.
+        repaired: the slips to take out; `slips` are those that the problem has.
+        compile_rules: compile the ticks: faster with many pitches, but the first action takes about a minute.
         device: of the tensors.
         seed: of starts and noise; the global generators are neither read nor moved.
         first_env: number of the first pitch, where other processes have the pitches before it.
@@ -87,8 +86,8 @@ class GoalEnv(CounterEnv[GoalState]):
         max_steps: int = 100,
         observation: Literal["scaled", "raw"] = "scaled",
         noise: float = 1.0,
-        repaired: Sequence[GoalSlip] = (),
-        compile_physics: bool = False,
+        repaired: Sequence[Slip] = (),
+        compile_rules: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
@@ -107,7 +106,7 @@ class GoalEnv(CounterEnv[GoalState]):
         self.repaired = tuple(repaired)
         self._is_scaled = observation == "scaled"
         self._tick, self._random_numbers = rules.masked_tick, rules.random_numbers
-        if compile_physics:
+        if compile_rules:
             self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
             self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
 
@@ -209,20 +208,7 @@ class HardGoalEnv(GoalEnv):
 
     The published code does not clip the shots' parameters; within [-1, 1] that makes no difference.
 
-    Args:
-        num_envs: number of pitches.
-        max_steps: actions after which an episode is truncated. The last one is not played, as in the published code,
-            which has 100.
-        observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
-        noise: factor on the published noise of the motions; 0 is none. Starts are random all the same.
-        repaired: the slips to take out.
-        compile_physics: compile the ticks: faster with many pitches, but the first action takes about a minute.
-        device: of the tensors.
-        seed: of starts and noise; the global generators are neither read nor moved.
-        first_env: number of the first pitch, where other processes have the pitches before it.
-
-    Raises:
-        ValueError: an argument or an action is invalid; the state is unchanged.
+    For the arguments and errors see `GoalEnv`.
     """
 
     discrete_names = rules.HARD_GOAL_ACTIONS
@@ -230,31 +216,6 @@ class HardGoalEnv(GoalEnv):
     parameter_low = (-1.0,) * 12
     parameter_high = (1.0,) * 12
     slips = ("kick_to", "goal_distance", "keeper_projection", "middle_shots")
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        max_steps: int = 100,
-        observation: Literal["scaled", "raw"] = "scaled",
-        noise: float = 1.0,
-        repaired: Sequence[HardGoalSlip] = (),
-        compile_physics: bool = False,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-    ) -> None:
-        super().__init__(
-            num_envs,
-            max_steps=max_steps,
-            observation=observation,
-            noise=noise,
-            repaired=repaired,  # type: ignore[arg-type]
-            compile_physics=compile_physics,
-            device=device,
-            seed=seed,
-            first_env=first_env,
-        )
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return None: there are no published ones."""

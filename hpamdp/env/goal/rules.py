@@ -460,7 +460,7 @@ def _accelerate(
         angle: in which direction, `[M]`; noise multiplies it.
         numbers: in (-1, 1), three of `[M]`: for the angle and the push in x and in y.
         noise: share of the angle and of the speed that the noise takes at most, a number or `[M]`.
-        limit: of the change of each velocity and of itself, a number or `[M]`.
+        limit: largest change of a velocity in x and in y, and largest velocity in x and in y, a number or `[M]`.
     """
     angle = angle + angle * noise * numbers[0]
     jolt = noise * _length(*velocity)
@@ -508,7 +508,8 @@ def goal_distance(state: GoalState, *, is_repaired: bool = False) -> Tensor:
 
     Args:
         state: of the episodes.
-        is_repaired: measure it behind the line below the goal, too; the published code gives twice 7.01 too much there.
+        is_repaired: right also for a ball behind the goal line and below the goal, for which the published code gives
+            2 x 7.01 too much.
     """
     beside = state.ball_y.abs() - GOAL_HALF_WIDTH
     depth = LENGTH - state.ball_x
@@ -537,8 +538,9 @@ def observe(state: GoalState, *, is_scaled: bool = True, repairs_projection: boo
     Args:
         state: of the episodes.
         is_scaled: from OBSERVATION_LOW and _HIGH to [-1, 1]; orientations and the ball can leave their bounds.
-        repairs_projection: clip where the keeper's shadow from the ball falls on the goal line to the goal; the
-            published code clips it to twice the height above. The bounds are the same.
+        repairs_projection: clip `keeper_projection`, where the line from the ball through the keeper meets the goal
+            line, to the goal's width. The published code lets it reach twice as far on the upper side. It is scaled by
+            the same bounds either way.
     """
     across, along = state.ball_y - state.keeper_y, state.ball_x - state.keeper_x
     distance = torch.hypot(along, across).clamp(min=1e-12)

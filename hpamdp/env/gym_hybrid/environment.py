@@ -8,24 +8,24 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.env import point_pictures
-from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.gym_hybrid import rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
+from hpamdp.env.point_env import PointEnv
 
 
-class _VehicleEnv(CounterEnv[VehicleState]):
+class _VehicleEnv(PointEnv[VehicleState]):
     """What Moving and Sliding have in common; see `MovingEnv`."""
 
     discrete_names: ClassVar[tuple[str, ...]] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 0)
+    target_radius = rules.TARGET_RADIUS
+    has_walls = True
     slides: ClassVar[bool]
     scripted_figures: ClassVar[dict[str, float]]  # of the hand-written player
 
@@ -57,11 +57,6 @@ class _VehicleEnv(CounterEnv[VehicleState]):
         """The lowest and the highest observation, `[10]` each."""
         return rules.observation_bounds(self.max_steps)
 
-    @property
-    def position(self) -> Tensor:
-        """Where the vehicles are, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
-
     def start(self, episode: Tensor, rng: Key) -> VehicleState:
         """Return states with vehicle and target anywhere in the field, at rest."""
         return rules.start(episode, rng)
@@ -86,23 +81,13 @@ class _VehicleEnv(CounterEnv[VehicleState]):
             return {}
         return {"scripted": self.scripted_figures, "ceiling": {"success": 1.0}}
 
-    def draw(self, track: Sequence[VehicleState]) -> np.ndarray:
-        """Return a picture of the vehicle's way to the target, uint8 `[480, 480, 3]`."""
-        last = track[-1]
-        return point_pictures.draw(
-            point_pictures.Scene(
-                path=point_pictures.path_of(track),
-                target=(float(last.target_x), float(last.target_y)),
-                radius=rules.TARGET_RADIUS,
-                outcome=rules.OUTCOMES[int(last.outcome)],
-                is_over=int(last.outcome) != rules.GOING_ON,
-                is_success=int(last.outcome) == rules.STOPPED,
-                steps=int(last.steps),
-                note=f"speed {float(last.speed):.2f}",
-                heading=float(last.heading),
-                has_walls=True,
-            )
-        )
+    def picture_note(self, state: VehicleState) -> str:
+        """Return the speed."""
+        return f"speed {float(state.speed):.2f}"
+
+    def heading(self, state: VehicleState) -> float:
+        """Return where the vehicle looks, rad."""
+        return float(state.heading)
 
 
 class MovingEnv(_VehicleEnv):

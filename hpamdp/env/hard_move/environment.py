@@ -8,15 +8,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from hpamdp.env import point_agent, point_pictures
-from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env import point_agent
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.hard_move import rules
 from hpamdp.env.hard_move.rules import HardMoveState
+from hpamdp.env.point_env import PointEnv
 
 NumActuators = Literal[4, 6, 8, 10]
 
@@ -28,7 +27,7 @@ _CEILING = {
 _SCRIPTED = {4: 0.962, 6: 0.990, 8: 0.993, 10: 0.995}  # success of the hand-written player within 30 steps
 
 
-class HardMoveEnv(CounterEnv[HardMoveState]):
+class HardMoveEnv(PointEnv[HardMoveState]):
     """Reach the target in `num_envs` planes at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: the set of actuators, a number of n bits whose highest one is
@@ -54,6 +53,7 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
 
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = point_agent.OBSERVATION_NAMES
+    target_radius = point_agent.HIT_RADIUS
 
     def __init__(
         self,
@@ -94,11 +94,6 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
         """The lowest and the highest observation, `[4]` each."""
         return point_agent.observation_bounds(self.max_steps)
 
-    @property
-    def position(self) -> Tensor:
-        """Where the agents are, `[N, 2]`."""
-        return torch.stack([self.state.x, self.state.y], -1)
-
     def start(self, episode: Tensor, rng: Key) -> HardMoveState:
         """Return states with agent and target anywhere in the square."""
         return rules.start(episode, rng)
@@ -124,18 +119,6 @@ class HardMoveEnv(CounterEnv[HardMoveState]):
         scripted = {"scripted": {"success": _SCRIPTED[self.n]}} if self.max_steps == 30 else {}
         return scripted | {"ceiling": {"success": _CEILING[self.max_steps][self.n]}}
 
-    def draw(self, track: Sequence[HardMoveState]) -> np.ndarray:
-        """Return a picture of the agent's way to the target, uint8 `[480, 480, 3]`."""
-        last = track[-1]
-        return point_pictures.draw(
-            point_pictures.Scene(
-                path=point_pictures.path_of(track),
-                target=(float(last.target_x), float(last.target_y)),
-                radius=point_agent.HIT_RADIUS,
-                outcome=rules.OUTCOMES[int(last.outcome)],
-                is_over=int(last.outcome) != rules.GOING_ON,
-                is_success=int(last.outcome) == rules.REACHED,
-                steps=int(last.steps),
-                note=f"{self.n} actuators",
-            )
-        )
+    def picture_note(self, state: HardMoveState) -> str:
+        """Return the number of actuators."""
+        return f"{self.n} actuators"

@@ -31,7 +31,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
-from hpamdp.policies.shared.fractions import FinalLearningRate, Fraction, LearningRate
+from hpamdp.policies.shared.fractions import Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy
@@ -93,7 +93,7 @@ class HPPO(OnPolicy, Learner):
         gamma: Fraction,
         gae_lambda: Fraction,
         lr: LearningRate,
-        lr_final: FinalLearningRate,
+        lr_final: Fraction,
         critic_weight: PositiveFloat,
         discrete_entropy: NonNegativeFloat,
         parameter_entropy: NonNegativeFloat,

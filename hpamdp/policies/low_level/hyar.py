@@ -8,10 +8,10 @@ Learning via Hybrid Action Representation*, 2022, arXiv 2109.05490: equations 2 
 Hoof and Meger 2018, arXiv 1802.09477; DDPG: Lillicrap et al. 2016, arXiv 1509.02971.
 
 In the published form (`discrete="nearest"`) the actor gives e and z, and e stands for the discrete action with the
-nearest embedding. It moves along the gradient of Q only, so it stays with a discrete action whose neighbours in the
-latent space are worse, whatever lies behind them. `discrete="greedy"` takes an exact maximum over the discrete actions
-instead: the actor gives a z for each of them, and the one whose own embedding and z have the highest Q is taken, in the
-policy as in the targets. It costs a pass of the critics for each discrete action.
+nearest embedding. The actor only follows the gradient of Q, so it stays with a discrete action whose neighbours in the
+latent space are worse, even where others farther away are better. `discrete="greedy"` takes an exact maximum over the
+discrete actions instead: the actor gives a z for each of them, and the one whose own embedding and z have the highest Q
+is taken, in the policy as in the targets. It costs a pass of the critics for each discrete action.
 
 Differs from the source:
 - discrete actions may take different numbers of parameters, which lie side by side; the encoder sees only the chosen
@@ -20,8 +20,8 @@ Differs from the source:
   entry dominates the reconstruction loss;
 - the random actions of the warm-up and of epsilon-greedy exploration have no latent action of their own: they are
   encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones;
-- the mean error to which the correction compares that of a stored action is a running one, over the last hundred or so
-  updates of the codec, instead of the last one;
+- the correction compares the error of a stored action with a running mean of the codec's error, over its last hundred
+  or so updates, instead of the error of the last update;
 - tanh bounds the actor's output; the published code multiplies the gradient by the range that is left (inverting
   gradients) besides, and clips its norm at 10;
 - exploration is by random actions, ever fewer, and by Gaussian noise of a constant scale; in the published code it is
@@ -47,7 +47,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
-from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update
+from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
@@ -135,10 +135,7 @@ class LatentActor(nn.Module):
             noise: standard deviation of the Gaussian noise on what the actor gives.
             noise_clip: bound of this noise.
         """
-        output = self.net(state).tanh()
-        if noise > 0.0:
-            added = (noise * torch.randn_like(output)).clamp(-noise_clip, noise_clip)
-            output = (output + added).clamp(-1.0, 1.0)
+        output = with_clipped_noise(self.net(state).tanh(), noise, noise_clip)
         if not self.is_greedy:
             return output.unsqueeze(1)
         z = output.unflatten(-1, (-1, self.latent_dim))
@@ -158,7 +155,7 @@ class LatentCritics(nn.Module):
         Args:
             state: `[B, observation_dim]`.
             latent: `[B, N, embedding_dim + latent_dim]`.
-            num_members: ask the first networks alone, so many of them.
+            num_members: how many of the networks to ask, from the first on; None: all, E.
         """
         batch_size, num_latents, _ = latent.shape
         rows = torch.cat([state.unsqueeze(1).expand(-1, num_latents, -1), latent], -1)
@@ -166,7 +163,7 @@ class LatentCritics(nn.Module):
 
 
 class HyARPolicy(TensorDictModuleBase):
-    """Decode the best of the actor's proposals; explore with Gaussian noise on them and with random actions."""
+    """Takes the best of the actor's proposals, decoded; explores with noise on them and with random actions."""
 
     epsilon: Tensor
 
@@ -190,14 +187,14 @@ class HyARPolicy(TensorDictModuleBase):
         The latent action is `[*B, embedding_dim + latent_dim]`.
         """
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
-        exploring = not is_greedy()
-        proposals = self.actor(state, self.codec.embeddings, self.noise if exploring else 0.0)
+        is_exploring = not is_greedy()
+        proposals = self.actor(state, self.codec.embeddings, self.noise if is_exploring else 0.0)
         latent = proposals[:, 0]
         if proposals.shape[1] > 1:
             best = self.critics(state, proposals).amin(0).argmax(-1)
             latent = proposals[torch.arange(len(best), device=best.device), best]
         discrete, unit = self.decode(state, latent)
-        if exploring and self.epsilon > 0.0:
+        if is_exploring and self.epsilon > 0.0:
             is_random = torch.rand_like(unit[:, :1]) < self.epsilon
             unit = torch.where(is_random, 2.0 * torch.rand_like(unit) - 1.0, unit)
             random_discrete = torch.randint_like(discrete, self.specs.num_discrete)
@@ -365,7 +362,7 @@ class HyAR(ReplayLearner):
             new_e = self.codec.embeddings[discrete]
             new_z, log_variance = self.codec.encode(state, discrete, batch["unit"])
             if self.relabels_with_noise:
-                new_e = (new_e + (0.1 * torch.randn_like(new_e)).clamp(-0.5, 0.5)).clamp(-1.0, 1.0)
+                new_e = with_clipped_noise(new_e, 0.1, 0.5)
                 new_z = new_z + (0.5 * log_variance).exp() * torch.randn_like(new_z)
             e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
             z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(new_z))

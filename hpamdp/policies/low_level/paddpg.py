@@ -41,6 +41,7 @@ from hpamdp.policies.shared.networks import (
     InvertingGradients,
     mlp,
     polyak_update,
+    with_clipped_noise,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -94,8 +95,6 @@ class PADDPGPolicy(TensorDictModuleBase):
 
 class PADDPG(ReplayLearner):
     """Deterministic policy gradients on scores and parameters together, from a replay buffer of its own."""
-
-    has_value: ClassVar[bool] = True
 
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no scores
 
@@ -154,10 +153,6 @@ class PADDPG(ReplayLearner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
 
-    def value(self, observation: Tensor) -> Tensor:
-        """Return Q of the actor's output, `[B]`."""
-        return self._q(self.critics, observation, self.actor(observation)).amin(0)
-
     def explore(self, frames: int) -> None:
         """Lower the fraction of random actions."""
         self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
@@ -195,9 +190,5 @@ class PADDPG(ReplayLearner):
     def _target(self, batch: TensorDictBase) -> Tensor:
         """Return r + discount min Q'(s', a'), `[B]`, with a' the target actor's output, smoothed with `twin`."""
         state = batch["next_state"]
-        output = self.target_actor(state)
-        if self.target_smoothing > 0.0:
-            bound = self.target_smoothing_clip
-            noise = (self.target_smoothing * torch.randn_like(output)).clamp(-bound, bound)
-            output = (output + noise).clamp(-1.0, 1.0)
+        output = with_clipped_noise(self.target_actor(state), self.target_smoothing, self.target_smoothing_clip)
         return batch["reward"] + batch["discount"] * self._q(self.target_critics, state, output).amin(0)

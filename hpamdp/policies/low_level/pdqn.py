@@ -44,6 +44,7 @@ from hpamdp.policies.shared.networks import (
     InvertingGradients,
     mlp,
     polyak_update,
+    with_clipped_noise,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
 from hpamdp.specs import PAMDPSpecs
@@ -224,11 +225,7 @@ class PDQN(ReplayLearner):
         """
         state = batch["next_state"]
         with torch.no_grad():
-            unit = self.target_actor(state)
-            if self.target_smoothing > 0.0:
-                bound = self.target_smoothing_clip
-                noise = (self.target_smoothing * torch.randn_like(unit)).clamp(-bound, bound)
-                unit = (unit + noise).clamp(-1.0, 1.0)
+            unit = with_clipped_noise(self.target_actor(state), self.target_smoothing, self.target_smoothing_clip)
             q = self.target_critics(state, unit).amin(0)
             choosing_q = self.critics(state, unit).amin(0) if self.double_q else q
             best = q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)

@@ -8,16 +8,16 @@ algorithm 1 and section 5; eNAC: Peters and Schaal 2008, *Natural Actor-Critic*,
 Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learning using the Fourier Basis*; the bound
 on the step: Dabney and Barto 2012, *Adaptive Step-Size for Online Temporal Difference Learning*.
 
-Where random actions do not lead everywhere, as on Platform, give `feature_range`: entries beyond the range that the
-warm-up saw are clipped, so that the learner cannot tell states beyond it apart. Many parallel environments then want a
-small `envs_per_update`, as Sarsa's step is no longer for a mean over more of them.
+Where random actions do not lead everywhere, as on Platform, give `feature_range`: without it, entries are clipped to
+the range that the warm-up saw, and the learner cannot tell states beyond it apart. With many parallel environments a
+small `envs_per_update` learns more from the same steps, since every group of environments makes updates of its own.
 
 Differs from the source:
 - all environments learn together: Sarsa makes one update per time step and group of environments, the mean over the
   group (all of them by default), and the bound on its step size holds for that mean; eNAC accumulates its regression as
   normal equations, with ridge regularisation;
 - the value of the next discrete action is its expectation under the softmax where that action is not in the batch: in
-  the batch's last column and where an episode is truncated;
+  the batch's last column, and where an episode is truncated;
 - the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to `feature_range` or to its
   range in the warm-up;
 - by default, that is with `qpamdp.yaml`: all weights of the values have the same step size, which Dabney and Barto's
@@ -329,7 +329,7 @@ class QPAMDP(Learner):
     high: Tensor
     best_return: Tensor  # of the current phase's windows
     window_return: Tensor  # sum over the current window
-    # A new run goes on from the phase: a second warm-up would fit other bases than those of the weights.
+    # A run from `low.checkpoint` goes on in the saved phase: a second warm-up would fit other bases under the weights.
     progress: ClassVar[frozenset[str]] = frozenset()
 
     frames: Tensor

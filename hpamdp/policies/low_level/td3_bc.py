@@ -31,7 +31,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
-from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
+from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -182,9 +182,7 @@ class TD3BC(ReplayLearner):
     def _target(self, sample: TensorDictBase) -> Tensor:
         """Return r + discount max_k Q'(s', k, x'(s')) over the allowed discrete actions k, `[B]`."""
         state = sample["next_state"]
-        unit = self.target_actor(state)
-        bound = self.target_smoothing_clip
-        noise = (self.target_smoothing * torch.randn_like(unit)).clamp(-bound, bound)
-        q = self.target_critics(state, (unit + noise).clamp(-1.0, 1.0)).amin(0)
+        unit = with_clipped_noise(self.target_actor(state), self.target_smoothing, self.target_smoothing_clip)
+        q = self.target_critics(state, unit).amin(0)
         best = q.masked_fill(self.policy.is_rare(state), -torch.inf).amax(-1)
         return sample["reward"] + sample["discount"] * best

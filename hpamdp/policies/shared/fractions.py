@@ -17,4 +17,3 @@ def _check_rate(rate: float) -> float:
 
 
 LearningRate = Annotated[float, AfterValidator(_check_rate)]
-FinalLearningRate = Annotated[float, Field(ge=0.0, le=1.0)]

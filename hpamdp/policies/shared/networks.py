@@ -74,6 +74,22 @@ def sample_index(logits: Tensor) -> Tensor:
     return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
 
 
+def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
+    """Return actions in [-1, 1] with Gaussian noise, itself clipped: the target policy smoothing of TD3.
+
+    Source: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477, section 5.3.
+
+    Args:
+        unit: the actions, of any shape.
+        scale: standard deviation of the noise; 0 is none, and draws no random numbers.
+        clip: bound of the noise.
+    """
+    if scale == 0.0:
+        return unit
+    noise = (scale * torch.randn_like(unit)).clamp(-clip, clip)
+    return (unit + noise).clamp(-1.0, 1.0)
+
+
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move a target network's parameters the fraction `tau` of the way towards the source network's."""
     for target_parameter, parameter in zip(target.parameters(), source.parameters(), strict=True):

@@ -1,17 +1,21 @@
-"""Collection in the learner's own process."""
+"""Collection in the learner's own process.
+
+TorchRL resets all environments when a collector is built and offers no way to continue from a state: its
+`Collector.state_dict` holds the policy and the environment's modules. So a collector's root, the tensordict from which
+it makes the next step, is saved and replaced here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 
 from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection
-from hpamdp.run.collection.root import collector_state, set_collector_state
 
 
 class SingleCollection(Collection):
@@ -46,13 +50,24 @@ class SingleCollection(Collection):
         After an error in the middle of a batch, when TorchRL has closed its collector, there are no episodes to go on
         with; what else the environments' state holds, such as the scale of observations, is returned.
         """
-        if self._is_idle:
-            return collector_state(self._collector)
-        return {"env": {} if self.env.keeps_episodes else self.env.env_state()}
+        if not self._is_idle:
+            return {"env": {} if self.env.keeps_episodes else self.env.env_state()}
+        state: dict[str, Any] = {"env": {name: column.clone() for name, column in self.env.env_state().items()}}
+        if self.env.keeps_episodes:
+            state["root"] = self._collector._carrier.exclude("collector").clone().to_dict()
+        return state
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`."""
-        set_collector_state(self._collector, state)
+        """Continue from a `state`.
+
+        Raises:
+            ValueError: the state is of another number of environments.
+        """
+        if state["env"]:  # else the episodes that the collector has just begun go on
+            self.env.set_env_state(state["env"])
+        if "root" in state and self.env.keeps_episodes:
+            root = self._collector._carrier
+            root.update(TensorDict(state["root"], batch_size=root.batch_size))
 
     def close(self) -> None:
         """Stop collecting; the environment stays open."""

@@ -1,0 +1,69 @@
+"""A base for problems in which a point has to reach a target in the plane: where it is, and its pictures."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hpamdp.env import point_pictures
+from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv, EpisodeColumns
+from hpamdp.env.point_agent import Located
+
+
+class PointColumns(EpisodeColumns, Located, Protocol):
+    """Columns `[N]` of episodes, among them the places of the agents and of their targets."""
+
+    @property
+    def target_x(self) -> Tensor:
+        """Of the target."""
+
+    @property
+    def target_y(self) -> Tensor:
+        """Of the target."""
+
+
+PointEpisode = TypeVar("PointEpisode", bound=PointColumns)
+
+
+class PointEnv(CounterEnv[PointEpisode], Generic[PointEpisode]):
+    """`num_envs` copies of a problem with a point and a target; see `CounterEnv`."""
+
+    target_radius: ClassVar[float]  # the distance that counts as a hit
+    has_walls: ClassVar[bool] = False  # whether the agent must stay within the square
+
+    @property
+    def position(self) -> Tensor:
+        """Where the agents are, `[N, 2]`."""
+        return torch.stack([self.state.x, self.state.y], -1)
+
+    def draw(self, track: Sequence[PointEpisode]) -> np.ndarray:
+        """Return a picture of the agent's way to the target, uint8 `[480, 480, 3]`."""
+        last = track[-1]
+        outcome = int(last.outcome)
+        return point_pictures.draw(
+            point_pictures.Scene(
+                path=[(float(state.x), float(state.y)) for state in track],
+                target=(float(last.target_x), float(last.target_y)),
+                radius=self.target_radius,
+                outcome=self.outcomes[outcome],
+                is_over=outcome != GOING_ON,
+                is_success=outcome == SUCCESS,
+                steps=int(last.steps),
+                note=self.picture_note(last),
+                heading=self.heading(last),
+                has_walls=self.has_walls,
+            )
+        )
+
+    @abstractmethod
+    def picture_note(self, state: PointEpisode) -> str:
+        """Return what a picture says of the state of one environment, columns `[1]`, beside the number of steps."""
+
+    def heading(self, state: PointEpisode) -> float | None:
+        """Return where the agent of one environment looks, rad; None where it has no front."""
+        return None
