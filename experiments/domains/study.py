@@ -1,8 +1,8 @@
 """Tabulate the learners on the field's domains beside the published scores, and draw their curves.
 
-python experiments/domains/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv, in
-                                                 the place of earlier ones of the same learner, domain, steps and seed;
-                                                 then draws and tabulates
+python experiments/domains/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
+                                                 in the place of earlier ones of the same learner, domain, steps and
+                                                 seed; then draws and tabulates
 python experiments/domains/study.py              draws and tabulates the stored csv files
 """
 
@@ -33,8 +33,8 @@ from hpamdp.analysis.study import (
 )
 
 HERE = Path(__file__).resolve().parent
-# The domains, with the published number of steps and what is scored: the mean return or the share of successes. No scores
-# were published on Moving and Sliding; a hand-written player scores 1.867 and 1.856.
+# The domains, with the published number of steps and what is scored: the mean return or the share of successes. No
+# scores were published on Moving and Sliding; a hand-written player scores 1.867 and 1.856.
 DOMAINS = {
     "platform": (200_000, "score"),
     "goal": (300_000, "success"),
@@ -105,7 +105,9 @@ def merged(stored: Rows, new: Rows) -> Rows:
     kept = [row for row in stored if tuple(_text(row[name]) for name in KEY) not in made_anew]
     rows = kept + new
     order = {name: number for number, name in enumerate(DOMAINS)}
-    return sorted(rows, key=lambda row: (order[row["domain"]], row["learner"], float(row["frames"]), float(row["seed"])))
+    return sorted(
+        rows, key=lambda row: (order[row["domain"]], row["learner"], float(row["frames"]), float(row["seed"]))
+    )
 
 
 def _text(value: Any) -> str:
@@ -122,9 +124,7 @@ def within_cpu_limit(results: Rows) -> Rows:
     chosen: Rows = []
     for cell in groups(results, "domain", "learner").values():
         affordable = [
-            rows
-            for rows in groups(cell, "frames").values()
-            if np.mean([row["cpu_s"] for row in rows]) <= CPU_LIMIT
+            rows for rows in groups(cell, "frames").values() if np.mean([row["cpu_s"] for row in rows]) <= CPU_LIMIT
         ]
         chosen += max(affordable, key=lambda rows: rows[0]["frames"], default=[])
     return chosen
@@ -152,7 +152,7 @@ def _values(rows: Rows) -> list[float]:
 
 
 def _cell(values: list[float]) -> str:
-    """Return the interquartile mean and its interval from `MIN_SEEDS` seeds on, else mean ± deviation, and the seeds."""
+    """Return the interquartile mean and its interval from `MIN_SEEDS` seeds on, else mean ± deviation; the seeds."""
     if not values:
         return ""
     if len(values) < MIN_SEEDS:
