@@ -93,7 +93,7 @@ class AgentConfig(BaseModel):
     model_config = _STRICT
 
     sharing: Literal["per_option", "shared"]
-    option_length: Literal["episode"] | PositiveInt
+    option_length: Literal["episode", "learned"] | PositiveInt
     uniform_option_frames: NonNegativeInt
 
 

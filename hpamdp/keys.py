@@ -13,7 +13,11 @@ OUTCOME = "outcome"  # how the episode ended, in an environment's own codes
 IS_DECISION = "is_decision"
 OPTION_RETURN, OPTION_STEPS = "option_return", "option_steps"
 DECISION_OBSERVATION = "decision_observation"
+OPTION_ENDED = "option_ended"  # only where options may end inside their episodes
 EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
+
+# Written by the agent for its learners, where there is `option_ended`: the option that holds in the next state.
+NEXT_OPTION = ("next", "option")
 
 # Written by an environment that knows the best action; read by the `oracle` selector and the `planner` learner.
 ORACLE_OPTION = ("oracle", "option")

@@ -64,6 +64,19 @@ def crossing(*words: str) -> Config:
             "agent.option_length=3: env=platform has no options; use agent.option_length=episode",
         ),
         (
+            "high=actor env=crossing low=stepper agent.option_length=learned",
+            "agent.option_length=learned: high=actor does not decide where options end; use high=option_critic, "
+            "high=meta_critic or a number of steps",
+        ),
+        *(
+            (
+                f"high={high} env=crossing low=stepper agent.option_length=3",
+                f"agent.option_length=3: high={high} is a bandit, which counts what an option pays and nothing of what "
+                "follows it; use agent.option_length=episode, high=meta_critic or high=actor",
+            )
+            for high in ("ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson")
+        ),
+        (
             "high=none env.controller=random low.freeze=true",
             "low.freeze=true: there is no choice left to learn; use low.freeze=false",
         ),
@@ -86,6 +99,19 @@ def test_what_does_not_go_together_is_refused_in_one_line(words, complaint, tmp_
     with pytest.raises(ConfigError) as error:
         make(make_config([*SMALL, *low, *words.split()]), tmp_path)
     assert str(error.value) == complaint
+
+
+@pytest.mark.parametrize("high", ["option_critic", "meta_critic"])
+def test_a_selector_that_ends_options_trains_and_is_evaluated(high, tmp_path):
+    words = (
+        ["high.warmup_steps=0", "high.batch_size=16", "high.updates_per_step=0.2"] if high == "option_critic" else []
+    )
+    words = QUICK_CRITIC if high == "meta_critic" else [f"high={high}", *words]
+    low = ["low=pdqn", *SHORT["pdqn"]]
+    config = make_config([*SMALL, "env=rooms", *low, *words, "agent.option_length=learned"])
+    parts = train(config, tmp_path / "run")
+    played = parts.evaluation.run(parts.agent.policy)
+    assert played["steps"].max() <= 50
 
 
 def test_frozen_learners_play_whole_episodes_so_that_options_cannot_be_shorter(tmp_path):

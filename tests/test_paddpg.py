@@ -114,3 +114,10 @@ def test_parameters_start_at_the_problems_initial_ones():
     state = torch.rand(50, 4) * 2 - 1
     expected = torch.stack([0.1 + 0.5 * state[:, 0], torch.full((50,), 0.8), torch.full((50,), -0.6)], -1)
     torch.testing.assert_close(learner.actor(state)[:, 3:], expected, atol=0.02, rtol=0.0)
+
+
+def test_the_value_is_that_of_the_actors_output():
+    learner = make(twin=True, target_smoothing=0.0)
+    state = torch.randn(10, 4)
+    q = learner.critics(torch.cat([state, learner.actor(state)], -1)).squeeze(-1).amin(0)
+    torch.testing.assert_close(learner.value(state), q)

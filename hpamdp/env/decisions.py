@@ -24,6 +24,8 @@ class DecisionTracker(Transform):
     - `option_return`: sum of rewards since the option began, discounted by `gamma`, and `option_steps`, its number of
       steps.
     - `decision_observation` `[*B, observation_dim]`: the observation at which the option was chosen.
+    - `option_ended`, bool, only with an `option_length`: under `next`, the option ended with this step by itself, not
+      only because its episode did.
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
     The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
@@ -33,10 +35,11 @@ class DecisionTracker(Transform):
 
     Args:
         gamma: discount of an environment step within the option.
-        option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode.
+        option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode;
+            `math.inf`: the selector ends it, by setting `is_decision` in the root of the step that it chooses anew at.
     """
 
-    def __init__(self, gamma: float = 1.0, option_length: int | None = None) -> None:
+    def __init__(self, gamma: float = 1.0, option_length: float | None = None) -> None:
         super().__init__()
         self.gamma = gamma
         self.option_length = option_length
@@ -46,6 +49,8 @@ class DecisionTracker(Transform):
         shape = (*observation_spec.shape, 1)
         device = observation_spec.device
         observation_spec[keys.IS_DECISION] = Binary(n=1, shape=shape, dtype=torch.bool, device=device)
+        if self.option_length is not None:
+            observation_spec[keys.OPTION_ENDED] = observation_spec[keys.IS_DECISION].clone()
         for name in (keys.OPTION_RETURN, keys.EPISODE_RETURN):
             observation_spec[name] = Unbounded(shape=shape, device=device)
         for name in (keys.OPTION_STEPS, keys.EPISODE_STEPS):
@@ -58,6 +63,8 @@ class DecisionTracker(Transform):
         observation = tensordict_reset.get(keys.OBSERVATION)
         is_decision = torch.ones_like(tensordict_reset.get(keys.DONE))
         zeros = torch.zeros(is_decision.shape, device=observation.device)
+        if self.option_length is not None:
+            tensordict_reset.set(keys.OPTION_ENDED, torch.zeros_like(is_decision))
         return tensordict_reset.update(
             {
                 keys.IS_DECISION: is_decision,
@@ -85,7 +92,9 @@ class DecisionTracker(Transform):
             option_return = _zero_where(is_first, option_return)
             option_steps = _zero_where(is_first, option_steps)
             decision_observation = torch.where(is_first, tensordict.get(keys.OBSERVATION), decision_observation)
-            is_decision = done | (option_steps + 1 >= self.option_length)
+            option_ended = option_steps + 1 >= self.option_length
+            is_decision = done | option_ended
+            next_tensordict.set(keys.OPTION_ENDED, option_ended)
         next_tensordict.set(keys.IS_DECISION, is_decision)
         next_tensordict.set(keys.OPTION_RETURN, option_return + self.gamma**option_steps * reward)
         next_tensordict.set(keys.OPTION_STEPS, option_steps + 1)
@@ -111,6 +120,6 @@ class DecisionEnv(TransformedEnv):
         return self.transform._reset(fresh.empty() if given is None else given, fresh)
 
 
-def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: int | None = None) -> DecisionEnv:
+def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionEnv:
     """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
     return DecisionEnv(env, DecisionTracker(gamma, option_length))

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, Selector
@@ -85,6 +86,95 @@ class HeldOption(TensorDictModuleBase):
         return td.set(keys.OPTION, torch.full(td.batch_size, self.option, device=observation.device))
 
 
+class NextOptions:
+    """What follows an option that ends inside its episode: a `Following` for the learners of an agent.
+
+    Args:
+        selector: chooses the options.
+        learners: one for each option, or a single one that observes the option.
+        is_shared: whether the single learner observes the option.
+    """
+
+    def __init__(self, selector: Selector, learners: Iterable[Learner], is_shared: bool) -> None:
+        self.selector = selector
+        self.learners = list(learners)
+        self.num_options = selector.specs.num_options
+        self.is_shared = is_shared
+        self.sees_observation_alone = {*selector.in_keys} <= {keys.OBSERVATION, keys.IS_DECISION}
+
+    @torch.no_grad()
+    def value(self, observation: Tensor, option: Tensor) -> Tensor:
+        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen."""
+        if self.is_shared:
+            one_hot = F.one_hot(option, self.num_options).to(observation)
+            return self.learners[0].value(torch.cat([self._without_option(observation), one_hot], -1))
+        value = observation.new_zeros(len(observation))
+        for i, learner in enumerate(self.learners):
+            rows = option == i
+            if rows.any():
+                value[rows] = learner.value(observation[rows])
+        return value
+
+    @property
+    def decides_ends(self) -> bool:
+        """Whether the selector decides where options end."""
+        return self.selector.decides_ends
+
+    @torch.no_grad()
+    def choose(self, observation: Tensor, option: Tensor, held: Tensor) -> Tensor:
+        """Return the selector's greedy options `[N]`, or the given ones if it needs more than the observation."""
+        if not self.sees_observation_alone:
+            return option
+        seen = {keys.OBSERVATION: self._without_option(observation)}
+        return self.greedy(TensorDict(seen, [len(observation)]), held)
+
+    @torch.no_grad()
+    def greedy(self, td: TensorDictBase, held: Tensor) -> Tensor:
+        """Return the selector's greedy options `[N]`; where it decides so, the held ones `[N]` go on.
+
+        Args:
+            td: what it reads of the states `[N]` but for `is_decision`.
+            held: the options before.
+        """
+        is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
+        td = td.copy().set(keys.IS_DECISION, is_decision).set(keys.OPTION, held)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            option = self.selector.choose(td)[keys.OPTION]
+            return torch.where(self.selector.ends(td), option, held) if self.decides_ends else option
+
+    def with_ends(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return a shallow copy of a batch `[*B, T]` with the ends that the selector decided on, a step later each.
+
+        Whether an option ends with the batch will be known with the next one. For learners it does (`option_ended`),
+        and may be followed by itself; for the selector it does not (`is_decision`).
+        """
+        done = batch.get(("next", keys.DONE))
+        is_ended = batch.get(keys.IS_DECISION).roll(-1, -2) & ~done
+        is_ended[..., -1, :] = False
+        batch = batch.copy()
+        batch.set(("next", keys.IS_DECISION), is_ended | done)
+        is_ended = is_ended.clone()
+        is_ended[..., -1, :] = True
+        return batch.set(("next", keys.OPTION_ENDED), is_ended)
+
+    def with_next_option(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return a shallow copy of a batch `[*B, T]` in which `("next", "option")` holds in the next state, `[*B, T]`.
+
+        Where an option ends, it is the one of the next step; where that is not in the batch, the selector's greedy one.
+        """
+        option = batch.get(keys.OPTION)
+        is_ended = batch.get(("next", keys.OPTION_ENDED)).squeeze(-1)
+        is_missing = is_ended & batch.get(("next", keys.DONE)).squeeze(-1)
+        is_missing[..., -1] = is_ended[..., -1]
+        following = torch.where(is_ended, option.roll(-1, -1), option)
+        if is_missing.any():
+            following[is_missing] = self.greedy(batch.get("next")[is_missing], option[is_missing])
+        return batch.copy().set(keys.NEXT_OPTION, following)
+
+    def _without_option(self, observation: Tensor) -> Tensor:
+        return observation[..., : -self.num_options] if self.is_shared else observation
+
+
 class HierarchicalAgent(nn.Module):
     """A selector and its learners: one policy that acts and one call to learn.
 
@@ -97,6 +187,7 @@ class HierarchicalAgent(nn.Module):
         is_frozen: whether the learners stay as they are.
         uniform_option_frames: number of steps (of decisions, if the learners are frozen) at the beginning for which the
             selector's exploring choices are uniform. The selector learns from them.
+        selector_ends_options: whether the selector decides where options end.
 
     Attributes:
         policy: writes `option`, if there is a selector, and the action leaves.
@@ -114,6 +205,7 @@ class HierarchicalAgent(nn.Module):
         is_shared: bool = False,
         is_frozen: bool = False,
         uniform_option_frames: int = 0,
+        selector_ends_options: bool = False,
     ) -> None:
         super().__init__()
         self.selector = selector
@@ -126,6 +218,12 @@ class HierarchicalAgent(nn.Module):
         self._set_is_uniform()
         self.router = OptionRouter(learners, specs, is_shared)
         self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
+        self.next_options: NextOptions | None = None
+        if selector is not None:
+            selector.decides_ends = selector_ends_options
+            self.next_options = NextOptions(selector, learners, is_shared)
+            for learner in learners:
+                learner.following = self.next_options
 
     def policy_of(self, option: int) -> TensorDictModuleBase:
         """Return the policy that always holds one option and otherwise acts like this agent."""
@@ -136,10 +234,13 @@ class HierarchicalAgent(nn.Module):
         scalars: dict[str, float] = {}
         self.frames += batch.numel()
         if self.selector is not None:
+            if self.selector.decides_ends and self.next_options is not None:
+                batch = self.next_options.with_ends(batch)
             self._set_is_uniform()
             self._set_pending(self.selector, batch)
             decisions = _finished_decisions(batch)
             learned = self.selector.learn(decisions) if len(decisions) else {}
+            learned = {**learned, **self.selector.learn_from_steps(batch)}
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
@@ -186,6 +287,8 @@ class HierarchicalAgent(nn.Module):
     def _shares(self, batch: TensorDictBase) -> Iterator[tuple[str, Learner, TensorDictBase, Tensor]]:
         """Yield for each learner its prefix in logs, itself, the batch as it sees it, the mask of its transitions."""
         everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
+        if self.next_options is not None and ("next", keys.OPTION_ENDED) in batch.keys(include_nested=True):
+            batch = self.next_options.with_next_option(batch)
         if self.is_shared:
             batch = with_option(batch, self.specs.num_options)
         for i, learner in enumerate(self._learners()):

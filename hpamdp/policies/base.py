@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -22,7 +22,37 @@ def is_greedy() -> bool:
 
 def option_ends(batch: TensorDictBase) -> Tensor:
     """Return where an episode or an option ends, bool `[*B, T, 1]`; another option's rows may follow."""
-    return batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
+    is_end = batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
+    return is_end | batch.get(("next", keys.OPTION_ENDED), False)
+
+
+class Following(Protocol):
+    """What follows an option that ends inside its episode, as the agent tells it to its learners.
+
+    The value of a state in which an option has ended is the value under the option that follows, by that option's own
+    learner. Learners reach one another through this alone. Observations are as the learner that asks sees them.
+    """
+
+    def value(self, observation: Tensor, option: Tensor) -> Tensor:
+        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen."""
+        ...
+
+    @property
+    def decides_ends(self) -> bool:
+        """Whether the selector decides where options end; otherwise they end where they did at the time."""
+        ...
+
+    def choose(self, observation: Tensor, option: Tensor, held: Tensor) -> Tensor:
+        """Return the options `[N]` that the selector would now choose greedily in states `[N, observation_dim]`.
+
+        Where it decides that the held option goes on, that is the held one.
+
+        Args:
+            observation: of the states in which an option has ended or may end.
+            option: chosen at the time, `[N]`. The result, if the selector would need more than the observation.
+            held: the options before, `[N]`.
+        """
+        ...
 
 
 class Selector(TensorDictModuleBase):
@@ -74,6 +104,10 @@ class Selector(TensorDictModuleBase):
             keys that `select` reads to `in_keys`. Environments without such an argument are refused.
         gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
             it, and so is the value of the next decision, see `next_discount`.
+        ends_options: whether the selector can decide where options end, by `ends`.
+        decides_ends: whether it does so in this run (`agent.option_length=learned`); the agent sets it.
+        is_bandit: whether the selector takes what an option paid for all that its choice was worth. It then is for
+            options that last as long as their episodes, after which nothing follows; others are refused.
         modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others
             made. A selector with keys of its own in `out_keys` usually has `train` alone, as a data set lacks them.
         is_uniform: bool scalar, a buffer that the agent sets. While it is true, for the first
@@ -85,6 +119,9 @@ class Selector(TensorDictModuleBase):
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
+    is_bandit: ClassVar[bool] = False
+    ends_options: ClassVar[bool] = False
+    decides_ends: bool = False
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     gamma: float = 1.0
     is_uniform: Tensor
@@ -118,6 +155,20 @@ class Selector(TensorDictModuleBase):
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return a uniformly random choice: a tensor `[*B]` for each of `out_keys`."""
         return {keys.OPTION: torch.randint(self.specs.num_options, td.batch_size, device=self.is_uniform.device)}
+
+    def ends(self, td: TensorDictBase) -> Tensor:
+        """Return where the held `option` `[*B]` of `td` ends, given `observation`, bool `[*B]`; greedily or exploring.
+
+        Asked at every step but those that begin an episode, if `decides_ends`. Override it if `ends_options`.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not decide where options end")
+
+    def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learn from every step of a collected batch `[*B, T]`, as `Learner.learn` gets it; return scalars to log.
+
+        For selectors that learn within options; called after `learn`.
+        """
+        return {}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Learn from finished decisions `[N]`, oldest first, and return scalars to log as `high/<name>`.
@@ -176,6 +227,9 @@ class Selector(TensorDictModuleBase):
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         held = {key: td.get(key, None) for key in self.out_keys}
         nothing_held = any(value is None for value in held.values())
+        if self.decides_ends and not nothing_held:
+            is_decision = is_decision | self.ends(td)
+            td.set(keys.IS_DECISION, is_decision.unsqueeze(-1))
         if not nothing_held and not is_decision.any():
             return td
         explores_uniformly = bool(self.is_uniform) and not is_greedy()
@@ -194,7 +248,13 @@ class Learner(nn.Module):
     - `policy`, which acts;
     - `learn`, to learn from the agent's own transitions;
     - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in `modes`;
+    - `value`, if it bootstraps, so that others can bootstrap from it where their option ends and its own follows;
     - `stateful`, if it has optimisers or a replay buffer.
+
+    Where an option ends inside its episode, the next state is worth what it is worth under the option chosen next, not
+    under the one that ended. The batch then has `("next", "option_ended")`, and `("next", "option")` says which option
+    holds in the next state; `following` has the value. The key is missing where options last as long as their
+    episodes, and nothing of this applies.
 
     `policies.shared.replay.ReplayLearner` implements `learn`, `add_demonstrations`, `update` and `stateful` for
     off-policy learners. The smallest complete learner is `policies.low_level.random.Random`.
@@ -224,6 +284,7 @@ class Learner(nn.Module):
             a data set (`mode=offline`, or `data=...` with `mode=train`).
         progress: the buffers, by the last part of their names, that say how far a run has come: counters of its steps
             and the exploration that follows from them. They begin afresh where a new run takes over the learner.
+        following: what follows an option that ends inside its episode; the agent sets it.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
@@ -231,10 +292,18 @@ class Learner(nn.Module):
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 
     policy: TensorDictModuleBase
+    following: Following
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.specs = specs
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the values `[N]` of states `[N, observation_dim]` from which this learner would bootstrap.
+
+        That is the value of what the learner does from there on, by its target networks if it has any.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no value to bootstrap from")
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Learn from a collected batch `[*B, T]` and return scalars to log, averaged over the updates made.
@@ -246,8 +315,10 @@ class Learner(nn.Module):
             batch: consecutive steps along `T`: `observation`, `option` (if the problem has options), the policy's
                 `out_keys` and, under `next`, `observation`, `reward` `[*B, T, 1]` and bool `[*B, T, 1]` `terminated`,
                 `truncated`, `done` and `is_decision`. A time limit is `truncated`, not `terminated`: values may be
-                bootstrapped there. Where `option_ends`, the next step may belong to another learner. All learners get
-                the same batch, and the collector may reuse its memory: do not modify it, and copy what must last.
+                bootstrapped there. Where options may end inside their episodes, also bool `[*B, T, 1]` `option_ended`
+                and int64 `[*B, T]` `option`, see above. Where `option_ends`, the next step may belong to another
+                learner. All learners get the same batch, and the collector may reuse its memory: do not modify it, and
+                copy what must last.
             mask: bool `[*B, T]`, the transitions that are this learner's.
         """
         return {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -123,6 +124,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         is_shared=is_shared,
         is_frozen=config.run.low.freeze,
         uniform_option_frames=config.run.agent.uniform_option_frames,
+        selector_ends_options=config.run.agent.option_length == "learned" and selector is not None,
     )
     return agent.to(device)
 
@@ -160,6 +162,8 @@ def _gamma(agent: HierarchicalAgent) -> float:
 
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
     length = config.run.agent.option_length
+    if length == "learned":
+        return with_decisions(env, gamma, math.inf)
     return with_decisions(env, gamma, None if length == "episode" else length)
 
 
@@ -283,6 +287,16 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
     if freeze and length != "episode":
         raise ConfigError(
             f"agent.option_length={length}: low.freeze=true plays whole episodes; use agent.option_length=episode"
+        )
+    if length != "episode" and getattr(config.high.cls, "is_bandit", False):
+        raise ConfigError(
+            f"agent.option_length={length}: {config.high} is a bandit, which counts what an option pays and nothing of "
+            "what follows it; use agent.option_length=episode, high=meta_critic or high=actor"
+        )
+    if length == "learned" and not getattr(config.high.cls, "ends_options", False):
+        raise ConfigError(
+            f"agent.option_length=learned: {config.high} does not decide where options end; use high=option_critic, "
+            "high=meta_critic or a number of steps"
         )
 
 

@@ -3,13 +3,16 @@
 Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2. Exploration by the upper confidence
 bounds of an ensemble: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
 
+Where the selector decides when options end, an option is interrupted as soon as another one is worth more (section 4 of
+the first source).
+
 Differs from the sources: where a time limit ends an episode, nothing follows.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -45,6 +48,7 @@ class MetaCritic(Selector):
         tau: step of the target critics towards the learned ones after each update.
     """
 
+    ends_options: ClassVar[bool] = True
     num_decisions: Tensor
 
     def __init__(
@@ -113,6 +117,12 @@ class MetaCritic(Selector):
             is_random = torch.rand_like(value[:, :1]) < self.epsilon
             value = torch.where(is_random, torch.rand_like(value), value)
         return value.argmax(-1).reshape(observation.shape[:-1])
+
+    @torch.no_grad()
+    def ends(self, td: TensorDictBase) -> Tensor:
+        """Return where another option is worth more than the held one, bool `[*B]`."""
+        value = self.critics(td.get(keys.OBSERVATION).flatten(0, -2)).mean(0).reshape(*td.batch_size, -1)
+        return value.argmax(-1) != td.get(keys.OPTION)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions and, after the warm-up, make the updates that are due."""

@@ -301,7 +301,7 @@ class DLPA(ReplayLearner):
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the model's inputs and targets in a batch `[*B, T]`."""
-        rows = super().transitions(batch).exclude("discount")
+        rows = super().transitions(batch).exclude("discount", "option_ended", "option", "next_option")
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:

@@ -152,7 +152,8 @@ class HPPO(OnPolicy, Learner):
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the generalised advantages and the targets of V, each `[*B, T]`; only the rows in `mask` are valid.
 
-        Bootstrapping stops where the episode terminates. The trace also stops at truncations and where an option ends,
+        Bootstrapping stops where the episode terminates. Where an option ends inside its episode, what follows is worth
+        what it is worth under the option chosen next. The trace also stops at truncations and where an option ends,
         since the next row may be another learner's; the rows of other learners are treated as zeros.
         """
         with torch.no_grad():
@@ -161,12 +162,27 @@ class HPPO(OnPolicy, Learner):
             reward = torch.zeros_like(value)
             value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
             next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
+            next_value = self._with_following(next_value, batch, mask)
             reward[mask] = batch.get(("next", keys.REWARD))[mask]
             terminated = batch.get(("next", keys.TERMINATED))
             advantage, target = generalized_advantage_estimate(
                 self.gamma, self.gae_lambda, value, next_value, reward, option_ends(batch), terminated
             )
         return advantage.squeeze(-1), target.squeeze(-1)
+
+    def value(self, observation: Tensor) -> Tensor:
+        """Return V(s), `[N]`."""
+        return self.critic(observation).squeeze(-1)
+
+    def _with_following(self, next_value: Tensor, batch: TensorDictBase, mask: Tensor) -> Tensor:
+        """Return the values `[*B, T, 1]` of the next states, with those under the next option where one has ended."""
+        option_ended = batch.get(("next", keys.OPTION_ENDED), None)
+        if option_ended is None:
+            return next_value
+        is_ended = option_ended.squeeze(-1) & mask
+        next_observation = batch.get(("next", keys.OBSERVATION))[is_ended]
+        value = self.following.value(next_observation, batch.get(keys.NEXT_OPTION)[is_ended])
+        return next_value.index_put((is_ended,), value.unsqueeze(-1))
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what an update needs of the rows in `mask`, `[N]`."""

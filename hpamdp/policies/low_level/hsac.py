@@ -217,11 +217,15 @@ class HSAC(ReplayLearner):
         polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
 
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the soft value V'(s) by the target critics, `[B]`."""
+        value, _, _ = self.soft_value(self.target_critics, observation)
+        return value
+
     def _target(self, batch: TensorDictBase) -> Tensor:
         """Return r + discount V'(s'), `[B]`, where the discount is 0 after a termination."""
-        with torch.no_grad():
-            value, _, _ = self.soft_value(self.target_critics, batch["next_state"])
-            return batch["reward"] + batch["discount"] * value
+        return batch["reward"] + batch["discount"] * self.next_value(batch)
 
     def _update_actor(self, state: Tensor) -> dict[str, Tensor]:
         """Update the actor to increase the soft value; return the loss and the mean entropies minus their targets."""

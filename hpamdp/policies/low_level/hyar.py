@@ -370,16 +370,18 @@ class HyAR(ReplayLearner):
                 e = self.codec.embeddings[discrete]  # the critics are asked about these alone
         return torch.cat([e, z], -1), ~(is_same_discrete & is_same_change)
 
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount * max over the target actor's proposals a' of min Q'(s', a'), `[B]`.
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the max over the target actor's proposals a of min Q'(s, a), `[B]`.
 
         The proposals carry clipped noise.
         """
-        state = batch["next_state"]
-        with torch.no_grad():
-            proposals = self.target_actor(state, self.codec.embeddings, self.target_noise, self.target_noise_clip)
-            q = self.target_critics(state, proposals).amin(0).amax(-1)
-            return batch["reward"] + batch["discount"] * q
+        proposals = self.target_actor(observation, self.codec.embeddings, self.target_noise, self.target_noise_clip)
+        return self.target_critics(observation, proposals).amin(0).amax(-1)
+
+    def _target(self, batch: TensorDictBase) -> Tensor:
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return batch["reward"] + batch["discount"] * self.next_value(batch)
 
     def _update_actor(self, state: Tensor) -> Tensor:
         """Update the actor towards higher values of its proposals by the first critic; return the loss."""

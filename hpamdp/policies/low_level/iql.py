@@ -103,7 +103,7 @@ class IQL(ReplayLearner):
 
         with torch.no_grad():
             advantage = q - self.value(state)
-            target = sample["reward"] + sample["discount"] * self.value(sample["next_state"])
+            target = sample["reward"] + sample["discount"] * self.next_value(sample)
         critics_q = self.critics.of_discrete(state, discrete, unit)
         critic_loss = F.mse_loss(critics_q, target.expand_as(critics_q))
         self.optimizer_step("critics", critic_loss)

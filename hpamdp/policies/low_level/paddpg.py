@@ -153,6 +153,12 @@ class PADDPG(ReplayLearner):
             "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
         }
 
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return min Q'(s, a), `[B]`, with a the target actor's output, smoothed with `twin`."""
+        output = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
+        return self._q(self.target_critics, observation, output).amin(0)
+
     def explore(self, frames: int) -> None:
         """Lower the fraction of random actions."""
         self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
@@ -186,9 +192,6 @@ class PADDPG(ReplayLearner):
         self.critics.requires_grad_(True)
         return loss
 
-    @torch.no_grad()
     def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount min Q'(s', a'), `[B]`, with a' the target actor's output, smoothed with `twin`."""
-        state = batch["next_state"]
-        output = with_clipped_noise(self.target_actor(state), self.target_smoothing, self.target_smoothing_clip)
-        return batch["reward"] + batch["discount"] * self._q(self.target_critics, state, output).amin(0)
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return batch["reward"] + batch["discount"] * self.next_value(batch)

@@ -194,6 +194,9 @@ class PDQN(ReplayLearner):
         rows["reward"] = reward
         rows["next_state"] = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
         rows["discount"] = self.gamma**num_rewards * ~terminated.gather(-1, last)
+        for name in ("option_ended", "next_option"):
+            if name in rows.keys():
+                rows[name] = rows[name].gather(-1, last)
         return rows
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
@@ -218,18 +221,20 @@ class PDQN(ReplayLearner):
         self.critics.requires_grad_(True)
         return loss
 
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount max_k Q'(s', k, x'(s')), `[B]`, where the discount is 0 after a termination.
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)), `[B]`.
 
         With `double_q`, the learned critics choose k instead of the target critics.
         """
-        state = batch["next_state"]
-        with torch.no_grad():
-            unit = with_clipped_noise(self.target_actor(state), self.target_smoothing, self.target_smoothing_clip)
-            q = self.target_critics(state, unit).amin(0)
-            choosing_q = self.critics(state, unit).amin(0) if self.double_q else q
-            best = q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
-            return batch["reward"] + batch["discount"] * best
+        unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
+        q = self.target_critics(observation, unit).amin(0)
+        choosing_q = self.critics(observation, unit).amin(0) if self.double_q else q
+        return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
+
+    def _target(self, batch: TensorDictBase) -> Tensor:
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return batch["reward"] + batch["discount"] * self.next_value(batch)
 
 
 def n_step_returns(reward: Tensor, done: Tensor, n: int, gamma: float) -> tuple[Tensor, Tensor]:

@@ -18,6 +18,8 @@ Differs from the source:
   normal equations, with ridge regularisation;
 - the value of the next discrete action is its expectation under the softmax where that action is not in the batch: in
   the batch's last column, and where an episode is truncated;
+- where an option ends inside its episode, the step is terminal, and its reward includes the discounted value under the
+  option that follows; what the source says of an episode then holds for the option, in Sarsa, eNAC and windows alike;
 - the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to `feature_range` or to its
   range in the warm-up;
 - by default, that is with `qpamdp.yaml`: all weights of the values have the same step size, which Dabney and Barto's
@@ -40,7 +42,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, is_greedy
+from hpamdp.policies.base import Learner, is_greedy, option_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData, num_fourier_features
 from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
@@ -428,7 +430,7 @@ class QPAMDP(Learner):
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Collect the ranges of the features during the warm-up; then learn what the phase learns, and end it if due.
 
-        Updates within a phase use the rows in `mask`; windows count their episodes.
+        Updates within a phase use the rows in `mask`; windows count their episodes, or options if these end before.
         """
         batch = batch.reshape(-1, batch.shape[-1])
         mask = mask.reshape(-1, mask.shape[-1])
@@ -474,15 +476,34 @@ class QPAMDP(Learner):
             basis.fit(inputs, low, high)
         self.policy.widen()
 
+    @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return the expected value of the softmax policy's discrete action, `[N]`."""
+        q = self.policy.phi(observation) @ self.policy.w.T
+        return ((q / self.policy.temperature).softmax(-1) * q).sum(-1)
+
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
-        """Return what the phase's update needs of a batch `[N, T]`."""
+        """Return what the phase's update needs of a batch `[N, T]`.
+
+        A step with which an option ends inside its episode is `terminated` and `done`, and its reward includes the
+        discounted value of what follows.
+        """
         observation = batch[keys.OBSERVATION]
+        reward = batch["next", keys.REWARD].squeeze(-1)
+        terminated = batch["next", keys.TERMINATED].squeeze(-1)
+        option_ended = batch.get(("next", keys.OPTION_ENDED), None)
+        if option_ended is not None:
+            is_followed = (option_ended & ~batch["next", keys.DONE]).squeeze(-1) & mask
+            next_observation = batch["next", keys.OBSERVATION][is_followed]
+            value = self.following.value(next_observation, batch[keys.NEXT_OPTION][is_followed])
+            reward = reward.index_put((is_followed,), self.sarsa.gamma * value, accumulate=True)
+            terminated = terminated | is_followed
         rows = {
             "phi": self.policy.phi(observation),
             "discrete": batch[keys.DISCRETE],
-            "reward": batch["next", keys.REWARD].squeeze(-1),
-            "terminated": batch["next", keys.TERMINATED].squeeze(-1),
-            "done": batch["next", keys.DONE].squeeze(-1),
+            "reward": reward,
+            "terminated": terminated,
+            "done": option_ends(batch).squeeze(-1),
             "mask": mask,
         }
         if self.phase == SARSA:

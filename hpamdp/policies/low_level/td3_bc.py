@@ -179,10 +179,12 @@ class TD3BC(ReplayLearner):
         return loss
 
     @torch.no_grad()
+    def value(self, observation: Tensor) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`."""
+        unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
+        q = self.target_critics(observation, unit).amin(0)
+        return q.masked_fill(self.policy.is_rare(observation), -torch.inf).amax(-1)
+
     def _target(self, sample: TensorDictBase) -> Tensor:
-        """Return r + discount max_k Q'(s', k, x'(s')) over the allowed discrete actions k, `[B]`."""
-        state = sample["next_state"]
-        unit = with_clipped_noise(self.target_actor(state), self.target_smoothing, self.target_smoothing_clip)
-        q = self.target_critics(state, unit).amin(0)
-        best = q.masked_fill(self.policy.is_rare(state), -torch.inf).amax(-1)
-        return sample["reward"] + sample["discount"] * best
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return sample["reward"] + sample["discount"] * self.next_value(sample)

@@ -1,11 +1,12 @@
 """What context-free bandits share: the statistics of each option's rewards, and the greedy choice.
 
-The reward of a bandit is here the return of an option.
+The reward of a bandit is here the return of an option. Nothing else counts, so bandits are for options that last as
+long as their episodes.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -112,6 +113,8 @@ class Bandit(Selector):
         num_decisions: how many decisions of its own have ended, forgotten ones included; those of a data set do not
             count. With the `pending` ones they are the decisions that it has made.
     """
+
+    is_bandit: ClassVar[bool] = True
 
     num_decisions: Tensor
 

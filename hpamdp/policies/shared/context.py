@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
@@ -90,6 +90,8 @@ class LinearBandit(Selector):
         moment: sum of features times reward for each option, float64 `[num_options, num_features]`.
         recent_features: of the decisions in `statistics.recent_options`, float64 `[window, num_features]`.
     """
+
+    is_bandit: ClassVar[bool] = True
 
     gram: Tensor
     moment: Tensor

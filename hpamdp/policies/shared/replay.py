@@ -25,6 +25,8 @@ class ReplayLearner(Learner):
     - `start` and `explore`: what happens at the end of the warm-up, and with every batch after it;
     - `updates_due`: when updates are made.
 
+    The target of a value is `reward + discount * next_value(sample)`, which asks `value`.
+
     Attributes:
         stores_own_parameters: whether the buffer holds the parameters of the discrete action taken alone, which is less
             where there are many; samples then have 0 for the others.
@@ -132,7 +134,7 @@ class ReplayLearner(Learner):
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the step terminated, else gamma."""
-        return TensorDict(
+        rows = TensorDict(
             {
                 "state": batch[keys.OBSERVATION],
                 "discrete": batch[keys.DISCRETE],
@@ -143,6 +145,29 @@ class ReplayLearner(Learner):
             },
             batch_size=batch.shape,
         )
+        option_ended = batch.get(("next", keys.OPTION_ENDED), None)
+        if option_ended is not None:
+            rows["option_ended"] = option_ended.squeeze(-1)
+            rows["option"] = batch[keys.OPTION]
+            rows["next_option"] = batch[keys.NEXT_OPTION]
+        return rows
+
+    def next_value(self, sample: TensorDictBase) -> Tensor:
+        """Return the values `[B]` of a sample's next states.
+
+        Where an option has ended, it is the value under the option that the selector would choose now, by that option's
+        learner: the selector has learned since.
+        """
+        state = sample["next_state"]
+        value = self.value(state)
+        if "option_ended" not in sample.keys():
+            return value
+        is_ended = sample["option_ended"] | self.following.decides_ends
+        if is_ended.any():
+            state = state[is_ended]
+            option = self.following.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
+            value[is_ended] = self.following.value(state, option)
+        return value
 
     def start(self) -> None:
         """Prepare for the first update, from the transitions that the warm-up stored."""

@@ -1,0 +1,116 @@
+"""Rooms as a batched TorchRL environment: options that suit a room each, and a way through three of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_rng import Key
+from hpamdp.env.rooms import rules
+from hpamdp.env.rooms.rules import RoomsState
+
+
+class RoomsEnv(CounterEnv[RoomsState]):
+    """Find the goal in `num_envs` houses of four rooms at once.
+
+    Action leaves: `option` int64 `[N]`: 0 skates, 1 boots; `("action", "discrete")` int64 `[N]`: up, right, down, left;
+    `("action", "parameters")` float32 `[N, 4]`: how far, as a fraction of the reach, in [0, 1]. The reach is three
+    cells with the option that suits the floor, else one. The option may change at every step.
+
+    The reward is -0.02 a step, and 1 at the goal, which ends the episode. It begins anywhere in the first room.
+
+    Args:
+        num_envs: number of houses.
+        max_steps: actions after which an episode is truncated.
+        device: of the tensors.
+        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
+        first_env: number of the first house, where other processes have the houses before it.
+
+    Raises:
+        ValueError: an argument or an action is invalid; the state is unchanged.
+    """
+
+    outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
+    observation_names = (
+        "x",
+        "y",
+        *(f"x_{i}" for i in range(rules.SIZE)),
+        *(f"y_{i}" for i in range(rules.SIZE)),
+    )
+    option_names = ("skates", "boots")
+    discrete_names = ("up", "right", "down", "left")
+    parameter_dims = (1, 1, 1, 1)
+    _option: Tensor
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        max_steps: int = 50,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+    ) -> None:
+        super().__init__(
+            num_envs,
+            max_steps=max_steps,
+            parameter_low=(0.0,) * 4,
+            parameter_high=(1.0,) * 4,
+            device=device,
+            seed=seed,
+            first_env=first_env,
+        )
+
+    @property
+    def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
+        """The lowest and the highest observation, `[24]` each."""
+        return [-1.0] * 2 + [0.0] * 2 * rules.SIZE, [1.0] * (2 + 2 * rules.SIZE)
+
+    @property
+    def position(self) -> Tensor:
+        """The cells of the agents, `[N, 2]`."""
+        return torch.stack([self.state.x, self.state.y], -1).float()
+
+    def start(self, episode: Tensor, rng: Key) -> RoomsState:
+        """Return states with the agent anywhere in the first room."""
+        return rules.start(episode, rng)
+
+    def act(
+        self, state: RoomsState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+    ) -> tuple[RoomsState, Tensor]:
+        """Return the states after one move and the rewards `[N]`."""
+        return rules.act(state, self._option, discrete, parameters.squeeze(-1))
+
+    def observe(self, state: RoomsState) -> Tensor:
+        """Return the observations `[N, 24]`."""
+        return rules.observe(state)
+
+    def describe(self) -> dict[str, Tensor]:
+        """Return the best possible return from where the episodes begin, `best_return` `[N]`."""
+        best = rules.best_values(1.0, 1).to(self.device)
+        return {"best_return": best[self.state.x.long(), self.state.y.long()]}
+
+    def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
+        """Return the mean of the best possible returns, with options that may change at every step, as `ceiling`."""
+        return {"ceiling": float(played["best_return"].mean())} if "best_return" in played else {}
+
+    def _make_specs(self, low: Tensor, high: Tensor) -> None:
+        super()._make_specs(low, high)
+        self.action_spec = self.make_action_spec(low, high, has_option=True)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self.check_action(tensordict)
+        option = tensordict.get(keys.OPTION)
+        is_known = (option >= 0) & (option < len(self.option_names))
+        if not is_known.all():
+            row = int((~is_known).nonzero()[0])
+            raise ValueError(f"step: environment {row} got option={option[row].item()} (allowed 0 to 1)")
+        self._option = option
+        return super()._step(tensordict)

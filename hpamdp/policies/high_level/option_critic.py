@@ -1,0 +1,214 @@
+"""Option-critic: values of options, learned within them, and terminations that follow the gradient of these values.
+
+With `agent.option_length=learned`, the held option o ends in state s with the learned probability beta(s, o), and the
+next one is chosen epsilon-greedily by Q(s, o). Any learner can be the policy within the options.
+
+Source: Bacon, Harb and Precup 2017, *The Option-Critic Architecture*, arXiv 1609.05140, algorithm 1 and theorem 2;
+deliberation cost: Harb, Bacon, Klissarov and Precup 2018, *When Waiting is not an Option: Learning Options with a
+Deliberation Cost*, arXiv 1709.04571, equation 10, as a margin of the advantage (their discount of the costs is 0).
+
+Differs from the sources:
+- the policies within the options are the agent's learners, with values and gradients of their own;
+- Q and beta are learned from a replay buffer of steps, Q with a target network;
+- the value of a state is max_o Q(s, o), without the share of random choices;
+- where a time limit ends an episode, nothing follows;
+- greedily, an option ends where beta is above 1/2.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, ClassVar
+
+import torch
+from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import LazyTensorStorage, ReplayBuffer
+
+from hpamdp import keys
+from hpamdp.policies.base import Selector, is_greedy
+from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.networks import mlp, polyak_update
+from hpamdp.policies.shared.replay import linear_schedule
+from hpamdp.specs import PAMDPSpecs
+
+
+class OptionCritic(Selector):
+    """Choose the option with the highest Q, and learn where it ends.
+
+    Args:
+        specs: of the problem.
+        device: where the networks live.
+        hidden_dims: of the option values and of the terminations.
+        gamma: discount of an environment step.
+        deliberation_cost: margin by which another option must be better for the held one to end, in units of the
+            return; 0: the option-critic of 2017, whose options tend to end at every step.
+        initial_termination: probability that an option ends with a step, at the start.
+        epsilon_final, epsilon_steps: the probability of a random option falls linearly from 1 to `epsilon_final` over
+            the `epsilon_steps` steps after the warm-up.
+        buffer_size: steps that are stored.
+        batch_size: steps in an update.
+        updates_per_step, max_updates: updates for each step, and at most in one call of `learn_from_steps`.
+        warmup_steps: steps with random options before the first update.
+        lr, termination_lr: learning rates of Adam.
+        tau: step of the target network towards the learned one after each update.
+    """
+
+    ends_options: ClassVar[bool] = True
+    modes: ClassVar[tuple[str, ...]] = ("train",)
+
+    num_steps: Tensor
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        hidden_dims: list[PositiveInt],
+        gamma: PositiveFraction,
+        deliberation_cost: NonNegativeFloat,
+        initial_termination: PositiveFraction,
+        epsilon_final: Fraction,
+        epsilon_steps: NonNegativeInt,
+        buffer_size: PositiveInt,
+        batch_size: PositiveInt,
+        updates_per_step: PositiveFloat,
+        max_updates: PositiveInt,
+        warmup_steps: NonNegativeInt,
+        lr: LearningRate,
+        termination_lr: LearningRate,
+        tau: PositiveFraction,
+    ) -> None:
+        super().__init__(specs)
+        if batch_size > buffer_size:
+            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
+        if initial_termination >= 1.0:
+            raise ValueError(f"initial_termination={initial_termination}: must be less than 1")
+        self.gamma = gamma
+        self.deliberation_cost = deliberation_cost
+        self.epsilon_final = epsilon_final
+        self.epsilon_steps = epsilon_steps
+        self.batch_size = batch_size
+        self.updates_per_step = updates_per_step
+        self.max_updates = max_updates
+        self.warmup_steps = warmup_steps
+        self.tau = tau
+        self.critic = mlp(specs.observation_dim, hidden_dims, specs.num_options)
+        self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
+        self.termination = mlp(specs.observation_dim, hidden_dims, specs.num_options)
+        last = self.termination[-1]
+        assert isinstance(last, nn.Linear)
+        with torch.no_grad():
+            last.weight.mul_(0.01)
+            last.bias.fill_(torch.tensor(initial_termination).logit().item())
+        self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
+        self.to(device)
+        self.optimizers = {
+            "critic": torch.optim.Adam(self.critic.parameters(), lr=lr, fused=True),
+            "termination": torch.optim.Adam(self.termination.parameters(), lr=termination_lr, fused=True),
+        }
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+
+    def stateful(self) -> dict[str, Any]:
+        """Return the optimizers and the replay buffer."""
+        return {**self.optimizers, "buffer": self.buffer}
+
+    @property
+    def epsilon(self) -> float:
+        """Probability of a random option."""
+        steps_after_warmup = int(self.num_steps) - self.warmup_steps
+        if steps_after_warmup < 0:
+            return 1.0
+        return linear_schedule(steps_after_warmup, self.epsilon_steps, self.epsilon_final)
+
+    @torch.no_grad()
+    def select(self, td: TensorDictBase) -> Tensor:
+        """Return the choices `[*B]`: the highest Q if the policy is greedy, else a random option at times."""
+        best = self.critic(td.get(keys.OBSERVATION)).argmax(-1)
+        if is_greedy():
+            return best
+        is_random = torch.rand(best.shape, device=best.device) < self.epsilon
+        return torch.where(is_random, torch.randint_like(best, self.specs.num_options), best)
+
+    @torch.no_grad()
+    def ends(self, td: TensorDictBase) -> Tensor:
+        """Return where the held option ends, bool `[*B]`: sampled, or where it is likely if the policy is greedy."""
+        beta = self._beta(td.get(keys.OBSERVATION), td.get(keys.OPTION))
+        return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
+
+    def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
+        """Store the steps and, after the warm-up, make the updates that are due from stored ones."""
+        rows = self._rows(batch).flatten()
+        self.buffer.extend(rows)
+        before = int(self.num_steps)
+        now = before + len(rows)
+        self.num_steps = self.num_steps + len(rows)
+        if now < self.warmup_steps:
+            return {}
+        due = int(now * self.updates_per_step) - int(before * self.updates_per_step)
+        history: dict[str, list[Tensor]] = {}
+        for _ in range(min(due, self.max_updates)):
+            sample = self.buffer.sample(self.batch_size)
+            history.setdefault("critic", []).append(self._update_critic(sample))
+            if self.decides_ends:
+                history.setdefault("termination", []).append(self._update_termination(sample))
+        scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
+        return {**scalars, "epsilon": self.epsilon}
+
+    def _rows(self, batch: TensorDictBase) -> TensorDict:
+        """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the episode ended."""
+        after = batch.get("next")
+        done = after.get(keys.DONE).squeeze(-1)
+        rows = {
+            "state": batch.get(keys.OBSERVATION),
+            "option": batch.get(keys.OPTION),
+            "reward": after.get(keys.REWARD).squeeze(-1),
+            "next_state": after.get(keys.OBSERVATION),
+            "discount": self.gamma * ~done,
+            "is_ended": after.get(keys.OPTION_ENDED).squeeze(-1) if keys.OPTION_ENDED in after.keys() else done,
+        }
+        return TensorDict(rows, batch_size=batch.shape)
+
+    def _beta(self, state: Tensor, option: Tensor) -> Tensor:
+        """Return the probabilities `[*B]` that the options `[*B]` end in states `[*B, observation_dim]`."""
+        return self.termination(state).gather(-1, option.unsqueeze(-1)).squeeze(-1).sigmoid()
+
+    def _target(self, rows: TensorDictBase) -> Tensor:
+        """Return r + discount ((1 - beta) Q'(s', o) + beta max Q'(s', .)), `[B]`.
+
+        Where others decide when options end, beta is 1 or 0: whether this one has.
+        """
+        with torch.no_grad():
+            q = self.target_critic(rows["next_state"])
+            held = q.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
+            beta = self._beta(rows["next_state"], rows["option"]) if self.decides_ends else rows["is_ended"].float()
+            following = held.lerp(q.amax(-1), beta)
+            return rows["reward"] + rows["discount"] * following
+
+    def _update_critic(self, rows: TensorDictBase) -> Tensor:
+        """Make one update of Q from steps `[batch_size]`; return the loss."""
+        q = self.critic(rows["state"]).gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
+        loss = (q - self._target(rows)).square().mean()
+        self.optimizers["critic"].zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizers["critic"].step()
+        polyak_update(self.target_critic, self.critic, self.tau)
+        return loss.detach()
+
+    def _update_termination(self, rows: TensorDictBase) -> Tensor:
+        """Make one step of the terminations against the advantage of going on; return their mean probability.
+
+        Args:
+            rows: steps `[batch_size]`.
+        """
+        state, option = rows["next_state"], rows["option"]
+        with torch.no_grad():
+            q = self.critic(state)
+            advantage = q.gather(-1, option.unsqueeze(-1)).squeeze(-1) - q.amax(-1) + self.deliberation_cost
+        beta = self._beta(state, option)
+        loss = (beta * advantage * (rows["discount"] > 0.0)).mean()
+        self.optimizers["termination"].zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimizers["termination"].step()
+        return beta.detach().mean()

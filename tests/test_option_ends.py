@@ -1,0 +1,196 @@
+"""Where the selector decides when options end: the bookkeeping, the option-critic and interruption."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_options import Crossing, Stepper, Toll, best_value, earned, steppers
+
+from hpamdp import keys
+from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.high_level.meta_critic import MetaCritic
+from hpamdp.policies.high_level.option_critic import OptionCritic
+from hpamdp.policies.high_level.uniform import Uniform
+from hpamdp.specs import PAMDPSpecs
+
+CPU = torch.device("cpu")
+GAMMA = 0.9
+SPECS = PAMDPSpecs.from_env(Crossing())
+
+
+class Moody(Uniform):
+    """Choose options at random, and end them at random."""
+
+    ends_options = True
+
+    def ends(self, td: TensorDict) -> torch.Tensor:
+        return torch.rand(td.batch_size) < 0.3
+
+
+def make_critic(**changes: object) -> OptionCritic:
+    torch.manual_seed(0)
+    options = dict(
+        hidden_dims=[64], gamma=GAMMA, deliberation_cost=0.0, initial_termination=0.5, epsilon_final=0.2,
+        epsilon_steps=2000, buffer_size=20_000, batch_size=128, updates_per_step=0.05, max_updates=64,
+        warmup_steps=500, lr=3e-3, termination_lr=3e-3, tau=0.05,
+    )  # fmt: skip
+    return OptionCritic(SPECS, CPU, **{**options, **changes})
+
+
+def make_meta_critic() -> MetaCritic:
+    torch.manual_seed(0)
+    options = dict(
+        hidden_dims=[64], num_members=1, exploration="epsilon", epsilon_final=0.2, epsilon_decisions=2000,
+        ucb_width=2.0, gamma=GAMMA, buffer_size=10_000, batch_size=64, updates_per_decision=0.1,
+        max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
+    )  # fmt: skip
+    return MetaCritic(SPECS, CPU, **options)
+
+
+def ending(selector, learners=None) -> HierarchicalAgent:
+    """Return an agent whose selector decides where options end."""
+    learners = [Stepper(SPECS), Stepper(SPECS)] if learners is None else learners
+    return HierarchicalAgent(selector, learners, SPECS, selector_ends_options=True)
+
+
+def collect(agent: HierarchicalAgent, env: Crossing, num_steps: int, batch_steps: int, num_envs: int):
+    collector = Collector(
+        with_decisions(env, GAMMA, math.inf),
+        agent.policy,
+        frames_per_batch=num_envs * batch_steps,
+        total_frames=num_envs * num_steps,
+        auto_register_policy_transforms=False,
+    )
+    yield from collector
+    collector.shutdown()
+
+
+def test_options_that_the_selector_ends_have_the_right_accounts_and_are_heard_of_once():
+    heard_steps, heard_decisions = [], []
+
+    class Listener(Moody):
+        def learn(self, decisions):
+            heard_decisions.append(decisions.clone())
+            return {}
+
+    class Hearing(Stepper):
+        def learn(self, batch, mask):
+            heard_steps.append(batch.clone())
+            return {}
+
+    torch.manual_seed(0)
+    agent = ending(Listener(SPECS), [Hearing(SPECS), Stepper(SPECS)])
+    rows = []
+    for batch in collect(agent, Toll(4, start=6.0), 60, 5, 4):
+        rows.append(batch.clone())
+        agent.learn(batch)
+    rows = torch.cat(rows, 1)
+    heard = torch.cat(heard_steps, 1)
+    num_ended = 0
+    expected = []
+    for e in range(4):
+        for t in range(60):
+            row = rows[e, t]
+            if row[keys.IS_DECISION]:
+                total, steps, decided_at = 0.0, 0, row[keys.OBSERVATION]
+            total += GAMMA**steps * row["next", keys.REWARD].item()
+            steps += 1
+            assert row["next", keys.OPTION_RETURN].item() == pytest.approx(total, abs=1e-5)
+            assert row["next", keys.OPTION_STEPS] == steps
+            assert torch.equal(row["next", keys.DECISION_OBSERVATION], decided_at)
+            done = bool(row["next", keys.DONE])
+            if t % 5 < 4:
+                ended = bool(rows[e, t + 1][keys.IS_DECISION]) and not done
+                assert bool(heard[e, t]["next", keys.OPTION_ENDED]) == ended
+                num_ended += ended
+                if not done:
+                    assert heard[e, t][keys.NEXT_OPTION] == rows[e, t + 1][keys.OPTION]
+            else:
+                ended = False
+                assert heard[e, t]["next", keys.OPTION_ENDED], "learners must not go on past what they know"
+            if ended or done:
+                expected.append(round(total, 4))
+    assert num_ended > 30
+    decisions = torch.cat(heard_decisions)
+    assert sorted(expected) == [round(x, 4) for x in sorted(decisions["next", keys.OPTION_RETURN].flatten().tolist())]
+
+
+def test_the_same_option_is_held_where_the_selector_does_not_end_it():
+    torch.manual_seed(0)
+    agent = ending(Moody(SPECS))
+    rows = torch.cat([batch.clone() for batch in collect(agent, Toll(4, start=6.0), 60, 5, 4)], 1)
+    goes_on = ~rows[keys.IS_DECISION][:, 1:].squeeze(-1)
+    assert 50 < goes_on.sum() < 200
+    assert torch.equal(rows[keys.OPTION][:, 1:][goes_on], rows[keys.OPTION][:, :-1][goes_on])
+
+
+def train(selector, num_batches: int) -> HierarchicalAgent:
+    agent = ending(selector)
+    for batch in collect(agent, Crossing(50, start=6.0), 10 * num_batches, 10, 50):
+        agent.learn(batch)
+    return agent
+
+
+@pytest.mark.parametrize("make", [make_critic, make_meta_critic], ids=["option_critic", "meta_critic"])
+def test_options_end_where_another_one_is_better(make):
+    agent = train(make(), 25)
+    assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
+    place = torch.eye(SPECS.observation_dim)[[2, 20]]  # on land, in water
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        wrong = agent.selector.ends(TensorDict({keys.OBSERVATION: place, keys.OPTION: torch.tensor([1, 0])}, [2]))
+        right = agent.selector.ends(TensorDict({keys.OBSERVATION: place, keys.OPTION: torch.tensor([0, 1])}, [2]))
+    assert wrong.tolist() == [True, True]
+    if isinstance(agent.selector, MetaCritic):  # without a deliberation cost nothing keeps the right option going
+        assert right.tolist() == [False, False]
+
+
+def test_a_deliberation_cost_makes_options_last():
+    agent = train(make_critic(deliberation_cost=0.02, termination_lr=1e-2), 25)
+    assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
+    place = torch.eye(SPECS.observation_dim)[[4, 20]]
+    beta = agent.selector._beta(place, torch.tensor([0, 1]))
+    assert beta.max() < 0.2
+
+
+def step_rows(critic: OptionCritic) -> TensorDict:
+    """Return three steps: one within an episode, one that ends it, and one that a time limit cuts off."""
+    state = torch.eye(SPECS.observation_dim)
+    done = torch.tensor([[False], [True], [True]])
+    after = {
+        keys.OBSERVATION: state[1:4],
+        keys.REWARD: torch.tensor([[1.0], [2.0], [3.0]]),
+        keys.DONE: done,
+        keys.TERMINATED: torch.tensor([[False], [True], [False]]),
+        keys.OPTION_ENDED: torch.tensor([[True], [False], [False]]),
+    }
+    rows = TensorDict({keys.OBSERVATION: state[:3], keys.OPTION: torch.tensor([0, 1, 1]), "next": after}, [3])
+    return critic._rows(rows)
+
+
+@pytest.mark.parametrize("decides", [True, False])
+def test_the_targets_of_the_option_critic_equal_those_by_hand(decides):
+    critic = make_critic(initial_termination=0.3)
+    critic.decides_ends = decides
+    rows = step_rows(critic)
+    q = critic.target_critic(rows["next_state"])[0]
+    beta = critic._beta(rows["next_state"], rows["option"])[0] if decides else 1.0
+    expected = 1.0 + GAMMA * ((1.0 - beta) * q[0] + beta * q.max())
+    assert critic._target(rows).tolist() == pytest.approx([expected.item(), 2.0, 3.0])
+
+
+def test_options_end_with_the_initial_probability():
+    critic = make_critic(initial_termination=0.3)
+    td = TensorDict({keys.OBSERVATION: torch.rand(4000, SPECS.observation_dim), keys.OPTION: torch.zeros(4000).long()})
+    td.batch_size = [4000]
+    assert critic.ends(td).float().mean().item() == pytest.approx(0.3, abs=0.04)
+
+
+def test_options_of_a_fixed_length_are_interrupted_by_nobody():
+    torch.manual_seed(0)
+    agent = steppers(make_meta_critic(), SPECS)
+    rows = with_decisions(Toll(4, start=0.0), GAMMA, 3).rollout(6, agent.policy)
+    assert rows[keys.IS_DECISION][0].flatten().tolist() == [True, False, False] * 2
