@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import TextIO
 
@@ -68,3 +69,14 @@ def duration(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {rest:02} s"
+
+
+def invalid_action(row: int, values: Mapping[str, tuple[object, str]]) -> ValueError:
+    """Return the error for an invalid action.
+
+    Args:
+        row: number of the environment.
+        values: for each leaf of the action its value and what is allowed.
+    """
+    listed = ", ".join(f"{name}={value} ({allowed})" for name, (value, allowed) in values.items())
+    return ValueError(f"step: environment {row} got {listed}")

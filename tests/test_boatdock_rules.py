@@ -167,7 +167,8 @@ def test_the_first_episodes_of_an_evaluation_are_its_fixed_layouts():
     env = BoatDockEnv(50)
     env.seed_evaluation(4)
     env.reset()
-    assert torch.equal(torch.stack(env.state[:4]), torch.stack(harbour.fixed_layouts(50, 4)))
+    # The kernel draws the one, the tensor function the other.
+    assert torch.allclose(torch.stack(env.state[:4]), torch.stack(harbour.fixed_layouts(50, 4)), atol=1e-4)
 
 
 def test_slip_presses_a_uniformly_random_key():

@@ -20,7 +20,7 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.counter_env import GOING_ON, CounterEnv
-from hpamdp.env.faces import CounterFace
+from hpamdp.env.counter_faces import CounterFace
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform.environment import PlatformEnv

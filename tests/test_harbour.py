@@ -149,7 +149,7 @@ def test_no_seed_makes_another_stream_repeat_the_numbers_of_evaluation(stream):
 
 
 def test_the_steps_of_two_streams_meet_at_most_once_in_two_to_the_thirty():
-    for one, other in itertools.combinations(counter_rng._STEPS, 2):
+    for one, other in itertools.combinations(counter_rng.STEPS, 2):
         assert one % 2 == other % 2 == 1
         assert (one - other) % 8 != 0
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+from hpamdp.messages import invalid_action
 
 
 def check_action_values(
@@ -41,14 +43,3 @@ def check_action_values(
                 parameters_name: (parameters[row].tolist(), "those of the chosen action must be finite"),
             },
         )
-
-
-def invalid_action(row: int, values: Mapping[str, tuple[object, str]]) -> ValueError:
-    """Return the error for an invalid action.
-
-    Args:
-        row: number of the environment.
-        values: for each leaf of the action its value and what is allowed.
-    """
-    listed = ", ".join(f"{name}={value} ({allowed})" for name, (value, allowed) in values.items())
-    return ValueError(f"step: environment {row} got {listed}")

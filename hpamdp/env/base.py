@@ -219,20 +219,23 @@ class PAMDPEnv(EnvBase):
         Raises:
             ValueError: a leaf is missing, or has another shape or type.
         """
-        shapes: dict[str | tuple[str, str], tuple[int, ...]] = {
-            keys.DISCRETE: tuple(self.batch_size),
-            keys.PARAMETERS: (*self.batch_size, sum(self.parameter_dims)),
-        }
+        size = self.batch_size
+        self._check_leaf(tensordict, keys.DISCRETE, size, is_integer=True)
+        self._check_leaf(tensordict, keys.PARAMETERS, (*size, sum(self.parameter_dims)), is_integer=False)
         if self.has_choice:
-            shapes[keys.OPTION] = tuple(self.batch_size)
-        for name, shape in shapes.items():
-            value = tensordict.get(name)
-            if value is None or value.shape != shape:
-                given_shape = None if value is None else list(value.shape)
-                raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
-            if name != keys.PARAMETERS and (value.is_floating_point() or value.dtype == torch.bool):
-                given_type = str(value.dtype).removeprefix("torch.")
-                raise ValueError(f"step: {name} has type {given_type}, but must be integer")
+            self._check_leaf(tensordict, keys.OPTION, size, is_integer=True)
+
+    @staticmethod
+    def _check_leaf(
+        tensordict: TensorDictBase, name: str | tuple[str, str], shape: tuple[int, ...], *, is_integer: bool
+    ) -> None:
+        value = tensordict.get(name)
+        if value is None or value.shape != shape:
+            given_shape = None if value is None else list(value.shape)
+            raise ValueError(f"step: {name} has shape {given_shape}, but must be {list(shape)}")
+        if is_integer and (value.is_floating_point() or value.dtype == torch.bool):
+            given_type = str(value.dtype).removeprefix("torch.")
+            raise ValueError(f"step: {name} has type {given_type}, but must be integer")
 
     def make_done_spec(self) -> Composite:
         """Return the spec of `done`, `terminated` and `truncated`, bool `[N, 1]`."""

@@ -23,7 +23,10 @@ from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.columns import Columns, replaced, restored, where
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.rows import Advance, Results, Rows
 
+# What a tensordict has whose next root holds nothing else.
+_PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
 
@@ -76,7 +79,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     result_keys = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
-    _state: EpisodeState
+    _rows: Rows | None = None
 
     def __init__(
         self,
@@ -102,6 +105,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         self._has_oracle = oracle
         self._make_specs(low, high)
         self._place_parameters(low, high)
+        self._is_compiled = compile_rules
         self._pure_step, self._pure_reset, self._pure_observe = self._advance, self._restart, self.observe
         if compile_rules:
             arguments: Any = counter_rng.COMPILE_ARGUMENTS
@@ -109,6 +113,51 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             self._pure_reset = torch.compile(self._restart, **arguments)
             self._pure_observe = torch.compile(self.observe, **arguments)
         self._set_seed(seed)
+
+    def _use_kernel(self, advance: Advance, owner: type[CounterEnv], settings: Sequence[float]) -> None:
+        """Let a kernel move the environments on the CPU; to be called at the end of the constructor.
+
+        Nothing happens where the rules are compiled, or where a subclass has replaced them.
+
+        Args:
+            advance: as in `hpamdp.env.kernels`.
+            owner: the class whose `start`, `act` and `observe` the kernel stands for.
+            settings: the problem's own numbers for it.
+        """
+        is_replaced = any(getattr(type(self), name) is not getattr(owner, name) for name in ("start", "act", "observe"))
+        if self.device.type != "cpu" or self._is_compiled or is_replaced:
+            return
+        bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
+        state = self._columns
+        num_integers = sum(not column.is_floating_point() for column in state)
+        self._rows = Rows(
+            advance,
+            self.num_envs,
+            num_columns=(len(state._fields) - num_integers, num_integers),
+            observation_dim=len(self.observation_names),
+            parameter_dims=self.parameter_dims,
+            bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(),
+            settings=[self.max_steps, *settings],
+            first_env=int(self._environment[0]),
+        )
+        self._rows.set_seed(int(self._seed), self._streams)
+        self._state = state
+
+    @property
+    def _state(self) -> EpisodeState:
+        """The columns; where a kernel moves them, they change in place."""
+        if self._rows is None:
+            return self._columns
+        columns = (torch.from_numpy(column) for column in (*self._rows.floats, *self._rows.integers))
+        return type(self._columns)(*columns)
+
+    @_state.setter
+    def _state(self, state: EpisodeState) -> None:
+        if self._rows is None:
+            self._columns = state
+            return
+        for column, new in zip(self._state, state, strict=True):
+            column.copy_(new)
 
     @abstractmethod
     def start(self, episode: Tensor, rng: Key) -> EpisodeState:
@@ -156,7 +205,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     @property
     def state(self) -> EpisodeState:
         """The columns of the state, `[N]` each."""
-        return self._state
+        state = self._state
+        return state if self._rows is None else type(state)(*(column.clone() for column in state))
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -170,7 +220,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each."""
-        return self._state._asdict()
+        return self.state._asdict()
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`; an empty one starts new episodes.
@@ -223,6 +273,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def _begin(self) -> None:
         """Put every environment before its first episode."""
         self._state = self._start(torch.full_like(self._environment, -1))
+        if self._rows is not None:
+            self._rows.set_seed(int(self._seed), self._streams)
 
     def _start(self, episode: Tensor) -> EpisodeState:
         return self.start(episode, counter_rng.key_for(self._seed, self._streams[0], self._environment, episode))
@@ -242,18 +294,58 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         return where(is_idle, state, after), torch.where(is_idle, 0.0, reward)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        self._state = self._pure_reset(self._state, self.reset_mask(tensordict))
+        mask = self.reset_mask(tensordict)
+        if self._rows is not None:
+            return self._reading(self._rows.restart(mask.numpy()))
+        self._state = self._pure_reset(self._state, mask)
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        mask = tensordict.get("_step", None)
+        mask = None if mask is None else mask.reshape(self.num_envs)
+        if self._rows is not None:
+            results = self._act(tensordict, mask)
+            if results is not None:
+                return self._reading(results, has_reward=True)
         discrete, parameters = self._read_action(tensordict)
         before = self._state
         is_idle = before.outcome != GOING_ON
-        mask = tensordict.get("_step", None)
         if mask is not None:
-            is_idle = is_idle | ~mask.reshape(self.num_envs)
+            is_idle = is_idle | ~mask
         self._state, reward = self._pure_step(before, discrete, parameters, is_idle)
         return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        is_plain = self._rows is not None and not self._has_oracle and _PLAIN_KEYS.issuperset(tensordict.keys())
+        results = self._act(tensordict, None, restarts=True) if is_plain else None
+        if results is None:
+            return super()._step_and_maybe_reset(tensordict)
+        # The same in one pass: TorchRL's own steps between ours take longer than the kernel. It keeps the action, too;
+        # in a tensordict of its own, since an update of the root changes it in place.
+        action = TensorDict._new_unsafe(
+            dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
+        )
+        root = self._reading(results, number=1, kept={keys.ACTION: action})
+        return tensordict.set("next", self._reading(results, has_reward=True)), root
+
+    def _act(self, tensordict: TensorDictBase, mask: Tensor | None, *, restarts: bool = False) -> Results | None:
+        """Act with the kernel; None where it cannot, since the parameters require gradients: it is given up then."""
+        assert self._rows is not None
+        self.check_action(tensordict)
+        discrete, parameters = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
+        if parameters.requires_grad and torch.is_grad_enabled():
+            self._columns, self._rows = self.state, None
+            return None
+        results = self._rows.act(
+            discrete.long().contiguous().numpy(),
+            parameters.detach().float().contiguous().numpy(),
+            mask=None if mask is None else mask.numpy(),
+            restarts=restarts,
+        )
+        if isinstance(results, int):
+            self._read_action(tensordict)
+            raise AssertionError(f"row {results}")
+        return results
 
     def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Check the action; return its discrete part `[N]` and its own parameters `[N, D]`, clipped, as `act` does."""
@@ -286,7 +378,27 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             keys.TERMINATED: done & ~truncated,
             keys.TRUNCATED: truncated,
         }
-        seen = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        return self._with_oracle(TensorDict(leaves, batch_size=self.batch_size, device=self.device))
+
+    def _reading(
+        self, results: Results, *, number: int = 0, has_reward: bool = False, kept: Mapping[str, Any] | None = None
+    ) -> TensorDict:
+        """Return one of the kernel's readings, with rewards or other leaves."""
+        flags = torch.from_numpy(results.flags[number]).unsqueeze(-1)
+        leaves: dict[str, Any] = {
+            **(kept or {}),
+            keys.OBSERVATION: torch.from_numpy(results.observations[number]),
+            keys.OUTCOME: torch.from_numpy(results.outcomes[number]),
+            keys.DONE: flags[0],
+            keys.TERMINATED: flags[1],
+            keys.TRUNCATED: flags[2],
+        }
+        if has_reward:
+            leaves[keys.REWARD] = torch.from_numpy(results.rewards).unsqueeze(-1)
+        # The checks of the constructor would take longer than a hundred rows.
+        return self._with_oracle(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
+
+    def _with_oracle(self, seen: TensorDict) -> TensorDict:
         if self._has_oracle:
             discrete, parameter = self.scripted_action(self._state)
             seen.set("oracle", {"discrete": discrete.unsqueeze(-1), "parameters": parameter.unsqueeze(-1)})

@@ -13,14 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-# What a stream is for: the episodes of training and of evaluation, and the noise in either.
-TRAINING, EVALUATION, NOISE, EVALUATION_NOISE = range(4)
-
-# Number `index` of a key is the hash of `bits + index * step`. An odd step visits all 2^32 values before it repeats one
-# (a Weyl sequence). Each stream has its own, and no difference of two is a multiple of 8, so the sequences of two
-# streams, shifted or not, have at most one value in common in 2^30 indices. Whatever the seeds, no stream repeats the
-# numbers of another.
-_STEPS = (-0x7A143595, -0x61C88647, 0x27D4EB2F, 0x165667BD)
+from hpamdp.env.streams import EVALUATION, EVALUATION_NOISE, NOISE, STEPS, TRAINING
 
 # How to compile functions that draw random numbers. Each operation of the hash reads its input twice, and the
 # compiler's default of inlining them into one another takes it two minutes. Measured with 16,384 environments: with
@@ -67,7 +60,7 @@ def key_for(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> 
     """
     h = _mix(seed ^ (0x2545F491 + 0x01234567 * stream))
     h = _mix(h ^ environment)
-    return Key(_mix(h ^ episode), _STEPS[stream])
+    return Key(_mix(h ^ episode), STEPS[stream])
 
 
 def uniform(key: Key, index: int | Tensor) -> Tensor:

@@ -1,31 +1,29 @@
 """Gymnasium environments over batched ones: `Face` (one environment) and `VectorFace` (many).
 
-`CounterFace` and `CounterVectorFace` are those of any `CounterEnv`, whose id a problem registers with the path of its
-class. Their actions are the field's nested tuples, `(discrete action, (parameters of action 0, ..., of action K-1))`;
-batched spaces are Gymnasium's own: every leaf has a leading `[N]`. Only the parameters of the chosen action count.
-
-Infos: `outcome` (name), `steps` (actions so far) and, once the episode is over, `is_success`.
+Nothing here needs torch, which takes seconds to import and microseconds for each operation.
 """
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from tensordict import TensorDict, TensorDictBase
-
-from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv
 
 RenderMode = Literal["rgb_array"] | None
+
+
+class After(NamedTuple):
+    """What follows an action: observations `[N, observation_dim]`, rewards, terminations and truncations `[N]`."""
+
+    observations: np.ndarray
+    rewards: np.ndarray
+    terminations: np.ndarray
+    truncations: np.ndarray
 
 
 class NumpyEnv(Protocol):
@@ -38,16 +36,31 @@ class NumpyEnv(Protocol):
 
     @property
     def state(self) -> Any:
-        """The columns of the state, a named tuple of tensors `[N]`."""
+        """The columns of the state, a named tuple of tensors or arrays `[N]` that stay as they are."""
 
     def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
         """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, observation_dim]`."""
 
-    def step(self, action: Any, ignored: np.ndarray | None = None) -> TensorDictBase:
-        """Return what follows an action in every environment; `ignored` rows may hold any action."""
+    def step(self, action: Any, *, restarts: bool = False) -> After:
+        """Return what follows an action in every environment.
 
-    def infos(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Return the infos, `[N]` each, and which episodes are over."""
+        With `restarts`, environments whose episode was over start a new one instead, whatever their action is.
+        """
+
+    @property
+    def is_over(self) -> np.ndarray:
+        """Which episodes are over, bool `[N]`."""
+
+    def infos(self) -> dict[str, np.ndarray]:
+        """Return the infos, `[N]` each."""
+
+    def info(self) -> dict[str, Any]:
+        """Return the infos of the first environment as Python's numbers."""
+        values = self.infos()
+        if not self.is_over[0]:
+            for name in self.final_infos:
+                del values[name]
+        return {name: value.item(0) for name, value in values.items()}
 
 
 class Face(gymnasium.Env):
@@ -83,22 +96,17 @@ class Face(gymnasium.Env):
         if seed is None and not self._problem.is_reset:
             seed = int(self.np_random.integers(2**31))
         observation = self._problem.reset(seed, options)[0]
-        self._track = [self._problem.state]
-        return observation, self._info()
+        if self.render_mode is not None:
+            self._track = [self._problem.state]
+        return observation, self._problem.info()
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Take an action; after the end of the episode everything stays as it is and earns 0."""
-        was_done = bool(self._problem.infos()[1][0])
-        after = self._problem.step(action)
-        if self.render_mode is not None and not was_done:
+        is_drawn = self.render_mode is not None and not self._problem.is_over[0]
+        observations, rewards, terminations, truncations = self._problem.step(action)
+        if is_drawn:
             self._track.append(self._problem.state)
-        return (
-            to_numpy(after[keys.OBSERVATION])[0],
-            after[keys.REWARD].item(),
-            after[keys.TERMINATED].item(),
-            after[keys.TRUNCATED].item(),
-            self._info(),
-        )
+        return observations[0], rewards.item(), terminations.item(), truncations.item(), self._problem.info()
 
     def render(self) -> np.ndarray | None:
         """Return a picture of the episode so far, uint8 `[480, 480, 3]`; None without a render mode."""
@@ -112,12 +120,6 @@ class Face(gymnasium.Env):
 
     def _draw(self) -> np.ndarray:
         raise NotImplementedError
-
-    def _info(self) -> dict[str, Any]:
-        values, is_done = self._problem.infos()
-        if not is_done[0]:
-            values = {name: value for name, value in values.items() if name not in self._problem.final_infos}
-        return {name: value[0] if value.dtype == object else value[0].item() for name, value in values.items()}
 
 
 class VectorFace(VectorEnv):
@@ -168,18 +170,10 @@ class VectorFace(VectorEnv):
             Observations `[N, observation_dim]`, rewards, terminations and truncations `[N]`, and infos, each with a
             mask `_name` of the environments that have it.
         """
-        _, was_done = self._problem.infos()
-        is_next_step = self.autoreset_mode == AutoresetMode.NEXT_STEP
-        after = self._problem.step(actions, ignored=was_done if is_next_step else None)
-        observations = to_numpy(after[keys.OBSERVATION])
-        rewards = to_numpy(after[keys.REWARD])[:, 0].astype(np.float64)
-        terminations = to_numpy(after[keys.TERMINATED])[:, 0]
-        truncations = to_numpy(after[keys.TRUNCATED])[:, 0]
-        if is_next_step and was_done.any():
-            # Finished episodes stayed as they were and earned 0, so only the other results of their rows change.
-            observations = self._problem.reset(None, None, was_done)
-            terminations &= ~was_done
-            truncations &= ~was_done
+        observations, rewards, terminations, truncations = self._problem.step(
+            actions, restarts=self.autoreset_mode == AutoresetMode.NEXT_STEP
+        )
+        rewards = rewards.astype(np.float64)
         is_done = terminations | truncations
         infos: dict[str, Any] = {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and is_done.any():
@@ -206,140 +200,20 @@ class VectorFace(VectorEnv):
 
     def _masked_infos(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         """Return the infos of `rows` in Gymnasium's format: with each value a mask `_name` of those that have it."""
-        values, is_done = self._problem.infos()
+        is_over, everywhere = self._problem.is_over, bool(rows.all())
         masked: dict[str, np.ndarray] = {}
-        for name, value in values.items():
-            has_value = rows & is_done if name in self._problem.final_infos else rows
-            if has_value.any():
+        for name, value in self._problem.infos().items():
+            is_final = name in self._problem.final_infos
+            has_value = rows & is_over if is_final else rows
+            if everywhere and not is_final:
+                masked[name] = value
+            elif has_value.any():
                 missing: Any = None if value.dtype == object else value.dtype.type(0)
                 masked[name] = np.where(has_value, value, missing)
-                masked[f"_{name}"] = has_value.copy()
+            else:
+                continue
+            masked[f"_{name}"] = has_value.copy()
         return masked
-
-
-class CounterFace(Face):
-    """One environment of a `CounterEnv`.
-
-    Args:
-        problem: the environment's class as text, `package.module:Class`.
-        render_mode: None or `rgb_array`.
-        settings: what the class takes besides.
-    """
-
-    def __init__(self, problem: str, *, render_mode: RenderMode = None, **settings: Any) -> None:
-        env = _load(problem)(1, **settings)
-        super().__init__(NumpyCounterEnv(env, ()), render_mode)
-        self._env = env
-
-    def _draw(self) -> np.ndarray:
-        return self._env.draw(self._track)
-
-
-class CounterVectorFace(VectorFace):
-    """`num_envs` environments of a `CounterEnv`.
-
-    Args:
-        problem: the environment's class as text, `package.module:Class`.
-        num_envs, autoreset_mode: as in `VectorFace`.
-        settings: what the class takes besides, such as `device`.
-    """
-
-    def __init__(
-        self,
-        problem: str,
-        *,
-        num_envs: int = 1,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        **settings: Any,
-    ) -> None:
-        env = _load(problem)(num_envs, **settings)
-        super().__init__(NumpyCounterEnv(env, (num_envs,)), num_envs, autoreset_mode)
-
-
-class NumpyCounterEnv(NumpyEnv):
-    """A `CounterEnv` with NumPy in and out: one environment (`batch=()`) or many (`batch=(N,)`)."""
-
-    final_infos = ("is_success",)
-
-    def __init__(self, env: CounterEnv, batch: tuple[int, ...]) -> None:
-        self.is_reset = False
-        self.action_space = _action_space(env)
-        low, high = (np.array(side, np.float32) for side in env.observation_bounds)
-        self.observation_space = spaces.Box(low, high, dtype=np.float32)
-        self._env = env
-        self._batch = batch
-
-    @property
-    def state(self) -> Any:
-        """The columns of the state."""
-        return self._env.state
-
-    def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
-        """Start new episodes; there are no options."""
-        if options:
-            raise ValueError(f"reset: unknown options {sorted(options)}; there are none")
-        if seed is not None:
-            self._env.set_seed(seed, static_seed=True)
-        given = TensorDict(batch_size=self._env.batch_size, device=self._env.device)
-        if mask is not None:
-            given["_reset"] = torch.from_numpy(mask.copy()).to(self._env.device).unsqueeze(-1)
-        self.is_reset = True
-        return to_numpy(self._env.reset(given)[keys.OBSERVATION])
-
-    def step(self, action: Any, ignored: np.ndarray | None = None) -> TensorDictBase:
-        """Return what follows an action in every environment."""
-        if not self.is_reset:
-            raise gymnasium.error.ResetNeeded("step: call reset first")
-        discrete, parameters = self._leaves(action)
-        if ignored is not None:
-            rows = torch.from_numpy(ignored)
-            discrete[rows] = 0
-            parameters[rows] = 0.0
-        td = TensorDict(batch_size=self._env.batch_size, device=self._env.device)
-        td[keys.DISCRETE] = discrete
-        td[keys.PARAMETERS] = parameters
-        return self._env.step(td)["next"]
-
-    def infos(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Return the infos, `[N]` each, and which episodes are over."""
-        outcome = to_numpy(self._env.state.outcome)
-        values = {
-            "outcome": np.array(self._env.outcomes, dtype=object)[outcome],
-            "steps": to_numpy(self._env.state.steps).astype(np.int64),
-            "is_success": outcome == SUCCESS,
-        }
-        return values, outcome != GOING_ON
-
-    def _leaves(self, action: Any) -> tuple[torch.Tensor, torch.Tensor]:
-        """Check the structure, types and shapes of an action and return its leaves, `[N]` and `[N, num_parameters]`."""
-        if not isinstance(action, (tuple, list)) or len(action) != 2:
-            raise ValueError(f"step: the action must be a tuple (discrete, parameters), but is {describe(action)}")
-        discrete, parameters = action
-        dims = self._env.parameter_dims
-        if not isinstance(parameters, (tuple, list)) or len(parameters) != len(dims):
-            raise ValueError(f"step: parameters must be a tuple of length {len(dims)}, but is {describe(parameters)}")
-        given = as_array("step: discrete", discrete, self._batch, is_integer=True).astype(np.int64)
-        arrays = [
-            as_array(f"step: parameters of action {number}", array, (*self._batch, dim))
-            for number, (array, dim) in enumerate(zip(parameters, dims, strict=True))
-        ]
-        joined = np.concatenate(arrays, axis=-1).astype(np.float32).reshape(self._env.num_envs, sum(dims))
-        return torch.from_numpy(given.reshape(self._env.num_envs)), torch.from_numpy(joined)
-
-
-def _load(problem: str) -> type[Any]:
-    """Return the class that `package.module:Class` names."""
-    module, _, name = problem.partition(":")
-    return getattr(importlib.import_module(module), name)
-
-
-def _action_space(env: PAMDPEnv) -> spaces.Tuple:
-    """Return the space `Tuple(Discrete, Tuple(Box, ...))` of the actions of one environment."""
-    bounds = env.full_action_spec_unbatched[keys.PARAMETERS].space
-    ends = np.cumsum(env.parameter_dims)[:-1]
-    lows, highs = (np.split(side.cpu().numpy().reshape(-1), ends) for side in (bounds.low, bounds.high))
-    boxes = [spaces.Box(low, high, dtype=np.float32) for low, high in zip(lows, highs, strict=True)]
-    return spaces.Tuple((spaces.Discrete(len(boxes)), spaces.Tuple(boxes)))
 
 
 def as_array(name: str, value: Any, shape: tuple[int, ...], *, is_integer: bool = False) -> np.ndarray:
@@ -367,8 +241,3 @@ def describe(value: Any) -> str:
     if isinstance(value, (tuple, list)):
         return f"a {kind} of length {len(value)}"
     return f"a {kind}"
-
-
-def to_numpy(tensor: torch.Tensor) -> np.ndarray:
-    """Return a copy of a tensor as an array that shares no memory with it."""
-    return tensor.cpu().numpy().copy()

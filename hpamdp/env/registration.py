@@ -38,7 +38,7 @@ def register_counter_env(env_id: str, problem: str, **settings: Any) -> None:
     # No max_episode_steps: the environment itself truncates after its last step.
     gymnasium.register(
         id=env_id,
-        entry_point="hpamdp.env.faces:CounterFace",
-        vector_entry_point="hpamdp.env.faces:CounterVectorFace",
+        entry_point="hpamdp.env.counter_faces:CounterFace",
+        vector_entry_point="hpamdp.env.counter_faces:CounterVectorFace",
         kwargs={"problem": problem, **settings},
     )

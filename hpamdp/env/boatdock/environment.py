@@ -18,14 +18,16 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
 from hpamdp.env.boatdock.episode import BoatState, Rules
+from hpamdp.env.boatdock.fleet import Fleet, Readings
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
+from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
+from hpamdp.env.boatdock.task import check_arguments, invalid_press, one_or_two
 from hpamdp.env.columns import where
 
 if TYPE_CHECKING:
@@ -34,6 +36,17 @@ if TYPE_CHECKING:
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
+# What a tensordict has whose next root holds nothing else.
+_PLAIN_KEYS = {
+    keys.OBSERVATION,
+    keys.OUTCOME,
+    episode.FUEL,
+    keys.DONE,
+    keys.TERMINATED,
+    keys.TRUNCATED,
+    keys.OPTION,
+    keys.ACTION,
+}
 _LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
 
 
@@ -58,13 +71,18 @@ class BoatDockEnv(PAMDPEnv):
             congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_rules: compile the pure step, reset and observation functions (takes about half a minute).
+        compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU; on the CPU
+            the kernel is as fast.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
         first_env: number of the first boat, where other processes have those before.
+
+    On the CPU the boats are moved by the kernel of `hpamdp.env.boatdock.kernel`; other devices, compiled rules, and
+    gradients (from the first durations that require them on) have the tensor functions of `episode`. Numbers agree to
+    rounding.
 
     `reset` also takes layouts to play: a tensordict with `start` and `goal` `[N, 2]` in screen px and, optionally,
     `controller` and `keymap` int `[N]`.
@@ -120,15 +138,13 @@ class BoatDockEnv(PAMDPEnv):
         seed: int = 0,
         first_env: int = 0,
     ) -> None:
-        motor_noises = [motor_noise, motor_noise] if isinstance(motor_noise, int | float) else motor_noise
-        if len(motor_noises) != 2:
-            raise ValueError(f"BoatDockEnv: motor_noise={motor_noises}, but must be one number or two")
-        incongruent, congruent = motor_noises
-        rules = Rules(controller, keymap, reward, observation, (incongruent, congruent), sensor_noise, slip)
-        _check_arguments(num_envs, rules)
+        rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
+        check_arguments(num_envs, rules)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
+        is_on_cpu = self.device is None or self.device.type == "cpu"
+        self._fleet = Fleet(num_envs, rules, first_env) if is_on_cpu and not compile_rules else None
         self._pure_step = episode.step
         self._pure_reset = episode.reset
         self._pure_read = episode.read
@@ -155,12 +171,26 @@ class BoatDockEnv(PAMDPEnv):
     @property
     def state(self) -> BoatState:
         """The boats as they are; assign a state to put them elsewhere (checkpoints do)."""
-        return self._state
+        return self._columns if self._fleet is None else BoatState(*(column.clone() for column in self._state))
 
     @state.setter
     def state(self, state: BoatState) -> None:
-        self._state = BoatState(*(column.to(self.device) for column in state))
+        self._put(BoatState(*(column.to(self.device) for column in state)))
         self._has_layouts = True
+
+    @property
+    def _state(self) -> BoatState:
+        """The boats as they are; where the kernel moves them, the columns change with them."""
+        if self._fleet is None:
+            return self._columns
+        return BoatState(*(torch.from_numpy(column) for column in self._fleet.columns()))
+
+    def _put(self, state: BoatState) -> None:
+        if self._fleet is None:
+            self._columns = state
+            return
+        for column, new in zip(self._state, state, strict=True):
+            column.copy_(new)
 
     @property
     def position(self) -> Tensor:
@@ -178,6 +208,8 @@ class BoatDockEnv(PAMDPEnv):
         """Seed episodes and noise as `set_seed` does, but from streams that training never meets, whatever its seed."""
         self.set_seed(seed)
         self.rules = self.rules._replace(is_evaluation=True)
+        if self._fleet is not None:
+            self._fleet.set_streams(is_evaluation=True)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `outcome`, `fuel` (fraction), `score` and `success` `[M]` of finished (or abandoned) episodes."""
@@ -191,7 +223,7 @@ class BoatDockEnv(PAMDPEnv):
         `start`, `goal` `[N, 2]`, `bearing_offset` `[N]` (degrees) and `optimum` `[N, 2]`: the best possible score with
         the incongruent and the congruent boat from a full tank; `controller` `[N]` where it is not chosen.
         """
-        state = self._state
+        state = self.state
         layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
         known = {
             "start": torch.stack(layout[:2], -1),
@@ -232,7 +264,7 @@ class BoatDockEnv(PAMDPEnv):
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
         plans = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
-        return {**self._state._asdict(), **plans}
+        return {**self.state._asdict(), **plans}
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`.
@@ -265,104 +297,141 @@ class BoatDockEnv(PAMDPEnv):
     def _set_seed(self, seed: int | None) -> None:
         self.rules = self.rules._replace(is_evaluation=False)
         self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
+        self._has_layouts = False
+        if self._fleet is not None:
+            self._fleet.set_seed(0 if seed is None else seed, is_evaluation=False)
+            return
         floats = torch.zeros(self.num_envs, device=self.device)
         integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
         columns = [floats] * 9 + [integers] * 4 + [integers - 1]
-        self._state = BoatState(*columns)
-        self._has_layouts = False
+        self._columns = BoatState(*columns)
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = self.reset_mask(tensordict)
         given = None
         if tensordict is not None and _LAYOUT_KEYS & set(tensordict.keys()):
             given = self._given_layout(tensordict)
-        self._state = self._pure_reset(self._state, mask, self._seed, self._environment, self.rules)
+        readings = None
+        if self._fleet is None:
+            self._columns = self._pure_reset(self._columns, mask, self._seed, self._environment, self.rules)
+        else:
+            readings = self._fleet.restart(mask.numpy())
         if given is not None:
-            self._state = where(mask, self._state._replace(**given), self._state)
+            state = self._state
+            self._put(where(mask, state._replace(**given), state))
+            readings = None
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)
         self._has_layouts = True
-        return self._read()
+        return self._read() if readings is None else self._reading(readings)
 
     def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
         """Check a user's layout and return the state's columns that it sets."""
-        centre = torch.tensor(harbour.CENTRE, device=self.device)
-        points = {}
-        for name in ("start", "goal"):
-            point = given.get(name, None)
-            if point is None or point.shape != (self.num_envs, 2):
-                shape = None if point is None else list(point.shape)
-                raise ValueError(f"reset: {name} has shape {shape}, but must be [{self.num_envs}, 2] (screen px)")
-            points[name] = point.to(self.device, torch.float32) - centre
-            if not (points[name].norm(dim=-1) < physics.HARBOUR_RADIUS).all():
-                radius = f"{physics.HARBOUR_RADIUS:g} px"
-                raise ValueError(f"reset: a {name} lies outside the harbour: centre {harbour.CENTRE}, radius {radius}")
-        if not ((points["start"] - points["goal"]).norm(dim=-1) > physics.DOCK_RADIUS).all():
-            raise ValueError(f"reset: a start lies within the dock's {physics.DOCK_RADIUS:g} px of its goal")
-        (start_x, start_y), (goal_x, goal_y) = (points[name].unbind(-1) for name in ("start", "goal"))
-        columns = dict(start_x=start_x, start_y=start_y, goal_x=goal_x, goal_y=goal_y, x=start_x, y=start_y)
-        for name, allowed in (("controller", (0, 1)), ("keymap", (1, 2))):
-            value = given.get(name, None)
-            if value is None:
-                continue
-            if name == "controller" and self.has_choice:
-                raise ValueError('reset: controller is given, but with controller="choose" it comes from the option')
-            if value.shape != (self.num_envs,) or not ((value == allowed[0]) | (value == allowed[1])).all():
-                raise ValueError(f"reset: {name} must be {allowed[0]} or {allowed[1]} in shape [{self.num_envs}]")
-            columns[name] = value.to(self.device, torch.int32)
-        return columns
+        arrays = {name: given.get(name).cpu().numpy() for name in _LAYOUT_KEYS & set(given.keys())}
+        columns = layout_columns(arrays, self.num_envs, has_choice=self.has_choice)
+        return {name: torch.from_numpy(column).to(self.device) for name, column in columns.items()}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        key, durations, option = self._read_action(tensordict)
+        mask = tensordict.get("_step", None)
+        mask = None if mask is None else mask.reshape(self.num_envs)
+        if self._fleet is not None:
+            return self._reading(*self._press(key, durations, option, mask))
+        chosen = self._columns.controller if option is None else option
+        state, reward, is_action = self._pure_step(
+            self._columns, chosen, key, durations, self._seed, self._environment, self.rules
+        )
+        if not is_action.all():
+            raise _invalid(int((~is_action).nonzero()[0]), key, durations, chosen)
+        if mask is not None:
+            state, reward = where(mask, state, self._columns), torch.where(mask, reward, 0.0)
+        self._columns = state
+        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+
+    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
+        is_plain = self._fleet is not None and self._oracle is None and not self._has_human
+        if not is_plain or tensordict.device != self.device or not _PLAIN_KEYS.issuperset(tensordict.keys()):
+            return super()._step_and_maybe_reset(tensordict)
+        # The same in one pass: TorchRL's own steps between ours take longer than the boats.
+        key, durations, option = self._read_action(tensordict)
+        if self._fleet is None:  # the durations require gradients
+            return super()._step_and_maybe_reset(tensordict)
+        readings, rewards = self._press(key, durations, option, None, restarts=True)
+        # TorchRL keeps the action, too; in a tensordict of its own, since an update of the root changes it in place.
+        action = TensorDict._new_unsafe(
+            dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
+        )
+        kept: dict[str, Any] = {keys.ACTION: action}
+        if keys.OPTION in tensordict.keys():
+            kept[keys.OPTION] = tensordict.get(keys.OPTION)
+        return tensordict.set("next", self._reading(readings, rewards)), self._reading(readings, number=1, kept=kept)
+
+    def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Return keys, durations and, where the agent chooses, options; their values are still to be checked."""
         if not self._has_layouts:
             raise RuntimeError("BoatDockEnv: the boats have no layouts yet; call reset before step")
         self.check_action(tensordict)
-        key, durations = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS).float()
-        option = tensordict.get(keys.OPTION) if self.has_choice else self._state.controller
-        state, reward, is_action = self._pure_step(
-            self._state, option, key, durations, self._seed, self._environment, self.rules
+        action = tensordict.get(keys.ACTION)
+        key, durations = action.get("discrete"), action.get("parameters").float()
+        if self._fleet is not None and durations.requires_grad and torch.is_grad_enabled():
+            self._columns, self._fleet = self.state, None
+        return key, durations, tensordict.get(keys.OPTION) if self.has_choice else None
+
+    def _press(
+        self, key: Tensor, durations: Tensor, option: Tensor | None, mask: Tensor | None, *, restarts: bool = False
+    ) -> tuple[Readings, np.ndarray]:
+        """Press a key with the kernel."""
+        assert self._fleet is not None
+        result = self._fleet.press(
+            None if option is None else _array(option.long()),
+            _array(key.long()),
+            _array(durations),
+            mask=None if mask is None else _array(mask),
+            restarts=restarts,
         )
-        if not is_action.all():
-            row = int((~is_action).nonzero()[0])
-            raise invalid_action(
-                row,
-                {
-                    "option": (option[row].item(), "allowed 0 to 1"),
-                    "key": (key[row].item(), "allowed 0 to 2"),
-                    "durations": (durations[row].tolist(), "the pressed key's must be finite"),
-                },
-            )
-        mask = tensordict.get("_step", None)
-        if mask is not None:
-            mask = mask.reshape(self.num_envs)
-            state, reward = where(mask, state, self._state), torch.where(mask, reward, 0.0)
-        self._state = state
-        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+        if isinstance(result, int):
+            raise _invalid(result, key, durations, self._state.controller if option is None else option)
+        return result
 
     def _read(self) -> TensorDict:
-        reading = self._pure_read(self._state, self._seed, self._environment, self.rules)
-        seen = TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device)
+        if self._fleet is not None:
+            return self._reading(self._fleet.read())
+        reading = self._pure_read(self._columns, self._seed, self._environment, self.rules)
+        return self._with_knowledge(TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device))
+
+    def _reading(
+        self,
+        readings: Readings,
+        rewards: np.ndarray | None = None,
+        number: int = 0,
+        kept: Mapping[str, Any] | None = None,
+    ) -> TensorDict:
+        """Return one of the kernel's readings, with rewards or other leaves."""
+        flags = torch.from_numpy(readings.flags[number]).unsqueeze(-1)
+        leaves: dict[str, Any] = {
+            **(kept or {}),
+            keys.OBSERVATION: torch.from_numpy(readings.observations[number]),
+            keys.OUTCOME: torch.from_numpy(readings.outcomes[number]),
+            episode.FUEL: torch.from_numpy(readings.fuel[number]).unsqueeze(-1),
+            keys.DONE: flags[0],
+            keys.TERMINATED: flags[1],
+            keys.TRUNCATED: flags[2],
+        }
+        if rewards is not None:
+            leaves[keys.REWARD] = torch.from_numpy(rewards).unsqueeze(-1)
+        # The checks of the constructor would take longer than a hundred boats.
+        return self._with_knowledge(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
+
+    def _with_knowledge(self, seen: TensorDict) -> TensorDict:
+        """Add what people and the planner know."""
         if self._has_human:
             seen.set(keys.HUMAN_OPTION, human_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
 
 
-def _check_arguments(num_envs: int, rules: Rules) -> None:
-    choices = {
-        "controller": ("choose", *harbour.CONTROLLERS[::-1], "random"),
-        "keymap": (1, 2, "random"),
-        "reward": ("paper", "sparse"),
-        "observation": ("scaled", "pixels"),
-    }
-    for name, allowed in choices.items():
-        value = getattr(rules, name)
-        if value not in allowed:
-            raise ValueError(f"BoatDockEnv: {name}={value!r}, but must be one of {', '.join(map(str, allowed))}")
-    if num_envs < 1:
-        raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
-    if not 0.0 <= rules.slip <= 1.0:
-        raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
-    noises = (("motor_noise", rules.motor_noise, 10), ("sensor_noise", (rules.sensor_noise,), 1000))
-    for name, values, largest in noises:
-        for value in values:
-            if not 0.0 <= value <= largest:
-                raise ValueError(f"BoatDockEnv: {name}={value}, but must lie between 0 and {largest}")
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()
+
+
+def _invalid(row: int, key: Tensor, durations: Tensor, option: Tensor) -> ValueError:
+    return invalid_press(row, option[row].item(), key[row].item(), durations[row].tolist())

@@ -7,83 +7,32 @@ observation would keep a physics fused with them from being vectorised. Position
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import harbour, physics
-from hpamdp.env.columns import where
-
-MAX_PRESSES = 25
-SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
-# The scaled observation divides by these, so that entries lie in about [-1, 1].
-_SPEED_SCALE = float(physics.speed(torch.tensor(physics.MAX_DURATION)))
-
-RewardForm = Literal["paper", "sparse"]
-ObservationForm = Literal["scaled", "pixels"]
-
-FUEL = "fuel"  # the tensordict entry: the fraction of the tank that is left
-
-OBSERVATION_NAMES = (
-    "start_x",
-    "start_y",
-    "goal_x",
-    "goal_y",
-    "centre_x",
-    "centre_y",
-    "radius",
-    "controller",
-    "boat_x",
-    "boat_y",
-    "velocity_x",
-    "velocity_y",
-    "fuel",
-    "distance",
+from hpamdp.env.boatdock.task import (
+    FAILURE_REWARD,
+    FUEL,
+    MAX_PRESSES,
+    MOTOR,
+    NUMBERS_PER_PRESS,
+    OBSERVATION_NAMES,
+    SCALED_NAMES,
+    SENSOR,
+    SLIP,
+    SLIPPED_KEY,
+    SPEED_SCALE,
+    SUCCESS_REWARD,
+    BoatState,
+    ObservationForm,
+    RewardForm,
+    Rules,
 )
-SCALED_NAMES = (*OBSERVATION_NAMES, "to_goal_x", "to_goal_y")
-
-# Each press has 16 random numbers of its episode's noise; Gaussian number i is made of the uniform ones 2i and 2i + 1.
-_NUMBERS_PER_PRESS = 16
-# Indices of these: uniform ones, then Gaussian ones.
-_SLIP, _SLIPPED_KEY = 0, 1
-_MOTOR, _SENSOR = 1, 2
-
-
-class Rules(NamedTuple):
-    """The settings of an environment, as BoatDockEnv explains them."""
-
-    controller: Literal["choose", "congruent", "incongruent", "random"] = "choose"
-    keymap: Literal[1, 2, "random"] = 1
-    reward: RewardForm = "paper"
-    observation: ObservationForm = "scaled"
-    motor_noise: tuple[float, float] = (0.0, 0.0)  # of the incongruent and of the congruent boat
-    sensor_noise: float = 0.0
-    slip: float = 0.0
-    is_evaluation: bool = False  # whether episodes and noise come from the streams of evaluation
-
-
-class BoatState(NamedTuple):
-    """Columns `[N]`; px from the harbour's centre, fuel in seconds, integers int32.
-
-    The velocity is that at the end of the last press, before the glide. `episode` is -1 before the first reset.
-    """
-
-    start_x: Tensor
-    start_y: Tensor
-    goal_x: Tensor
-    goal_y: Tensor
-    x: Tensor
-    y: Tensor
-    velocity_x: Tensor
-    velocity_y: Tensor
-    fuel: Tensor
-    controller: Tensor
-    keymap: Tensor
-    presses: Tensor
-    outcome: Tensor
-    episode: Tensor
+from hpamdp.env.columns import where
 
 
 class Reading(NamedTuple):
@@ -175,15 +124,15 @@ def _press(
     state: BoatState, option: Tensor, key: Tensor, duration: Tensor, noise_key: counter_rng.Key, rules: Rules
 ) -> BoatState:
     """Return the states after a press of allowed keys with finite durations, as if no episode were over."""
-    first = state.presses * _NUMBERS_PER_PRESS
+    first = state.presses * NUMBERS_PER_PRESS
     if rules.slip > 0.0:
-        random_key = (counter_rng.uniform(noise_key, first + _SLIPPED_KEY) * harbour.NUM_KEYS).to(torch.int32)
-        key = torch.where(counter_rng.uniform(noise_key, first + _SLIP) < rules.slip, random_key, key)
+        random_key = (counter_rng.uniform(noise_key, first + SLIPPED_KEY) * harbour.NUM_KEYS).to(torch.int32)
+        key = torch.where(counter_rng.uniform(noise_key, first + SLIP) < rules.slip, random_key, key)
     duration = duration.clamp(0.0, physics.MAX_DURATION)
     controller = torch.where(state.controller == harbour.NOT_CHOSEN, option, state.controller)
     if max(rules.motor_noise) > 0.0:
         deviation = torch.where(controller == 0, *rules.motor_noise)
-        duration = duration * (deviation * counter_rng.normal(noise_key, first // 2 + _MOTOR)).exp()
+        duration = duration * (deviation * counter_rng.normal(noise_key, first // 2 + MOTOR)).exp()
         duration = duration.clamp(max=physics.MAX_DURATION)
     dir_x, dir_y = harbour.direction(controller, state.keymap, key)
     pressed = physics.press(state.x, state.y, state.fuel, state.goal_x, state.goal_y, dir_x, dir_y, duration)
@@ -225,7 +174,7 @@ def read(state: BoatState, seed: Tensor, environment: Tensor, rules: Rules) -> R
     points = [state.start_x, state.start_y, state.goal_x, state.goal_y, state.x, state.y]
     if rules.sensor_noise > 0.0:
         noise_key = _noise_key(state, seed, environment, rules)
-        first = state.presses * (_NUMBERS_PER_PRESS // 2) + _SENSOR
+        first = state.presses * (NUMBERS_PER_PRESS // 2) + SENSOR
         points = [p + rules.sensor_noise * counter_rng.normal(noise_key, first + i) for i, p in enumerate(points)]
     start_x, start_y, goal_x, goal_y, x, y = points
     distance = ((goal_x - x).square() + (goal_y - y).square()).sqrt()
@@ -233,7 +182,7 @@ def read(state: BoatState, seed: Tensor, environment: Tensor, rules: Rules) -> R
     at_start = harbour.separation(harbour.Layout(start_x, start_y, goal_x, goal_y)).clamp(min=physics.DOCK_RADIUS)
     is_pixels = rules.observation == "pixels"
     centre_x, centre_y = harbour.CENTRE if is_pixels else (0.0, 0.0)
-    length, speed = (1.0, 1.0) if is_pixels else (1.0 / physics.HARBOUR_RADIUS, 1.0 / _SPEED_SCALE)
+    length, speed = (1.0, 1.0) if is_pixels else (1.0 / physics.HARBOUR_RADIUS, 1.0 / SPEED_SCALE)
     zeros = torch.zeros_like(x)
     columns = [
         start_x * length + centre_x,

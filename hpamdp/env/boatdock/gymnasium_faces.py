@@ -1,4 +1,4 @@
-"""The boat-docking task as Gymnasium environments over BoatDockEnv: `BoatDock` (one boat), `BoatDockVector` (many).
+"""The boat-docking task as Gymnasium environments: `BoatDock` (one boat), `BoatDockVector` (many).
 
 Actions are dicts or, with `action_format="tuple"`, the field's nested tuples: see `hpamdp.env.boatdock.numpy_boats`.
 
@@ -11,16 +11,14 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
-import torch
 from gymnasium.vector import AutoresetMode
 
-from hpamdp.env.boatdock import physics, rendering
-from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import BoatState
 from hpamdp.env.boatdock.numpy_boats import ActionFormat, NumpyBoats
+from hpamdp.env.boatdock.task import Rules, one_or_two
 from hpamdp.env.faces import Face, VectorFace
 
 
@@ -52,19 +50,12 @@ class BoatDock(Face):
         action_format: ActionFormat = "dict",
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
-        env = BoatDockEnv(
-            1,
-            controller=controller,
-            keymap=keymap,
-            reward=reward,
-            observation=observation,
-            motor_noise=_one_or_two(motor_noise),
-            sensor_noise=sensor_noise,
-            slip=slip,
-        )
-        super().__init__(NumpyBoats(env, (), action_format), render_mode)
+        rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
+        super().__init__(NumpyBoats(rules, (), action_format), render_mode)
 
     def _draw(self) -> np.ndarray:
+        from hpamdp.env.boatdock import rendering  # it brings torch along
+
         state = self._track[-1]
         return rendering.draw(
             rendering.Scene(
@@ -72,30 +63,15 @@ class BoatDock(Face):
                 goal=(state.goal_x.item(), state.goal_y.item()),
                 boat=(state.x.item(), state.y.item()),
                 heading=(state.velocity_x.item(), state.velocity_y.item()),
-                legs=tuple(_leg(*pair) for pair in itertools.pairwise(self._track)),
-                keymap=int(state.keymap),
-                **self._info(),
+                legs=tuple(rendering.leg(*pair) for pair in itertools.pairwise(self._track)),
+                keymap=state.keymap.item(),
+                **self._problem.info(),
             )
         )
 
 
-def _one_or_two(motor_noise: float | Sequence[float]) -> float | list[float]:
-    """Return the motor noise as BoatDockEnv takes it."""
-    return motor_noise if isinstance(motor_noise, int | float) else list(motor_noise)
-
-
-def _leg(before: BoatState, after: BoatState) -> rendering.Leg:
-    """Return the track of the press between two states of one boat."""
-    start = (before.x.item(), before.y.item())
-    end = (after.x.item(), after.y.item())
-    # The fuel burnt is the time that the key was down, after noise and with what was left in the tank.
-    pressed = physics.pressed_distance(before.fuel - after.fuel).item()
-    length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
-    return rendering.Leg(start, end, min(pressed / length, 1.0) if length > 0.0 else 1.0)
-
-
 class BoatDockVector(VectorFace):
-    """`num_envs` boats to dock in one BoatDockEnv.
+    """`num_envs` boats to dock.
 
     Args:
         num_envs: number of boats.
@@ -127,18 +103,13 @@ class BoatDockVector(VectorFace):
         action_format: ActionFormat = "dict",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         compile_rules: bool = False,
-        device: torch.device | str = "cpu",
+        device: Any = "cpu",
     ) -> None:
-        env = BoatDockEnv(
-            num_envs,
-            controller=controller,
-            keymap=keymap,
-            reward=reward,
-            observation=observation,
-            motor_noise=_one_or_two(motor_noise),
-            sensor_noise=sensor_noise,
-            slip=slip,
-            compile_rules=compile_rules,
-            device=device,
-        )
-        super().__init__(NumpyBoats(env, (num_envs,), action_format), num_envs, autoreset_mode)
+        rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
+        make_fleet = None
+        if compile_rules or str(device) != "cpu":
+            # It brings torch along.
+            from hpamdp.env.boatdock.tensor_fleet import TensorFleet
+
+            make_fleet = partial(TensorFleet, device=device, compile_rules=compile_rules)
+        super().__init__(NumpyBoats(rules, (num_envs,), action_format, make_fleet), num_envs, autoreset_mode)

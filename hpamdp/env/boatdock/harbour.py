@@ -9,16 +9,22 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
-from hpamdp.env.boatdock.physics import SUCCESS, TANK
-
-CENTRE = (640.0, 512.0)  # px on the screen
-LAYOUT_RADIUS = 110.0
-MIN_SEPARATION = 30.0
-NUM_KEYS = 3
-
-INCONGRUENT, CONGRUENT = 0, 1
-CONTROLLERS = ("incongruent", "congruent")  # option 0, option 1
-NOT_CHOSEN = -1
+from hpamdp.env.boatdock.task import (
+    CENTRE,
+    CONGRUENT,
+    CONTROLLERS,
+    INCONGRUENT,
+    INDEX_ANGLE,
+    INDEX_CONTROLLER,
+    INDEX_KEYMAP,
+    LAYOUT_RADIUS,
+    LAYOUT_TRIES,
+    MIN_SEPARATION,
+    NOT_CHOSEN,
+    NUM_KEYS,
+    SUCCESS,
+    TANK,
+)
 
 _COS30 = math.sqrt(3.0) / 2.0
 _CONGRUENT_KEYS = ((-_COS30, 0.5), (0.0, -1.0), (_COS30, 0.5))
@@ -56,13 +62,6 @@ class Layout(NamedTuple):
     goal_y: Tensor
 
 
-# Indices of an episode's random numbers: three for each try at a layout, then the others.
-_TRIES = 4
-_INDEX_ANGLE = 3 * _TRIES
-INDEX_CONTROLLER = 3 * _TRIES + 1
-INDEX_KEYMAP = 3 * _TRIES + 2
-
-
 def sample_layout(key: counter_rng.Key) -> Layout:
     """Sample start and goal uniformly in the disc, again while they are less than MIN_SEPARATION apart.
 
@@ -87,7 +86,7 @@ def sample_layout(key: counter_rng.Key) -> Layout:
 
     # Each try is judged on its own. From the last to the first, each replaces what came after it unless it is too near,
     # so that the first good try remains.
-    tries = [attempt(3 * i) for i in range(_TRIES)]
+    tries = [attempt(3 * i) for i in range(LAYOUT_TRIES)]
     near = [is_near(*each) for each in tries]
     start, goal, turn = tries[-1]
     goal = torch.where(near[-1], 0.25, goal)
@@ -97,7 +96,7 @@ def sample_layout(key: counter_rng.Key) -> Layout:
         goal = torch.where(is_too_near, goal, each[1])
         turn = torch.where(is_too_near, turn, each[2])
 
-    angle = 2.0 * math.pi * counter_rng.uniform(key, _INDEX_ANGLE)
+    angle = 2.0 * math.pi * counter_rng.uniform(key, INDEX_ANGLE)
     start_radius = LAYOUT_RADIUS * start.sqrt()
     goal_radius = LAYOUT_RADIUS * goal.sqrt()
     goal_angle = angle + turn

@@ -1,4 +1,4 @@
-"""BoatDockEnv with NumPy in and out: Gymnasium's spaces, and the checks between its actions and our tensors.
+"""Boats with NumPy in and out: Gymnasium's spaces, and the checks between its actions and the boats.
 
 Formats of an action, for one boat (batched spaces are Gymnasium's own: every leaf has a leading `[N]`):
 
@@ -11,23 +11,23 @@ Formats of an action, for one boat (batched spaces are Gymnasium's own: every le
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import gymnasium
 import numpy as np
-import torch
 from gymnasium import spaces
-from tensordict import TensorDict, TensorDictBase
 
-from hpamdp import keys
-from hpamdp.env.boatdock import harbour, physics
-from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import OBSERVATION_NAMES, SCALED_NAMES, BoatState, Rules
-from hpamdp.env.faces import NumpyEnv, as_array, describe, to_numpy
+from hpamdp.env.boatdock import kernel, task
+from hpamdp.env.boatdock.fleet import Fleet, Readings
+from hpamdp.env.boatdock.layouts import layout_columns
+from hpamdp.env.boatdock.task import OBSERVATION_NAMES, SCALED_NAMES, BoatState, Rules
+from hpamdp.env.faces import After, NumpyEnv, as_array, describe
 
 ActionFormat = Literal["dict", "tuple"]
 
+_TANK = np.float32(task.TANK)
+_OUTCOME_NAMES = np.array(task.OUTCOMES, dtype=object)
 _OPTION_SHAPES = {"start": (2,), "goal": (2,), "controller": (), "keymap": ()}
 # Gaussian numbers that are made from 23-bit uniform ones stay within 5.8 standard deviations.
 _LARGEST_NORMAL = 6.0
@@ -35,33 +35,33 @@ _LARGEST_NORMAL = 6.0
 
 def action_space(has_choice: bool, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
     """Return the action space of one boat; see the module's docstring."""
-    option = spaces.Discrete(len(harbour.CONTROLLERS))
-    key = spaces.Discrete(harbour.NUM_KEYS)
+    option = spaces.Discrete(len(task.CONTROLLERS))
+    key = spaces.Discrete(task.NUM_KEYS)
     if action_format == "dict":
-        duration = spaces.Box(0.0, physics.MAX_DURATION, (harbour.NUM_KEYS,))
+        duration = spaces.Box(0.0, task.MAX_DURATION, (task.NUM_KEYS,))
         leaves: dict[str, spaces.Space] = {"key": key, "duration": duration}
         if has_choice:
             leaves["option"] = option
         return spaces.Dict(leaves)
-    durations = spaces.Tuple([spaces.Box(0.0, physics.MAX_DURATION, (1,)) for _ in range(harbour.NUM_KEYS)])
+    durations = spaces.Tuple([spaces.Box(0.0, task.MAX_DURATION, (1,)) for _ in range(task.NUM_KEYS)])
     return spaces.Tuple((option, key, durations) if has_choice else (key, durations))
 
 
 def observation_space(rules: Rules) -> spaces.Box:
     """Return the observation space of one boat: float32, bounded by what layouts, motion and noise can reach."""
     is_pixels = rules.observation == "pixels"
-    unit = 1.0 if is_pixels else 1.0 / physics.HARBOUR_RADIUS
-    top_speed = 1.01 * (float(physics.speed(torch.tensor(physics.MAX_DURATION))) if is_pixels else 1.0)
+    unit = 1.0 if is_pixels else 1.0 / task.HARBOUR_RADIUS
+    top_speed = 1.01 * (task.SPEED_SCALE if is_pixels else 1.0)
     # One px more than the geometry allows, for rounding.
-    reach = physics.HARBOUR_RADIUS + 1.0 + _LARGEST_NORMAL * rules.sensor_noise
+    reach = task.HARBOUR_RADIUS + 1.0 + _LARGEST_NORMAL * rules.sensor_noise
     bounds = {
-        "radius": (0.0, 2.0 * physics.HARBOUR_RADIUS * unit),
+        "radius": (0.0, 2.0 * task.HARBOUR_RADIUS * unit),
         "controller": (-1.0, 1.0),
         "fuel": (0.0, 1.0),
         # In units of the distance at the start, which counts as at least the radius of the dock.
-        "distance": (0.0, 2.0 * 2.0**0.5 * reach / physics.DOCK_RADIUS),
+        "distance": (0.0, 2.0 * 2.0**0.5 * reach / task.DOCK_RADIUS),
     }
-    for axis, centre in zip("xy", harbour.CENTRE if is_pixels else (0.0, 0.0), strict=True):
+    for axis, centre in zip("xy", task.CENTRE if is_pixels else (0.0, 0.0), strict=True):
         for point in ("start", "goal", "centre", "boat"):
             bounds[f"{point}_{axis}"] = (centre - reach * unit, centre + reach * unit)
         bounds[f"velocity_{axis}"] = (-top_speed, top_speed)
@@ -72,105 +72,142 @@ def observation_space(rules: Rules) -> spaces.Box:
 
 
 class NumpyBoats(NumpyEnv):
-    """BoatDockEnv with NumPy in and out: one boat (`batch=()`) or many (`batch=(N,)`)."""
+    """Boats with NumPy in and out: one (`batch=()`) or many (`batch=(N,)`).
+
+    Args:
+        rules: of the environment.
+        batch: see above.
+        action_format: `dict` or `tuple`.
+        make_fleet: returns what moves the boats, given their number and the rules; the kernel by default.
+    """
 
     final_infos = ("score",)
 
-    def __init__(self, env: BoatDockEnv, batch: tuple[int, ...], action_format: ActionFormat) -> None:
+    def __init__(
+        self,
+        rules: Rules,
+        batch: tuple[int, ...],
+        action_format: ActionFormat,
+        make_fleet: Callable[[int, Rules], Any] | None = None,
+    ) -> None:
         if action_format not in ("dict", "tuple"):
             raise ValueError(f"BoatDock: action_format={action_format!r}, but must be dict or tuple")
-        self.env = env
+        num_boats = batch[0] if batch else 1
+        task.check_arguments(num_boats, rules)
+        self.num_boats = num_boats
         self.is_reset = False
-        self.action_space = action_space(env.has_choice, action_format)
-        self.observation_space = observation_space(env.rules)
+        self.has_choice = rules.controller == "choose"
+        self.action_space = action_space(self.has_choice, action_format)
+        self.observation_space = observation_space(rules)
+        self._fleet: Any = Fleet(num_boats, rules, first_env=0) if make_fleet is None else make_fleet(num_boats, rules)
         self._batch = batch
         self._is_tuple = action_format == "tuple"
-        self._leaf_names = ("option", "key", "duration") if env.has_choice else ("key", "duration")
+        self._leaf_names = ("option", "key", "duration") if self.has_choice else ("key", "duration")
+        self._leaf_set = set(self._leaf_names)
 
     @property
     def state(self) -> BoatState:
         """The boats as they are."""
-        return self.env.state
+        return BoatState(*(column.copy() for column in self._fleet.columns()))
 
     def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
         """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, observation_dim]`."""
-        given = self._layout(options or {})
-        if mask is not None:
-            given["_reset"] = torch.from_numpy(mask.copy()).to(self.env.device).unsqueeze(-1)
+        columns = self._layout(options) if options else {}
         if seed is not None:
-            if options:
-                # Refuse an invalid layout before the seed changes anything.
-                self.env.reset(given.clone())
-            self.env.set_seed(seed, static_seed=True)
+            self._fleet.set_seed(seed, is_evaluation=False)
         self.is_reset = True
-        return to_numpy(self.env.reset(given)[keys.OBSERVATION])
+        readings: Readings = self._fleet.restart(mask)
+        if columns:
+            self._fleet.put(columns, mask)
+            readings = self._fleet.read()
+        return readings.observations[0]
 
-    def step(self, action: Any, ignored: np.ndarray | None = None) -> TensorDictBase:
-        """Press a key in every boat and return the next state of BoatDockEnv; `ignored` rows may hold any action."""
+    def step(self, action: Any, *, restarts: bool = False) -> After:
+        """Press a key in every boat and return what follows."""
         if not self.is_reset:
             raise gymnasium.error.ResetNeeded("step: call reset first")
-        leaves = self._leaves(action)
-        if ignored is not None:
-            for leaf in leaves.values():
-                leaf[torch.from_numpy(ignored)] = 0
-        td = TensorDict(batch_size=self.env.batch_size, device=self.env.device)
-        td[keys.DISCRETE] = leaves["key"]
-        td[keys.PARAMETERS] = leaves["duration"]
-        if self.env.has_choice:
-            td[keys.OPTION] = leaves["option"]
-        return self.env.step(td)["next"]
+        option, key, durations = self._leaves(action)
+        press = self._fleet.press_or_restart if restarts else self._fleet.press
+        result = press(option, key, durations)
+        if isinstance(result, int):
+            chosen = self._fleet.integers[kernel.CONTROLLER] if option is None else option
+            raise task.invalid_press(result, chosen[result].item(), key[result].item(), durations[result].tolist())
+        readings, rewards = result
+        return After(readings.observations[0], rewards, readings.flags[0, 1], readings.flags[0, 2])
 
-    def infos(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Return the infos, `[N]` each, and which boats are done; `score` is meaningless for the others."""
-        state = self.env.state
-        fuel = state.fuel / physics.TANK
-        values = {
-            "outcome": np.array(physics.OUTCOMES, dtype=object)[to_numpy(state.outcome)],
-            "fuel": to_numpy(fuel).astype(np.float64),
-            "presses": to_numpy(state.presses).astype(np.int64),
-            "controller": to_numpy(state.controller).astype(np.int64),
-            "score": to_numpy(harbour.score(state.outcome, fuel)).astype(np.float64),
+    @property
+    def is_over(self) -> np.ndarray:
+        """Which episodes are over, bool `[N]`."""
+        return self._fleet.integers[kernel.OUTCOME] != task.SAILING
+
+    def infos(self) -> dict[str, np.ndarray]:
+        """Return the infos, `[N]` each; `score` is meaningless where the episode is not over."""
+        integers = self._fleet.integers
+        fuel = (self._fleet.floats[kernel.FUEL] / _TANK).astype(np.float64)
+        outcome = integers[kernel.OUTCOME]
+        return {
+            "outcome": _OUTCOME_NAMES[outcome],
+            "fuel": fuel,
+            "presses": integers[kernel.PRESSES].astype(np.int64),
+            "controller": integers[kernel.CONTROLLER].astype(np.int64),
+            "score": np.where(outcome == task.SUCCESS, task.SUCCESS_REWARD * fuel, task.FAILURE_REWARD),
         }
-        return values, to_numpy(state.outcome != physics.SAILING)
 
-    def _layout(self, options: Mapping[str, Any]) -> TensorDict:
-        """Check the options of a reset and return them as tensors."""
+    def info(self) -> dict[str, Any]:
+        """Return the infos of the first boat as Python's numbers."""
+        controller, _, presses, outcome, _ = self._fleet.integers[:, 0].tolist()
+        fuel = float(self._fleet.floats[kernel.FUEL, 0] / _TANK)
+        values = {"outcome": task.OUTCOMES[outcome], "fuel": fuel, "presses": presses, "controller": controller}
+        if outcome != task.SAILING:
+            values["score"] = task.SUCCESS_REWARD * fuel if outcome == task.SUCCESS else task.FAILURE_REWARD
+        return values
+
+    def _layout(self, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """Check the options of a reset and return the columns of the state that they set."""
         unknown = set(options) - set(_OPTION_SHAPES)
         if unknown:
             raise ValueError(f"reset: unknown options {sorted(unknown)}; allowed: {', '.join(_OPTION_SHAPES)}")
         missing = {"start", "goal"} - set(options)
-        if options and missing:
+        if missing:
             raise ValueError(f"reset: options {sorted(options)} lack {sorted(missing)}: a layout has both points")
         given = {}
         for name, value in options.items():
             shape = _OPTION_SHAPES[name]
-            given[name] = self._tensor(f"reset: {name}", value, shape, is_integer=shape == ())
-        return TensorDict(given, batch_size=[self.env.num_envs], device=self.env.device)
+            array = as_array(f"reset: {name}", value, self._batch + shape, is_integer=shape == ())
+            given[name] = array.reshape(self.num_boats, *shape)
+        return layout_columns(given, self.num_boats, has_choice=self.has_choice)
 
-    def _leaves(self, action: Any) -> dict[str, torch.Tensor]:
-        """Check the structure, types and shapes of an action and return its leaves, `[N, ...]` each."""
-        names = ", ".join(self._leaf_names)
+    def _leaves(self, action: Any) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+        """Check the structure, types and shapes of an action and return options, keys and durations."""
         if self._is_tuple:
-            if not isinstance(action, (tuple, list)) or len(action) != len(self._leaf_names):
-                raise ValueError(f"step: the action must be a tuple ({names}), but is {describe(action)}")
-            action = dict(zip(self._leaf_names, action, strict=True))
-            durations = action["duration"]
-            if not isinstance(durations, (tuple, list)) or len(durations) != harbour.NUM_KEYS:
-                allowed = f"a tuple of length {harbour.NUM_KEYS}"
-                raise ValueError(f"step: duration must be {allowed}, but is {describe(durations)}")
-            action["duration"] = np.concatenate(
-                [as_array("step: duration", d, (*self._batch, 1)) for d in durations], axis=-1
-            )
-        elif not isinstance(action, Mapping) or set(action) != set(self._leaf_names):
+            action = self._named(action)
+        elif not isinstance(action, dict | Mapping) or action.keys() != self._leaf_set:
+            names = ", ".join(self._leaf_names)
             raise ValueError(f"step: the action must be a dict with keys {names}, but is {describe(action)}")
-        leaves = {"duration": self._tensor("step: duration", action["duration"], (harbour.NUM_KEYS,))}
-        for name in self._leaf_names[:-1]:
-            leaves[name] = self._tensor(f"step: {name}", action[name], (), is_integer=True)
-        return leaves
+        durations = as_array("step: duration", action["duration"], (*self._batch, task.NUM_KEYS))
+        option = self._integers("option", action["option"]) if self.has_choice else None
+        if durations.dtype != np.float32 or not durations.flags.c_contiguous:
+            durations = np.ascontiguousarray(durations, np.float32)
+        durations = durations if self._batch else durations.reshape(1, task.NUM_KEYS)
+        return option, self._integers("key", action["key"]), durations
 
-    def _tensor(self, name: str, value: Any, shape: tuple[int, ...], is_integer: bool = False) -> torch.Tensor:
-        array = as_array(name, value, self._batch + shape, is_integer=is_integer).astype(
-            np.int64 if is_integer else np.float64
+    def _named(self, action: Any) -> dict[str, Any]:
+        """Return an action of nested tuples by the names of its leaves."""
+        if not isinstance(action, (tuple, list)) or len(action) != len(self._leaf_names):
+            names = ", ".join(self._leaf_names)
+            raise ValueError(f"step: the action must be a tuple ({names}), but is {describe(action)}")
+        named = dict(zip(self._leaf_names, action, strict=True))
+        durations = named["duration"]
+        if not isinstance(durations, (tuple, list)) or len(durations) != task.NUM_KEYS:
+            allowed = f"a tuple of length {task.NUM_KEYS}"
+            raise ValueError(f"step: duration must be {allowed}, but is {describe(durations)}")
+        named["duration"] = np.concatenate(
+            [as_array("step: duration", d, (*self._batch, 1)) for d in durations], axis=-1
         )
-        tensor = torch.from_numpy(array).reshape(self.env.num_envs, *shape)
-        return tensor if is_integer else tensor.to(torch.float32)
+        return named
+
+    def _integers(self, name: str, value: Any) -> np.ndarray:
+        array = as_array(f"step: {name}", value, self._batch, is_integer=True)
+        if array.dtype != np.int64 or not array.flags.c_contiguous:
+            array = np.ascontiguousarray(array, np.int64)
+        return array if self._batch else array.reshape(1)

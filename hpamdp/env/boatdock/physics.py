@@ -17,18 +17,22 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-HARBOUR_RADIUS = 120.0
-DOCK_RADIUS = 15.0
-GLIDE = 0.95  # length and duration of the glide, as multiples of those of the pressed stretch
-DOCKING_SPEED = 74.0  # px/s, the highest speed of arrival that docks
-TANK = 6.0  # seconds of pressing in a full tank
-MAX_DURATION = 2.0  # seconds
-
-SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(6)
-OUTCOMES = ("sailing", "success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit")
-
-# With less fuel than this (seconds) the tank counts as empty: the rest is rounding in float32.
-_DRY = 1e-6
+from hpamdp.env.boatdock.task import (
+    DOCK_RADIUS,
+    DOCKING_SPEED,
+    DRY,
+    GLIDE,
+    HARBOUR_RADIUS,
+    MAX_DURATION,
+    OUT_OF_BOUNDS,
+    OUT_OF_FUEL,
+    OUTCOMES,
+    SAILING,
+    SUCCESS,
+    TANK,
+    TIME_LIMIT,
+    TOO_FAST,
+)
 
 
 class Press(NamedTuple):
@@ -126,7 +130,7 @@ def press(
     virtual = torch.minimum(virtual, duration)
     burnt = torch.where(in_glide, duration, virtual)
     left = fuel - burnt
-    left = torch.where(left > _DRY, left, 0.0)
+    left = torch.where(left > DRY, left, 0.0)
 
     docked = torch.where(speed(virtual) <= DOCKING_SPEED, SUCCESS, TOO_FAST)
     rested = torch.where(left > 0.0, SAILING, OUT_OF_FUEL)

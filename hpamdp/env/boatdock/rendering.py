@@ -11,6 +11,7 @@ import numpy as np
 from PIL import Image
 
 from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
 
 _WATER = "#d6e7ec"
@@ -176,3 +177,13 @@ def _write_labels(canvas: Canvas, scene: Scene) -> None:
         canvas.write((462.0, 463.0), scene.outcome.replace("_", " "), colour, 16.0, anchor="rm")
         if scene.score is not None:
             canvas.write((462.0, 441.0), f"score {scene.score:.2f}", INK, anchor="rm")
+
+
+def leg(before: BoatState, after: BoatState) -> Leg:
+    """Return the track of the press between two states of one boat."""
+    start = (before.x.item(), before.y.item())
+    end = (after.x.item(), after.y.item())
+    # The fuel burnt is the time that the key was down, after noise and with what was left in the tank.
+    pressed = physics.pressed_distance(before.fuel - after.fuel).item()
+    length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
+    return Leg(start, end, min(pressed / length, 1.0) if length > 0.0 else 1.0)

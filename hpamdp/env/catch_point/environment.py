@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.catch_point import rules
+from hpamdp.env.catch_point import kernel, rules
 from hpamdp.env.catch_point.rules import CatchPointState
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.point_env import PointEnv
@@ -84,6 +84,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         self.catches = catches
         self.late_end = late_end
         self.progress = progress
+        self._use_kernel(kernel.advance, CatchPointEnv, [catches, late_end, progress])
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

@@ -19,7 +19,7 @@ from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.goal import rendering, rules
+from hpamdp.env.goal import kernel, rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
 
 Slip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]  # the last is Hard Goal's alone
@@ -109,6 +109,14 @@ class GoalEnv(CounterEnv[GoalState]):
         if compile_rules:
             self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
             self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
+        self._is_compiled = compile_rules
+        repairs = ("kick_to", "goal_distance", "keeper_projection", "middle_shots")
+        is_hard = self.parameter_dims != rules.PARAMETER_DIMS
+        self._use_kernel(
+            kernel.advance,
+            GoalEnv,
+            [noise, self._is_scaled, *(repair in self.repaired for repair in repairs), is_hard],
+        )
 
     def start(self, episode: Tensor, rng: Key) -> GoalState:
         """Return the states in which episodes begin."""

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.gym_hybrid import rules
+from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
 from hpamdp.env.point_env import PointEnv
 
@@ -51,6 +51,7 @@ class _VehicleEnv(PointEnv[VehicleState]):
             oracle=oracle,
             compile_rules=compile_rules,
         )
+        self._use_kernel(kernel.advance, _VehicleEnv, [self.slides])
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hpamdp.env import point_agent
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.hard_move import rules
+from hpamdp.env.hard_move import kernel, rules
 from hpamdp.env.hard_move.rules import HardMoveState
 from hpamdp.env.point_env import PointEnv
 
@@ -88,6 +88,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
             oracle=oracle,
             compile_rules=compile_rules,
         )
+        self._use_kernel(kernel.advance, HardMoveEnv, motions.flatten().tolist())
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

@@ -16,7 +16,7 @@ from torch import Tensor
 from hpamdp.env import counter_rng
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.platform import rendering, rules
+from hpamdp.env.platform import kernel, rendering, rules
 from hpamdp.env.platform.rules import PlatformState
 
 
@@ -70,6 +70,7 @@ class PlatformEnv(CounterEnv[PlatformState]):
             first_env=first_env,
         )
         self.noise = noise
+        self._use_kernel(kernel.advance, PlatformEnv, [noise])
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return constants: run 3, hop 10, leap 400."""

@@ -1,0 +1,88 @@
+"""The rules of Catch Point for one row, and the loop over all rows that Numba compiles.
+
+It states what `rules` says of columns, for the CPU alone; a test compares the two.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import int32
+
+from hpamdp.env import kernels, point_kernel
+from hpamdp.env.catch_point import rules
+from hpamdp.env.kernels import ONE, ZERO, kernel, part, sin_cos
+
+CATCHES, LATE_END, PROGRESS = range(kernels.OWN, kernels.OWN + 3)  # the problem's own settings
+
+_MISSES, _STEPS, _OUTCOME, _EPISODE = range(4)
+
+_F = np.float32
+_FORCE, _PI, _SIX, _TWELVE = _F(rules._FORCE), _F(math.pi), _F(6.0), _F(12.0)
+
+
+@part
+def _act(floats: Any, integers: Any, row: Any, action: Any, given: Any, settings: Any) -> Any:
+    """Take an action in a row and return its outcome and reward: `rules.act`."""
+    is_catch = action == rules.CATCH
+    force = ZERO if is_catch else _FORCE
+    sin, cos = sin_cos(_PI * given)
+    squared = point_kernel.move(floats, row, force * sin, force * cos)
+    misses = integers[_MISSES, row]
+    has_catches = misses < settings[CATCHES]
+    is_hit = is_catch & has_catches & (squared <= point_kernel.HIT)
+    if is_catch and has_catches and not is_hit:
+        misses += 1
+    integers[_MISSES, row] = misses
+    reward = (point_kernel.CATCH_REWARD if is_hit else ZERO) - squared if has_catches else ZERO
+    is_lost = not has_catches if settings[LATE_END] != 0.0 else misses >= settings[CATCHES]
+    return rules.CAUGHT if is_hit else (rules.NO_CATCHES_LEFT if is_lost else rules.GOING_ON), reward
+
+
+@kernel
+def advance(
+    floats: Any,
+    integers: Any,
+    discrete: Any,
+    parameters: Any,
+    places: Any,
+    bounds: Any,
+    mask: Any,
+    settings: Any,
+    mode: Any,
+    observations: Any,
+    outcomes: Any,
+    flags: Any,
+    rewards: Any,
+) -> int:
+    """Act or restart in every row, in place; see `hpamdp.env.rows`."""
+    invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
+    if invalid >= 0:
+        return invalid
+    stream = int32(settings[kernels.EPISODE_STREAM])
+    base, step = kernels.stream_key(settings[kernels.SEED], stream), kernels.stream_step(stream)
+    for row in range(len(mask)):
+        was_over = integers[_OUTCOME, row] != rules.GOING_ON
+        if mode != kernels.RESTART and mask[row] and not was_over:
+            action, steps = discrete[row], integers[_STEPS, row] + 1
+            given = kernels.parameter(parameters, row, 0, action, places, bounds)
+            outcome, rewards[row] = _act(floats, integers, row, action, given, settings)
+            if outcome == rules.GOING_ON and steps >= settings[kernels.MAX_STEPS]:
+                outcome = rules.TIME_LIMIT
+            integers[_STEPS, row], integers[_OUTCOME, row] = steps, outcome
+        for reading in range(len(observations)):
+            if kernels.must_restart(mode, reading, was_over, integers[_OUTCOME, row], mask[row]):
+                integers[_EPISODE, row] += 1
+                integers[_STEPS, row], integers[_OUTCOME, row] = 0, rules.GOING_ON
+                bits = kernels.episode_key(base, int32(settings[kernels.FIRST_ENV]) + row, integers[_EPISODE, row])
+                integers[_MISSES, row] = 0
+                point_kernel.start(floats, row, bits, step)
+            point_kernel.observe(floats, row, observations[reading, row])
+            if settings[PROGRESS] != 0.0:
+                misses = min(integers[_MISSES, row], rules.PUBLISHED_CATCHES)
+                observations[reading, row, 4] = _F(misses) / _SIX - ONE
+                observations[reading, row, 5] = _F(integers[_STEPS, row]) / _TWELVE - ONE
+            kernels.report(integers[_OUTCOME, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+    return -1

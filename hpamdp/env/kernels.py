@@ -1,0 +1,191 @@
+"""Kernels: loops over the rows of a batch that Numba compiles for one core of the CPU.
+
+The rules of a problem are tensor functions, which run on CPU and CUDA, compile and differentiate. Eagerly each of their
+operations reads and writes whole columns, and costs microseconds even for one row. A kernel states the same rules for
+one row and takes all rows through a whole step, so that one environment and a million are both fast. A test compares
+the two.
+
+Random numbers are those of `counter_rng`, bit for bit. Machine code is kept on disk, so that only the first run on a
+machine compiles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import int32, njit, uint32
+
+from hpamdp.env.streams import STEPS
+
+_STREAM_STEPS = tuple(step & 0xFFFFFFFF for step in STEPS)
+# The multipliers of `counter_rng`.
+_FIRST, _SECOND = np.uint32(0x7FEB352D), np.uint32(0x846CA68B)
+_MASK = 0xFFFFFFFF
+
+ZERO, HALF, ONE, TWO = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(2.0)
+TURN = np.float32(2.0 * math.pi)
+_UNIT = np.float32(2.0**-23)
+_MINUS_TWO = np.float32(-2.0)
+
+# Of cos and sin: 2/pi, and pi/2 in two parts, so that the remainder is exact. The series are as in Cephes.
+_QUARTERS = np.float32(2.0 / math.pi)
+_QUARTER_HIGH = np.float32(1.5703125)
+_ROUNDING = np.float32(1.5 * 2.0**23)  # added and taken away again, it rounds to an integer
+_QUARTER_LOW = np.float32(math.pi / 2.0 - 1.5703125)
+_SIN_3, _SIN_5, _SIN_7 = np.float32(-1.6666654611e-1), np.float32(8.3321608736e-3), np.float32(-1.9515295891e-4)
+_COS_4, _COS_6, _COS_8 = np.float32(4.1666645683e-2), np.float32(-1.3887316255e-3), np.float32(2.4433157118e-5)
+
+
+@cache
+def _sources() -> tuple[str]:
+    """Return a hash of all sources that kernels are made from."""
+    digest = sha256()
+    for path in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return (digest.hexdigest(),)
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compile a function at its first call and keep the machine code on disk; division by 0 is as in NumPy."""
+    try:
+        compiled: Any = njit(function, cache=True, error_model="numpy", nogil=True)
+    except RuntimeError:  # there is no folder for it
+        return njit(function, error_model="numpy", nogil=True)
+    # Numba keeps the code for as long as the function's own file is unchanged, even if it calls functions of others.
+    compiled._cache._cache_file._source_stamp = _sources()
+    return compiled
+
+
+def part(function: Callable[..., Any]) -> Any:
+    """Compile a function that kernels call for many rows."""
+    return njit(function, error_model="numpy", nogil=True)
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Compile a function that kernels call for one row; inlined, since a loop with a call is not vectorised."""
+    return njit(function, error_model="numpy", nogil=True, forceinline=True)
+
+
+def folded(seed: int) -> int:
+    """Fold an integer of any size into 32 bits, as `counter_rng.seed_tensor` does."""
+    return (seed ^ (seed >> 32)) & _MASK
+
+
+@inlined
+def _mix(h: Any) -> Any:
+    h = uint32(h)
+    h = uint32(uint32(h ^ (h >> uint32(16))) * _FIRST)
+    h = uint32(uint32(h ^ (h >> uint32(15))) * _SECOND)
+    return uint32(h ^ (h >> uint32(16)))
+
+
+@inlined
+def stream_key(seed: Any, stream: Any) -> Any:
+    """Return what a folded seed and a stream contribute to the keys of all episodes."""
+    return _mix(uint32(seed) ^ uint32(0x2545F491 + 0x01234567 * stream))
+
+
+@inlined
+def stream_step(stream: Any) -> Any:
+    """Return the step of a stream, which `uniform` takes."""
+    return uint32(_STREAM_STEPS[stream])
+
+
+@inlined
+def episode_key(key: Any, environment: Any, episode: Any) -> Any:
+    """Return the bits of an episode's key, from a `stream_key`."""
+    return _mix(_mix(key ^ uint32(environment)) ^ uint32(episode))
+
+
+@inlined
+def uniform(bits: Any, step: Any, index: Any) -> Any:
+    """Return float32 in (0, 1): number `index` of a key."""
+    drawn = _mix(uint32(bits + uint32(uint32(index) * step))) >> uint32(9)
+    return (np.float32(int32(drawn)) + HALF) * _UNIT
+
+
+@inlined
+def normal(bits: Any, step: Any, index: Any) -> Any:
+    """Return a standard normal float32, from the uniform numbers `2 index` and `2 index + 1`."""
+    radius = math.sqrt(_MINUS_TWO * math.log(uniform(bits, step, 2 * index)))
+    return radius * math.cos(TURN * uniform(bits, step, 2 * index + 1))
+
+
+@inlined
+def sin_cos(angle: Any) -> Any:
+    """Return sine and cosine of a float32 angle of a few turns, to float32 accuracy; without a branch or a call."""
+    quarters = (angle * _QUARTERS + _ROUNDING) - _ROUNDING
+    rest = (angle - quarters * _QUARTER_HIGH) - quarters * _QUARTER_LOW
+    square = rest * rest
+    sine = rest + rest * square * (_SIN_3 + square * (_SIN_5 + square * _SIN_7))
+    cosine = ONE - HALF * square + square * square * (_COS_4 + square * (_COS_6 + square * _COS_8))
+    quadrant = int32(quarters)
+    swapped = quadrant & 1 != 0
+    of_sine = cosine if swapped else sine
+    of_cosine = sine if swapped else cosine
+    return (-of_sine if quadrant & 2 != 0 else of_sine), (-of_cosine if (quadrant + 1) & 2 != 0 else of_cosine)
+
+
+# What the kernels of all `CounterEnv`s share: the modes, the first places in their settings, and the last rows of their
+# integers.
+ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
+SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, OWN = range(6)
+STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1
+
+
+@part
+def invalid_row(discrete: Any, parameters: Any, places: Any, integers: Any, mode: Any) -> Any:
+    """Return the first row whose action is unknown or has a parameter that is not finite, or -1.
+
+    Args:
+        discrete: int64 `[N]`.
+        parameters: float32 `[N, P]`, of all actions, side by side.
+        places: int64 `[K + 1]`; the parameters of action k are those from `places[k]` to `places[k + 1]`.
+        integers: of the state.
+        mode: with ACT_OR_RESTART, rows that start anew may have any action; with RESTART, all.
+    """
+    if mode == RESTART:
+        return -1
+    for row in range(len(discrete)):
+        is_valid = (discrete[row] >= 0) & (discrete[row] < len(places) - 1)
+        if is_valid:
+            for place in range(places[discrete[row]], places[discrete[row] + 1]):
+                is_valid &= math.isfinite(parameters[row, place])
+        if not is_valid and not (mode == ACT_OR_RESTART and integers[len(integers) + OUTCOME_ROW, row] != 0):
+            return row
+    return -1
+
+
+@inlined
+def parameter(parameters: Any, row: Any, number: Any, action: Any, places: Any, bounds: Any) -> Any:
+    """Return a parameter of the chosen action, clipped to its bounds `[2, P]`; 0 where it has none of this number."""
+    place = places[action] + number
+    if place >= places[action + 1]:
+        return ZERO
+    return min(max(parameters[row, place], bounds[0, place]), bounds[1, place])
+
+
+@inlined
+def report(outcome: Any, num_outcomes: Any, row: Any, outcomes: Any, flags: Any) -> None:
+    """Write an outcome int64 `[N]` and the flags bool `[3, N]`: done, terminated, truncated."""
+    outcomes[row] = outcome
+    is_late = outcome == num_outcomes - 1
+    flags[0, row] = outcome != 0
+    flags[1, row] = (outcome != 0) & (not is_late)
+    flags[2, row] = is_late
+
+
+@inlined
+def must_restart(mode: Any, reading: Any, was_over: Any, outcome: Any, is_marked: Any) -> Any:
+    """Return whether a row starts anew before a reading, given how its episode was before the action and is now."""
+    if mode == RESTART:
+        return is_marked
+    if mode == ACT_OR_RESTART:
+        return was_over
+    return (reading == 1) & (outcome != 0)

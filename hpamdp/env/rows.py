@@ -1,0 +1,131 @@
+"""The rows of a `CounterEnv` as NumPy arrays that a kernel moves; see `hpamdp.env.kernels`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from hpamdp.env import kernels
+from hpamdp.env.kernels import ACT, ACT_AND_RESTART, ACT_OR_RESTART, RESTART
+
+# Moves all rows; its arguments are those of `Rows.advance`, in this order.
+Advance = Callable[..., int]
+
+
+class Results(NamedTuple):
+    """What R readings of N rows say; R is 2 where rows that are over started anew, before and after that.
+
+    `observations` float32 `[R, N, D]`, `outcomes` int64 `[R, N]`, `flags` bool `[R, 3, N]` (done, terminated,
+    truncated) and `rewards` float32 `[N]`.
+    """
+
+    observations: np.ndarray
+    outcomes: np.ndarray
+    flags: np.ndarray
+    rewards: np.ndarray
+
+
+class Rows:
+    """The state of N rows, and the kernel that moves them.
+
+    Args:
+        advance: the kernel of the problem.
+        num_rows: N.
+        num_columns: how many float32 and how many int32 columns the state has.
+        observation_dim: D.
+        parameter_dims: number of parameters of each discrete action.
+        bounds: lowest and highest values of all parameters, `[2, P]`.
+        settings: MAX_STEPS and the problem's own.
+        first_env: number of the first row, where other processes have those before it.
+    """
+
+    def __init__(
+        self,
+        advance: Advance,
+        num_rows: int,
+        *,
+        num_columns: tuple[int, int],
+        observation_dim: int,
+        parameter_dims: Sequence[int],
+        bounds: np.ndarray,
+        settings: Sequence[float],
+        first_env: int,
+    ) -> None:
+        self.floats = np.zeros((num_columns[0], num_rows), np.float32)
+        self.integers = np.zeros((num_columns[1], num_rows), np.int32)
+        self._advance = advance
+        self._num_rows = num_rows
+        self._observation_dim = observation_dim
+        self._places = np.concatenate([[0], np.cumsum(parameter_dims)]).astype(np.int64)
+        self._bounds = np.ascontiguousarray(bounds, np.float32)
+        self._settings = np.array([0.0, 0.0, 0.0, first_env, *settings])
+        self._all = np.ones(num_rows, np.bool_)
+        self._no_discrete = np.zeros(num_rows, np.int64)
+        self._no_parameters = np.zeros((num_rows, sum(parameter_dims)), np.float32)
+
+    def set_seed(self, seed: int, streams: tuple[int, int]) -> None:
+        """Set the seed and the streams of episodes and of noise."""
+        self._settings[kernels.SEED] = kernels.folded(seed)
+        self._settings[kernels.EPISODE_STREAM], self._settings[kernels.NOISE_STREAM] = streams
+
+    def act(
+        self,
+        discrete: np.ndarray,
+        parameters: np.ndarray,
+        *,
+        mask: np.ndarray | None = None,
+        restarts: bool = False,
+    ) -> Results | int:
+        """Take an action in every row; those whose episode is over stay as they are.
+
+        Args:
+            discrete: int64 `[N]`.
+            parameters: float32 `[N, P]`, of all discrete actions, side by side.
+            mask: bool `[N]`, the rows that move; all by default.
+            restarts: read the rows, start new episodes where they are over, and read them again.
+
+        Returns:
+            The results, or the number of the first row whose action is invalid, where nothing has changed.
+        """
+        return self.advance(ACT_AND_RESTART if restarts else ACT, discrete, parameters, mask)
+
+    def act_or_restart(self, discrete: np.ndarray, parameters: np.ndarray) -> Results | int:
+        """Take an action, and instead start a new episode where one is over; actions are not read there."""
+        return self.advance(ACT_OR_RESTART, discrete, parameters, None)
+
+    def restart(self, mask: np.ndarray | None = None) -> Results:
+        """Start new episodes, in the rows of `mask` bool `[N]` or in all."""
+        results = self.advance(RESTART, self._no_discrete, self._no_parameters, mask)
+        assert not isinstance(results, int)
+        return results
+
+    def read(self) -> Results:
+        """Return what is observed."""
+        return self.restart(~self._all)
+
+    def advance(
+        self, mode: int, discrete: np.ndarray, parameters: np.ndarray, mask: np.ndarray | None
+    ) -> Results | int:
+        """Call the kernel."""
+        num_readings, n = 2 if mode == ACT_AND_RESTART else 1, self._num_rows
+        results = Results(
+            np.empty((num_readings, n, self._observation_dim), np.float32),
+            np.empty((num_readings, n), np.int64),
+            np.empty((num_readings, 3, n), np.bool_),
+            np.zeros(n, np.float32),
+        )
+        invalid = self._advance(
+            self.floats,
+            self.integers,
+            discrete,
+            parameters,
+            self._places,
+            self._bounds,
+            self._all if mask is None else mask,
+            self._settings,
+            mode,
+            *results,
+        )
+        return results if invalid < 0 else invalid

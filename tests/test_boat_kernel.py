@@ -1,0 +1,197 @@
+"""The kernel that moves boats on the CPU against the tensor functions, which are the truth."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+
+from hpamdp import keys
+from hpamdp.env import counter_rng, kernels
+from hpamdp.env.boatdock import episode, physics
+from hpamdp.env.boatdock.environment import BoatDockEnv
+
+POSITIONS = ("start_x", "start_y", "goal_x", "goal_y", "x", "y")
+SETTINGS = {
+    "controller": st.sampled_from(["choose", "congruent", "incongruent", "random"]),
+    "keymap": st.sampled_from([1, 2, "random"]),
+    "reward": st.sampled_from(["paper", "sparse"]),
+    "observation": st.sampled_from(["scaled", "pixels"]),
+    "motor_noise": st.sampled_from([0.0, 0.2, [0.1, 0.0], [0.0, 0.3]]),
+    "sensor_noise": st.sampled_from([0.0, 3.0]),
+    "slip": st.sampled_from([0.0, 0.3, 1.0]),
+}
+
+
+def random_action(num_envs: int, generator: torch.Generator) -> dict:
+    """Return presses of which many are short, so that episodes last, and some are out of their bounds."""
+    durations = 2.4 * torch.rand(num_envs, 3, generator=generator).pow(3) - 0.05
+    return {
+        keys.OPTION: torch.randint(2, (num_envs,), generator=generator),
+        keys.DISCRETE: torch.randint(3, (num_envs,), generator=generator),
+        keys.PARAMETERS: durations,
+    }
+
+
+def compare(state, expected, same):
+    """Assert that two states are the same in the rows of `same`, up to rounding."""
+    for name, column, right in zip(state._fields, state, expected, strict=True):
+        column, right = column[same], right[same]
+        if name in POSITIONS:
+            assert (column - right).abs().max() <= 1e-4, name
+        elif column.is_floating_point():
+            assert torch.allclose(column, right, atol=2e-3 if "velocity" in name else 2e-5, rtol=1e-5), name
+        else:
+            assert torch.equal(column, right), name
+
+
+def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, **rules) -> tuple[set[int], int]:
+    """Compare `num_steps` steps and resets with the tensor functions; return the outcomes met and the rows that differ.
+
+    Rows may differ where an event, or whether a layout is too near, is a tie to within rounding.
+    """
+    env = BoatDockEnv(num_envs, seed=seed, first_env=7, **rules)
+    if is_evaluation:
+        env.seed_evaluation(seed)
+    td = env.reset()
+    arguments = env._seed, env._environment, env.rules
+    generator = torch.Generator().manual_seed(seed)
+    outcomes, num_different = set(), 0
+    for _ in range(num_steps):
+        action = random_action(num_envs, generator)
+        before = env.state
+        chosen = action[keys.OPTION] if env.has_choice else before.controller
+        moved, reward, _ = episode.step(before, chosen, action[keys.DISCRETE], action[keys.PARAMETERS], *arguments)
+        for name, leaf in action.items():
+            if name != keys.OPTION or env.has_choice:
+                td[name] = leaf
+        td, root = env.step_and_maybe_reset(td)
+        after = td["next"]
+        same = after[keys.OUTCOME] == moved.outcome
+        num_different += int((~same).sum())
+        reading = episode.read(moved, *arguments)
+        for name in ("observation", "fuel", "done", "terminated", "truncated"):
+            left, right = after[name][same].float(), getattr(reading, name)[same].float()
+            assert torch.allclose(left, right, atol=1e-3 if rules["observation"] == "pixels" else 3e-5), name
+        assert torch.allclose(after[keys.REWARD][same, 0], reward[same], atol=1e-5)
+        # What starts anew is compared from the same state, too.
+        done = after[keys.DONE][:, 0]
+        fresh = episode.reset(moved, done, *arguments)
+        is_other_try = (env.state.start_x - fresh.start_x).abs() > 1.0
+        num_different += int((is_other_try & same).sum())
+        same = same & ~is_other_try
+        compare(env.state, fresh, same)
+        again = episode.read(fresh, *arguments).observation
+        assert torch.allclose(
+            root["observation"][same], again[same], atol=1e-3 if rules["observation"] == "pixels" else 3e-5
+        )
+        outcomes |= set(after[keys.OUTCOME].tolist())
+        td = root
+    return outcomes, num_different
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 2**31 - 1), is_evaluation=st.booleans(), rules=st.fixed_dictionaries(SETTINGS))
+def test_the_kernel_does_what_the_tensor_functions_do_with_all_settings(seed, is_evaluation, rules):
+    _, num_different = play(300, 6, seed, is_evaluation, **rules)
+    assert num_different <= 1
+
+
+@pytest.mark.parametrize("num_envs", [1, 127, 128, 129])
+def test_blocks_of_any_size_are_whole(num_envs):
+    play(num_envs, 4, 3, controller="choose", observation="scaled")
+
+
+def test_all_outcomes_come_up_in_the_comparison():
+    outcomes, _ = play(3000, 30, 1, controller="choose", observation="scaled")
+    assert outcomes >= set(range(physics.TIME_LIMIT))
+
+
+def test_a_time_limit_is_the_tensor_functions_one():
+    env = BoatDockEnv(2)
+    td = env.reset()
+    for _ in range(episode.MAX_PRESSES):
+        for name in (keys.OPTION, keys.DISCRETE):
+            td[name] = torch.zeros(2, dtype=torch.long)
+        td[keys.PARAMETERS] = torch.zeros(2, 3)
+        td, root = env.step_and_maybe_reset(td)
+        last, td = td, root
+    assert last["next", keys.TRUNCATED].all() and not last["next", keys.TERMINATED].any()
+    assert (last["next", keys.OUTCOME] == physics.TIME_LIMIT).all()
+
+
+@pytest.mark.slow
+def test_a_million_random_steps_agree():
+    _, num_different = play(100_000, 10, 5, controller="random", observation="scaled", slip=0.1, motor_noise=0.1)
+    assert num_different <= 20
+
+
+def test_random_numbers_are_the_same_bit_for_bit():
+    @njit
+    def draw(seed, stream, environments, episodes, drawn):
+        key, step = kernels.stream_key(seed, stream), kernels.stream_step(stream)
+        for row in range(len(environments)):
+            bits = kernels.episode_key(key, environments[row], episodes[row])
+            for index in range(drawn.shape[1]):
+                drawn[row, index] = kernels.uniform(bits, step, index)
+
+    rng = np.random.default_rng(0)
+    environments, episodes = (rng.integers(-1, 2**31 - 1, 2000).astype(np.int32) for _ in range(2))
+    drawn = np.empty((2000, 30), np.float32)
+    for seed in (0, 1, -3, 2**40 + 7):
+        for stream in range(4):
+            draw(kernels.folded(seed), stream, environments, episodes, drawn)
+            where = torch.from_numpy(environments), torch.from_numpy(episodes)
+            key = counter_rng.key_for(counter_rng.seed_tensor(seed), stream, *where)
+            right = torch.stack([counter_rng.uniform(key, index) for index in range(30)], -1)
+            assert np.array_equal(drawn, right.numpy())
+
+
+def test_a_state_that_was_read_does_not_change_with_the_boats():
+    env = BoatDockEnv(3)
+    td = env.reset()
+    state, saved = env.state, env.env_state()
+    env.step(env.rand_action(td))
+    assert (state.presses == 0).all() and (saved["presses"] == 0).all() and (env.state.presses == 1).all()
+
+
+def test_the_step_with_a_reset_returns_what_torchrls_own_does():
+    fast, slow = BoatDockEnv(200, seed=2), BoatDockEnv(200, seed=2)
+    one, other = fast.reset(), slow.reset()
+    for _ in range(5):
+        action = fast.rand_action(one.clone()).select(keys.OPTION, keys.ACTION)
+        fast_step, one = fast.step_and_maybe_reset(one.update(action))
+        # An entry that the environment does not know takes TorchRL's way.
+        slow_step, other = slow.step_and_maybe_reset(other.update(action).set("mark", torch.zeros(200)))
+        other = other.exclude("mark")
+        assert set(fast_step.keys(True)) == set(slow_step.exclude("mark").keys(True))
+        assert set(one.keys(True)) == set(other.keys(True))
+        assert (fast_step == slow_step.exclude("mark")).all() and (one == other).all()
+
+
+def test_durations_that_require_gradients_get_them():
+    env = BoatDockEnv(4, controller="congruent")
+    td = env.reset()
+    td[keys.DISCRETE] = torch.zeros(4, dtype=torch.long)
+    td[keys.PARAMETERS] = torch.full((4, 3), 0.3, requires_grad=True)
+    env.step(td)["next", "observation"].sum().backward()
+    assert td[keys.PARAMETERS].grad[:, 0].abs().min() > 0.0
+
+
+def test_a_boat_for_gymnasium_needs_no_torch():
+    code = (
+        "import sys, gymnasium, hpamdp; env = gymnasium.make('hpamdp/BoatDock-v0'); env.reset(seed=0);"
+        "env.step(env.action_space.sample()); assert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_change_of_any_source_compiles_kernels_anew():
+    cached = kernels.kernel(play)._cache._cache_file
+    assert cached._source_stamp == kernels._sources()

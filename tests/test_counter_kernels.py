@@ -1,0 +1,136 @@
+"""The kernels of the field's domains against their rules, the tensor functions, which are the truth."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hpamdp import keys
+from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
+from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
+from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.env.platform.environment import PlatformEnv
+
+GOAL = {
+    "observation": st.sampled_from(["scaled", "raw"]),
+    "noise": st.sampled_from([0.0, 1.0, 2.0]),
+    "max_steps": st.sampled_from([2, 100]),
+}
+GOAL_SLIPS = ["kick_to", "goal_distance", "keeper_projection"]
+# Each problem with its settings, and how far rounding may go within an action.
+PROBLEMS = {
+    "goal": (GoalEnv, {**GOAL, "repaired": st.lists(st.sampled_from(GOAL_SLIPS), unique=True)}, 5e-3),
+    "hard_goal": (
+        HardGoalEnv,
+        {**GOAL, "repaired": st.lists(st.sampled_from([*GOAL_SLIPS, "middle_shots"]), unique=True)},
+        5e-3,
+    ),
+    "platform": (
+        PlatformEnv,
+        {"noise": st.sampled_from([0.0, 1.0, 3.0]), "max_steps": st.sampled_from([2, 200])},
+        5e-3,
+    ),
+    "catch_point": (
+        CatchPointEnv,
+        {
+            "max_steps": st.sampled_from([3, 25]),
+            "catches": st.sampled_from([1, 11]),
+            "late_end": st.booleans(),
+            "progress": st.booleans(),
+        },
+        1e-5,
+    ),
+    "hard_move": (
+        HardMoveEnv,
+        {"n": st.sampled_from([4, 6]), "rounded_directions": st.booleans(), "max_steps": st.sampled_from([3, 30])},
+        1e-5,
+    ),
+    "moving": (MovingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-5),
+    "sliding": (SlidingEnv, {"max_steps": st.sampled_from([3, 201])}, 1e-4),
+}
+
+
+def play(env, num_steps: int, tolerance: float) -> tuple[set[int], int]:
+    """Compare steps and resets with the rules; return the outcomes met and how many rows differ by more than rounding.
+
+    A row may differ where a threshold is met to within rounding, as when two bodies just touch.
+    """
+    assert env._rows is not None
+    td = env.reset()
+    outcomes, num_different = set(), 0
+    for _ in range(num_steps):
+        td = env.rand_action(td)
+        before = env.state
+        moved, reward = env._advance(before, *env._read_action(td), before.outcome != 0)
+        fresh = env._restart(moved, moved.outcome != 0)
+        td, root = env.step_and_maybe_reset(td)
+        pairs = [
+            *zip(env.state, fresh, strict=True),
+            (td["next", keys.REWARD], reward.unsqueeze(-1)),
+            (td["next", "observation"], env.observe(moved)),
+            (root["observation"], env.observe(fresh)),
+            (td["next", keys.OUTCOME], moved.outcome),
+            (td["next", keys.TRUNCATED], (moved.outcome == len(env.outcomes) - 1).unsqueeze(-1)),
+            (td["next", keys.DONE], (moved.outcome != 0).unsqueeze(-1)),
+        ]
+        differs = torch.zeros(env.num_envs, dtype=torch.bool)
+        for one, other in pairs:
+            near = torch.isclose(one.double(), other.double(), rtol=1e-4, atol=tolerance)
+            differs |= ~near.reshape(env.num_envs, -1).all(-1)
+        num_different += int(differs.sum())
+        outcomes |= set(td["next", keys.OUTCOME].tolist())
+        td = root
+    return outcomes, num_different
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+@settings(max_examples=8, deadline=None)
+@given(data=st.data(), seed=st.integers(0, 2**31 - 1), is_evaluation=st.booleans())
+def test_a_kernel_does_what_the_rules_say_with_all_settings(name, data, seed, is_evaluation):
+    problem, choices, tolerance = PROBLEMS[name]
+    env = problem(300, seed=seed, first_env=5, **data.draw(st.fixed_dictionaries(choices)))
+    if is_evaluation:
+        env.seed_evaluation(seed)
+    assert play(env, 4, tolerance)[1] <= 3
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_comparison_meets_every_outcome_but_the_rarest(name):
+    problem, _, tolerance = PROBLEMS[name]
+    outcomes, num_different = play(problem(2000, seed=1, max_steps=4), 12, tolerance)
+    assert len(outcomes) >= len(problem.outcomes) - 1
+    assert num_different <= 12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_million_random_steps_agree(name):
+    problem, _, tolerance = PROBLEMS[name]
+    assert play(problem(50_000, seed=2), 20, tolerance)[1] <= 500
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_step_with_a_reset_returns_what_torchrls_own_does(name):
+    problem = PROBLEMS[name][0]
+    fast, slow = problem(100, seed=2), problem(100, seed=2)
+    one, other = fast.reset(), slow.reset()
+    for _ in range(4):
+        action = fast.rand_action(one.clone()).select(keys.ACTION)
+        fast_step, one = fast.step_and_maybe_reset(one.update(action))
+        # An entry that the environment does not know takes TorchRL's way.
+        slow_step, other = slow.step_and_maybe_reset(other.update(action).set("mark", torch.zeros(100)))
+        slow_step, other = slow_step.exclude("mark"), other.exclude("mark")
+        assert set(fast_step.keys(True)) == set(slow_step.keys(True)) and set(one.keys(True)) == set(other.keys(True))
+        assert (fast_step == slow_step).all() and (one == other).all()
+
+
+def test_a_subclass_with_rules_of_its_own_has_no_kernel():
+    class Level(GoalEnv):
+        def observe(self, state):
+            return torch.zeros_like(super().observe(state))
+
+    env = Level(2)
+    assert (env.reset()["observation"] == 0.0).all()
