@@ -3,16 +3,17 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 IS_ALLOWED := import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
 
-# Environments of their own for `make slow` and `make lowest`.
+# Environments of their own for `make slow`, `make lowest` and `make docs`.
 SLOW := .venv-slow
 RAY := .venv-ray-launcher
 LOWEST := .venv-lowest
+DOCS := .venv-docs
 
 COVERAGE := --cov=hpamdp --cov-report=term:skip-covered --cov-fail-under=90
 # The one slow test that needs the Ray launcher, which shares no environment with the others.
 RAY_TEST := test_a_killed_sweep_is_finished_by_the_same_command and ray
 
-.PHONY: run test slow slow-tests ray-launcher wheel lowest report
+.PHONY: run test slow slow-tests ray-launcher wheel lowest report docs
 
 # A first run: which boat, by UCB; how to sail it, by HyAR. More settings: make run ARGS="seed=1"
 run: $(VENV)/.installed
@@ -48,6 +49,7 @@ wheel: $(SLOW)/.installed
 	cd $(SLOW)/wheel && PYTHONPATH=site ../bin/python -c 'import hpamdp; assert "wheel/site" in hpamdp.__file__'
 	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp \
 	    high=ucb low=hyar total_frames=1024 num_envs=32 eval.layouts=10 eval.every=0
+	cd $(SLOW)/wheel && PYTHONPATH=site site/bin/hpamdp play --export page
 
 # The quick tests with the lowest versions that pyproject.toml allows.
 lowest: $(LOWEST)/.installed
@@ -56,6 +58,11 @@ lowest: $(LOWEST)/.installed
 # Figures, tables and pages of all studies, from their csv files: report/report.html
 report: $(VENV)/.installed
 	$(PYTHON) experiments/report.py
+
+# The documentation site, in site/: runs the tutorials, then builds the pages. Warnings are errors.
+docs: $(DOCS)/.installed
+	$(DOCS)/bin/python -m pytest tests/test_tutorials.py tests/test_pages.py -m 'slow or not slow' $(ARGS)
+	NO_MKDOCS_2_WARNING=1 $(DOCS)/bin/python -m mkdocs build
 
 # A python on the PATH may be a stub that does not run (pyenv) or lack venv's pip (Debian), so each is tried.
 define venv
@@ -79,7 +86,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(SLOW)/.installed: pyproject.toml constraints.txt
 	$(venv)
-	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray]'
+	$(INSTALL) -c constraints.txt -e '.[dev,sweeps,ray,browser,video]'
 	@touch $@
 
 # This launcher wants cloudpickle < 3, so it has constraints of its own; without them pip searches for an hour.
@@ -91,4 +98,9 @@ $(RAY)/.installed: pyproject.toml constraints-ray-launcher.txt
 $(LOWEST)/.installed: pyproject.toml constraints-lowest.txt
 	$(venv)
 	$(INSTALL) -c constraints-lowest.txt -e '.[dev]'
+	@touch $@
+
+$(DOCS)/.installed: pyproject.toml constraints.txt
+	$(venv)
+	$(INSTALL) -c constraints.txt -e '.[dev,docs]'
 	@touch $@

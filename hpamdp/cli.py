@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import importlib
 import itertools
 import os
 import re
@@ -36,6 +37,8 @@ _EXTRAS = {
     "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
     "hydra/sweeper": {"optuna": "optuna"},
 }
+# Commands beside that of a run, by the modules whose `main` gets the words that follow, and a parser.
+_COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play"}
 # What Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UnicodeDecodeError)
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
@@ -63,6 +66,8 @@ Examples
   {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
       the same, two at a time; needs hpamdp[joblib]
 
+  hpamdp play                      lets you play the problem yourself; hpamdp play --help
+  hpamdp watch FOLDER              films the agent of a run; hpamdp watch --help
   {program} low=hyar --cfg job     shows every value and option without running
   {program} --hydra-help           shows Hydra's own flags
 """
@@ -81,6 +86,8 @@ def main() -> None:
     # TorchRL logs every replay buffer that it fills.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     try:
+        if sys.argv[1:2] and sys.argv[1] in _COMMANDS:
+            sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
         conf = conf_dir()
         arguments = _parse()
         if arguments.help:
@@ -99,6 +106,20 @@ def main() -> None:
         _exit_with(str(error))
     except KeyboardInterrupt:
         sys.exit(_INTERRUPTED)
+
+
+def _run_command(name: str, words: list[str]) -> int:
+    """Run a command that has options of its own, and return its exit code."""
+    command = importlib.import_module(_COMMANDS[name])
+    parser = _Parser(prog=f"hpamdp {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
+    return command.main(words, parser)
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see {self.prog} --help")
 
 
 def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:

@@ -149,6 +149,7 @@ class RunConfig(BaseModel):
     checkpoint: str | None
     resume: str | None
     overwrite: bool
+    film: bool = True  # runs of earlier versions did not save it
 
     @property
     def num_frames(self) -> int:
@@ -252,12 +253,19 @@ class Config:
 
 
 def conf_dir() -> Path:
-    """Return the folder of the yaml files: inside the package where it is installed, beside it in a clone."""
+    """Return the folder of the yaml files."""
+    folder = package_dir("conf")
+    if folder is None or not (folder / "config.yaml").is_file():
+        package = Path(__file__).resolve().parent
+        raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
+    return folder
+
+
+def package_dir(name: str) -> Path | None:
+    """Return a folder that lies inside the package where it is installed, and beside it in a clone; None: neither."""
     package = Path(__file__).resolve().parent
-    for folder in (package / "conf", package.parent / "conf"):
-        if (folder / "config.yaml").is_file():
-            return folder
-    raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
+    folders = (package / name, package.parent / name)
+    return next((folder for folder in folders if folder.is_dir()), None)
 
 
 def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
@@ -291,6 +299,19 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
         _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
     return Config(run, **{group: component(group, names[group], plain[group]) for group in GROUPS})
+
+
+def compose_words(words: list[str]) -> DictConfig:
+    """Return the config of a command line's words, with its `hydra` part, outside of Hydra's own command line.
+
+    Raises:
+        ConfigError: the words cannot be composed.
+    """
+    try:
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose("config", words, return_hydra_config=True)
+    except (hydra.errors.HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(f"{' '.join(words)}: {first_line(error)}") from error
 
 
 def chosen_names(cfg: DictConfig) -> Mapping[str, str]:

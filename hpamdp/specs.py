@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.geometry import PlaneGeometry, Symmetries
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,9 @@ class PAMDPSpecs:
         initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the parameters
             in [-1, 1] that the field starts this problem with; None where there is no such convention.
         initial_bias: what it adds, `num_parameters` entries.
+        symmetries: maps under which neither dynamics nor reward change; None where the problem declares none.
+        geometry: which entries are vectors of the plane, and where the discrete actions point; None where the problem
+            declares none.
     """
 
     observation_dim: int
@@ -32,6 +36,8 @@ class PAMDPSpecs:
     parameter_high: tuple[float, ...]
     initial_weight: tuple[tuple[float, ...], ...] | None = None
     initial_bias: tuple[float, ...] | None = None
+    symmetries: Symmetries | None = field(default=None, compare=False)
+    geometry: PlaneGeometry | None = field(default=None, compare=False)
 
     @property
     def num_options(self) -> int:
@@ -81,28 +87,74 @@ class PAMDPSpecs:
         weight = self.initial_weight
         if weight is not None:
             weight = tuple((*row, *[0.0] * self.num_options) for row in weight)
-        return replace(self, observation_dim=self.observation_dim + self.num_options, initial_weight=weight)
+        dim = self.observation_dim
+        symmetries, geometry = self.symmetries, self.geometry
+        return replace(
+            self,
+            observation_dim=dim + self.num_options,
+            initial_weight=weight,
+            symmetries=None if symmetries is None else symmetries.with_option_observed(dim, self.num_options),
+            geometry=None if geometry is None else geometry.with_option_observed(dim),
+        )
+
+    def of_option(self, option: int) -> PAMDPSpecs:
+        """Return the specs of a learner that serves one option."""
+        symmetries, geometry = self.symmetries, self.geometry
+        return replace(
+            self,
+            symmetries=None if symmetries is None else symmetries.of_option(option),
+            geometry=None if geometry is None else geometry.of_option(option),
+        )
+
+    @property
+    def telling_entries(self) -> list[int]:
+        """The entries of the observation that are not redundant, all of them where nothing is declared."""
+        redundant = () if self.geometry is None else self.geometry.redundant
+        return [entry for entry in range(self.observation_dim) if entry not in redundant]
+
+    def with_telling_entries(self) -> PAMDPSpecs:
+        """Return the specs of observations that have the `telling_entries` alone."""
+        entries = self.telling_entries
+        symmetries, geometry = self.symmetries, self.geometry
+        weight = self.initial_weight
+        return replace(
+            self,
+            observation_dim=len(entries),
+            initial_weight=None if weight is None else tuple(tuple(row[entry] for entry in entries) for row in weight),
+            symmetries=None if symmetries is None else symmetries.with_entries(entries),
+            geometry=None if geometry is None else geometry.with_entries(entries),
+        )
 
     @classmethod
     def from_env(cls, env: EnvBase) -> PAMDPSpecs:
         """Read the sizes off a `PAMDPEnv`.
 
         Raises:
-            ValueError: its initial parameters do not fit its observation and action.
+            ValueError: its initial parameters, symmetries or geometry do not fit its observation and action.
         """
         action = env.full_action_spec_unbatched
         parameters = action[keys.PARAMETERS]
         observation_dim = env.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
+        num_parameters = sum(env.parameter_dims)
         initial = env.initial_parameters()
         weight = bias = None
         if initial is not None:
             shapes = [list(part.shape) for part in initial]
-            num_parameters = sum(env.parameter_dims)
             expected = [[num_parameters, observation_dim], [num_parameters]]
             if shapes != expected:
                 raise ValueError(f"initial_parameters: shapes {shapes}, but must be {expected}")
             weight = tuple(tuple(row) for row in initial[0].tolist())
             bias = tuple(initial[1].tolist())
+        symmetries, geometry = env.symmetries, env.geometry
+        num_discrete = len(env.parameter_dims)
+        misfits: dict[str, str] = {}
+        if symmetries is not None:
+            misfits["symmetries"] = symmetries.fits(observation_dim, num_discrete, num_parameters)
+        if geometry is not None:
+            misfits["geometry"] = geometry.fits(observation_dim, env.parameter_dims)
+        for name, misfit in misfits.items():
+            if misfit:
+                raise ValueError(f"{name}: {misfit}")
         return cls(
             observation_dim=observation_dim,
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
@@ -111,4 +163,6 @@ class PAMDPSpecs:
             parameter_high=tuple(parameters.space.high.flatten().tolist()),
             initial_weight=weight,
             initial_bias=bias,
+            symmetries=symmetries,
+            geometry=geometry,
         )

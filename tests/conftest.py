@@ -36,7 +36,11 @@ OWN = f"hydra.searchpath=[file://{Path(__file__).resolve().parent / 'conf'}]"
 
 
 def compose_config(overrides: Sequence[str]) -> DictConfig:
-    """Compose conf/config.yaml as the command line does; yaml files in tests/conf are found, too."""
+    """Compose conf/config.yaml as the command line does; yaml files in tests/conf are found, too.
+
+    Runs are not filmed unless a test asks for it, which saves it half a second.
+    """
+    overrides = [*([] if any(word.startswith("film=") for word in overrides) else ["film=false"]), *overrides]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         own = [] if any(word.startswith("hydra.searchpath=") for word in overrides) else [OWN]
         return compose("config", [*own, *overrides], return_hydra_config=True)

@@ -42,9 +42,19 @@ def test_the_modules_are_found():
     assert "hpamdp.policies.base" in {name.rpartition(".")[0] for name in imports(f"{LOW}.random")}
 
 
-@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.messages", "hpamdp.env.boatdock.physics"])
+@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.messages", "hpamdp.env.streams"])
 def test_the_foundations_import_nothing_of_ours(module):
     assert not [name for name in imports(module) if is_in(name, "hpamdp")]
+
+
+def test_the_physics_imports_only_the_constants_of_the_task():
+    ours = [name for name in imports("hpamdp.env.boatdock.physics") if is_in(name, "hpamdp")]
+    assert ours and all(is_in(name, "hpamdp.env.boatdock.task") for name in ours)
+
+
+def test_what_a_boat_for_gymnasium_runs_through_imports_no_torch():
+    for module in ("task", "layouts", "kernel", "fleet", "numpy_boats", "gymnasium_faces"):
+        assert not [name for name in imports(f"hpamdp.env.boatdock.{module}") if is_in(name, "torchrl")], module
 
 
 GENERIC = [module for module in FILES if not any(is_in(module, room) for room in BOATS)]

@@ -10,7 +10,8 @@ from hpamdp import keys
 from hpamdp.env.boatdock import episode, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.policies.low_level.dlpa import DLPA, Plan, Planner
-from hpamdp.policies.low_level.dlpa_model import PAMDPModel, Prediction
+from hpamdp.policies.low_level.dlpa_model import PAMDPModel
+from hpamdp.policies.shared.planning import Prediction
 from hpamdp.specs import PAMDPSpecs
 
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
@@ -23,7 +24,7 @@ SEARCH = dict(
 OPTIONS = dict(
     form="masking", hidden_dims=[64, 64], num_members=2, lr=2e-3, state_weight=2.0, reward_weight=0.5,
     termination_weight=0.5, rho=0.5, buffer_size=5000, batch_size=64, updates_per_frame=0.5, warmup_frames=500,
-    epsilon=0.05, planning_precision="float32", **SEARCH,
+    augment=False, epsilon=0.05, planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import TRAINED, choices, compose_config, make_config
+from conftest import CONF, TRAINED, choices, compose_config, make_config
 from tensordict import TensorDict
 
+from hpamdp.config import ConfigError
 from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run
@@ -26,6 +28,17 @@ SHORT = {
     "hsac": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "hyar": ["low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "paddpg": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
+    "pets": [
+        *("low.warmup_frames=64", "low.updates_per_frame=0.1", "low.batch_size=16", "low.transition_dims=[16]"),
+        *(
+            "low.outcome_dims=[16]",
+            "low.num_members=2",
+            "low.num_samples=4",
+            "low.num_elites=2",
+            "low.num_iterations=2",
+        ),
+        "low.max_sequences=8",
+    ],
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "pdqn_published": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
@@ -130,3 +143,31 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
         results.append(td)
     for key in ("observation", ("action", "discrete"), ("action", "parameters")):
         torch.testing.assert_close(results[0][key], results[1][key])
+
+
+AUGMENTED = [low for low in choices("low") if "augment:" in (CONF / "low" / f"{low}.yaml").read_text()]
+
+
+@pytest.mark.parametrize("low", AUGMENTED)
+def test_a_learner_with_augment_learns_from_steps_under_the_problems_symmetries(low, tmp_path, monkeypatch):
+    given = [*words("uniform", low), "low.augment=true"]
+    if low != "pets":  # which learns from all maps of a step at once
+        calls = []
+        mapped = RandomSymmetry.mapped
+        monkeypatch.setattr(
+            RandomSymmetry, "mapped", lambda self, *rows: calls.append(len(self.maps)) or mapped(self, *rows)
+        )
+    torch.manual_seed(0)
+    parts = assemble(make_config(given), tmp_path)
+    before = weights(parts.agent)
+    collected = parts.env.rollout(20, parts.agent.policy, break_when_any_done=False).contiguous()
+    parts.agent.learn(collected)
+    assert any(not before[name].equal(value) for name, value in weights(parts.agent).items())
+    if low != "pets":
+        assert calls and set(calls) == {6}, "each boat's learner has the maps that keep the boat"
+
+
+@pytest.mark.parametrize("low", ["pdqn", "pets"])
+def test_augment_is_refused_where_the_problem_declares_no_symmetries(low, tmp_path):
+    with pytest.raises(ConfigError, match="low: augment=true: the problem declares no symmetries; use augment=false"):
+        assemble(make_config(["env=platform", "high=none", f"low={low}", "low.augment=true", *SMALL]), tmp_path)

@@ -20,7 +20,7 @@ OPTIONS = dict(
     min_scale=0.01, max_scale=1.0, discrete_temperature=0.05, parameter_temperature=0.03,
     tune_discrete_temperature=True, tune_parameter_temperature=True, discrete_target_entropy=0.1,
     parameter_target_entropy=-1.5, temperature_lr=3e-3, warmup_frames=1000, buffer_size=20_000, batch_size=64,
-    updates_per_frame=0.12, policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
+    updates_per_frame=0.12, augment=False, policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
 )  # fmt: skip
 
 

@@ -17,6 +17,7 @@ OPTIONS = dict(
     codec_pretrain_updates=1500, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, relabelling="mean",
     buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
+    augment=False,
     lr_final=1.0, lr_frames=0, policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1,
     epsilon_final=0.05, epsilon_frames=3000,
 )  # fmt: skip

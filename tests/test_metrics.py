@@ -32,6 +32,8 @@ def log_a_run(logger, output_dir):
     Image.new("RGB", (8, 8)).save(output_dir / "figure.png")
     logger.log({"frames": 10, "eval/score": 1.5}, step=10)
     logger.images([output_dir / "figure.png"])
+    Image.new("P", (8, 8)).save(output_dir / "episodes.gif")
+    logger.film(output_dir / "episodes.gif")
     logger.summary({"eval/score": 1.5, "references": {"ceiling": 3.64}})
     logger.close()
 
@@ -129,7 +131,7 @@ def test_every_logger_takes_a_run(tmp_path, without_login):
     log_a_run(wandb_logger(tmp_path, "disabled"), tmp_path)
     events = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [(event.step, event.value) for event in events.Scalars("eval/score")] == [(10, 1.5)]
-    assert events.Tags()["images"] == ["figure"]
+    assert sorted(events.Tags()["images"]) == ["episodes", "figure"]
 
 
 def test_wandb_auto_without_login_makes_an_offline_run_under_the_output_folder(tmp_path, without_login, capfd):

@@ -264,10 +264,12 @@ COMMON = {"hidden_dims": [32, 32], "buffer_size": 10_000, "batch_size": 128}
 IQL_OPTIONS = COMMON | dict(
     min_scale=0.02, max_scale=1.0, expectile=0.8, temperature=10.0, max_weight=100.0, gamma=0.9, tau=0.01,
     actor_lr=3e-3, critic_lr=3e-3, warmup_frames=0, updates_per_frame=1.0,
+    augment=False,
 )  # fmt: skip
 TD3BC_OPTIONS = COMMON | dict(
     behaviour_weight=0.2, discrete_threshold=0.3, target_smoothing=0.0, target_smoothing_clip=0.1, policy_delay=2,
     parameter_noise=0.1, gamma=0.9, tau=0.01, actor_lr=3e-3, critic_lr=3e-3, warmup_frames=0, updates_per_frame=1.0,
+    augment=False,
 )  # fmt: skip
 
 

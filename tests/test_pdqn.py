@@ -17,7 +17,7 @@ from hpamdp.specs import PAMDPSpecs
 OPTIONS = dict(
     multipass=True, twin_q=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
     n_step=1, bounding="tanh", hidden_dims=[64, 64], warmup_frames=1000, buffer_size=20_000, batch_size=64,
-    updates_per_frame=0.12, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
+    updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
     max_grad_norm=None, parameter_noise=0.1, epsilon_final=0.1, epsilon_frames=3000,
     epsilon_episodes=None, reward_scale=1.0, initial_parameters="none",
 )  # fmt: skip

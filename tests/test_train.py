@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import compose_config, make_config
+from PIL import Image
 
 from hpamdp.config import ConfigError
 from hpamdp.env.boatdock import harbour
@@ -46,6 +47,15 @@ def test_a_run_leaves_numbers_pictures_and_a_closing_table(tmp_path, capsys, wit
     assert summary["human_normalised"] == human_normalised(summary["score"])
     printed = capsys.readouterr().out
     assert "score" in printed and "ceiling" in printed and str(tmp_path) in printed
+
+
+def test_a_run_leaves_a_film_of_three_episodes_unless_it_is_turned_off(tmp_path):
+    words = ["high=uniform", "low=random", "total_frames=128", "eval.every=0"]
+    start(tmp_path / "on", *words, "film=true")
+    with Image.open(tmp_path / "on" / "episodes.gif") as film:
+        assert film.size == (600, 200) and film.n_frames > 10
+    start(tmp_path / "off", *words, "film=false")
+    assert not (tmp_path / "off" / "episodes.gif").exists()
 
 
 def test_the_planner_under_the_oracle_reaches_the_ceiling_with_nothing_to_learn(tmp_path):

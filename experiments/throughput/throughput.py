@@ -1,12 +1,16 @@
-"""Measure how many presses a second the environment makes on one core; write results.csv and print the figures.
+"""Measure how many steps a second the environments make on one core; write results.csv and print the figures.
 
-Run: python experiments/throughput/throughput.py [--seconds 2] [--device cpu]
+Run: python experiments/throughput/throughput.py [--seconds 1] [--device cpu]
 
-Three interfaces are timed, each with automatic resets and with random actions that were sampled before (a pool of
-eight):
-- physics: `episode.step` and `episode.reset` as one function, without observations;
-- env: `BoatDockEnv.step_and_maybe_reset`, with observations and TorchRL's bookkeeping;
-- gymnasium: `BoatDockVector.step`, with NumPy arrays. Gymnasium's own vectorised CartPole is timed for comparison.
+Each figure is the fastest of many short trials of one process on one core, by its CPU time, which leaves out the turns
+of other processes; its peers are measured beside it in the same run:
+- boats, one: `gymnasium.make`, beside Gymnasium's own CartPole;
+- boats, many: Gymnasium's vector environment, `BoatDockEnv.step_and_maybe_reset` by the kernel and by the tensor
+  functions (as they are and, with --compiled, compiled), beside Gymnasium's vectorised NumPy CartPole;
+- the field's domains: the TorchRL and the Gymnasium environments, beside one environment in plain Python
+  (`originals.py`).
+
+Actions are random, from a pool of eight that was sampled before; episodes start anew where they end.
 """
 
 from __future__ import annotations
@@ -15,79 +19,57 @@ import argparse
 import csv
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from random import Random
 
 import gymnasium
 import torch
-from torch import Tensor
+from originals import ORIGINALS
 
 import hpamdp  # also registers the Gymnasium ids
 from hpamdp import keys
-from hpamdp.env import counter_rng
-from hpamdp.env.boatdock import episode, physics
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import BoatState, Rules
+from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.goal.environment import GoalEnv
+from hpamdp.env.gym_hybrid.environment import MovingEnv
+from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.env.platform.environment import PlatformEnv
 
-SIZES = (1, 1_024, 16_384, 65_536, 131_072)
+SIZES = (64, 256, 1_024, 16_384, 65_536)
+DOMAIN_SIZES = (1_024, 16_384)
+DOMAINS: dict[str, type[PAMDPEnv]] = {
+    "Goal": GoalEnv,
+    "Platform": PlatformEnv,
+    "CatchPoint": CatchPointEnv,
+    "HardMove4": HardMoveEnv,
+    "Moving": MovingEnv,
+}
 POOL = 8
 
 
-def rate(step: Callable[[], object], num_envs: int, seconds: float) -> float:
-    """Return the presses a second of the fastest of five trials that take about `seconds` together."""
+def rate(step: Callable[[], object], steps_per_call: int, seconds: float) -> float:
+    """Return the steps a second of CPU time of the fastest of many trials of a few milliseconds."""
     for _ in range(POOL + 2):
         step()
-    num_steps = 0  # in a twentieth of the time
-    started = time.perf_counter()
-    while time.perf_counter() - started < seconds / 20:
-        step()
-        num_steps += 1
-    num_steps *= 4
+    calls, ended = 1, time.perf_counter() + seconds
     best = 0.0
-    for _ in range(5):
-        started = time.perf_counter()
-        for _ in range(num_steps):
+    while time.perf_counter() < ended:
+        started = time.process_time()
+        for _ in range(calls):
             step()
-        best = max(best, num_steps * num_envs / (time.perf_counter() - started))
+        taken = time.process_time() - started
+        best = max(best, calls * steps_per_call / taken)
+        if taken < 0.0025:
+            calls *= 2
     return best
 
 
-def random_actions(env: BoatDockEnv) -> Iterator[dict[str, Tensor]]:
-    """Return an endless iterator over a pool of random actions."""
-    pool = [env.rand_action(env.reset()).select(keys.OPTION, keys.ACTION) for _ in range(POOL)]
-    return itertools.cycle(pool)
-
-
-def physics_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], object]:
-    """Return a function that makes one press in every environment, with resets."""
-    rules = Rules()
-    seed = counter_rng.seed_tensor(0, torch.device(device))
-    environment = torch.arange(num_envs, dtype=torch.int32, device=device)
-
-    def press(state: BoatState, option: Tensor, key: Tensor, durations: Tensor) -> tuple[BoatState, Tensor, Tensor]:
-        moved, reward, _ = episode.step(state, option, key, durations, seed, environment, rules)
-        over = moved.outcome != physics.SAILING
-        return episode.reset(moved, over, seed, environment, rules), reward, moved.outcome
-
-    if is_compiled:
-        press = torch.compile(press, **counter_rng.COMPILE_ARGUMENTS)
-    env = BoatDockEnv(num_envs, device=device)
-    actions = random_actions(env)
-    env.reset()
-    state = env.state
-
-    def step() -> None:
-        nonlocal state
-        action = next(actions)
-        state, _, _ = press(state, action[keys.OPTION], action[keys.DISCRETE], action[keys.PARAMETERS])
-
-    return step
-
-
-def env_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], object]:
+def env_stepper(env: PAMDPEnv) -> Callable[[], object]:
     """Return a function that calls `step_and_maybe_reset` once."""
-    env = BoatDockEnv(num_envs, compile_rules=is_compiled, device=device)
-    actions = random_actions(env)
+    leaves = [keys.OPTION, keys.ACTION] if env.has_choice else [keys.ACTION]
+    actions = itertools.cycle([env.rand_action(env.reset()).select(*leaves) for _ in range(POOL)])
     td = env.reset()
 
     def step() -> None:
@@ -97,7 +79,33 @@ def env_stepper(num_envs: int, is_compiled: bool, device: str) -> Callable[[], o
     return step
 
 
-def gymnasium_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
+def by_tensor_functions(num_envs: int) -> BoatDockEnv:
+    """Return boats that the tensor functions move, uncompiled: what durations that require gradients lead to."""
+    env = BoatDockEnv(num_envs)
+    td = env.rand_action(env.reset())
+    td[keys.PARAMETERS] = td[keys.PARAMETERS].requires_grad_()
+    env.step(td)
+    env.state = env.state._replace(**{name: column.detach() for name, column in env.state._asdict().items()})
+    return env
+
+
+def one_stepper(env_id: str) -> Callable[[], object]:
+    """Return a function that makes 64 steps of one Gymnasium environment, with resets."""
+    env = gymnasium.make(env_id)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    actions = [env.action_space.sample() for _ in range(64)]
+
+    def step() -> None:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return step
+
+
+def vector_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
     """Return a function that makes one step of a Gymnasium vector environment."""
     env = gymnasium.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point")
     env.reset(seed=0)
@@ -106,33 +114,46 @@ def gymnasium_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
     return lambda: env.step(next(actions))
 
 
-def steppers(num_envs: int, device: str) -> dict[str, Callable[[], Callable[[], object]]]:
+def boats(num_envs: int, device: str, is_compiled: bool) -> dict[str, Callable[[], Callable[[], object]]]:
     """Return what makes each function to time, by its name in the table."""
-    return {
-        "physics eager": lambda: physics_stepper(num_envs, False, device),
-        "physics compiled": lambda: physics_stepper(num_envs, True, device),
-        "env eager": lambda: env_stepper(num_envs, False, device),
-        "env compiled": lambda: env_stepper(num_envs, True, device),
-        "gymnasium": lambda: gymnasium_stepper("hpamdp/BoatDock-v0", num_envs),
-        "gymnasium CartPole-v1": lambda: gymnasium_stepper("CartPole-v1", num_envs),
+    makers = {
+        "CartPole-v1, Gymnasium vector": lambda: vector_stepper("CartPole-v1", num_envs),
+        "boats, Gymnasium vector": lambda: vector_stepper("hpamdp/BoatDock-v0", num_envs),
+        "boats, TorchRL": lambda: env_stepper(BoatDockEnv(num_envs, device=device)),
+        "boats, TorchRL, tensor functions": lambda: env_stepper(by_tensor_functions(num_envs)),
     }
+    if is_compiled:
+        makers["boats, TorchRL, compiled"] = lambda: env_stepper(BoatDockEnv(num_envs, compile_rules=True))
+    return makers
 
 
 def main() -> None:
     """Measure everything and write the csv file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=2.0, help="for each figure")
+    parser.add_argument("--seconds", type=float, default=1.0, help="for each figure")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--compiled", action="store_true", help="also time the compiled tensor functions")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(f"hpamdp {hpamdp.__version__}, torch {torch.__version__}, one thread, {arguments.device}")
-    rows = []
+    rows: list[dict[str, object]] = []
+
+    def measure(what: str, num_envs: int, step: Callable[[], object], steps_per_call: int) -> None:
+        per_second = rate(step, steps_per_call, arguments.seconds)
+        rows.append({"what": what, "num_envs": num_envs, "steps_per_s": round(per_second)})
+        print(f"{what:<34} {num_envs:>7,} environments {per_second:>13,.0f} steps/s", flush=True)
+
+    for env_id in ("CartPole-v1", "hpamdp/BoatDock-v0", *(f"hpamdp/{name}-v0" for name in DOMAINS)):
+        measure(f"{env_id.removeprefix('hpamdp/')}, Gymnasium", 1, one_stepper(env_id), 64)
     for num_envs in SIZES:
-        for what, make in steppers(num_envs, arguments.device).items():
-            torch.compiler.reset()
-            million = rate(make(), num_envs, arguments.seconds) / 1e6
-            rows.append({"what": what, "num_envs": num_envs, "million_presses_per_s": round(million, 4)})
-            print(f"{what:<22} {num_envs:>8,} environments {million:9.3f} million presses/s", flush=True)
+        for what, make in boats(num_envs, arguments.device, arguments.compiled).items():
+            measure(what, num_envs, make(), num_envs)
+    for name, problem in DOMAINS.items():
+        original = ORIGINALS[name](Random(0))
+        measure(f"{name}, plain Python", 1, lambda played=original: next(played), 1)
+        for num_envs in DOMAIN_SIZES:
+            measure(f"{name}, TorchRL", num_envs, env_stepper(problem(num_envs)), num_envs)
+            measure(f"{name}, Gymnasium vector", num_envs, vector_stepper(f"hpamdp/{name}-v0", num_envs), num_envs)
     name = "results.csv" if arguments.device == "cpu" else f"results_{arguments.device}.csv"
     with (Path(__file__).parent / name).open("w", newline="") as file:
         writer = csv.DictWriter(file, rows[0])

@@ -13,6 +13,7 @@ AGENT, INK, FAINT = "#0072B2", "#2b2b2b", "#8c8c8c"
 REFERENCES = {
     "random": ("random", "#8c8c8c", ":"),
     "human": ("people", "#D98200", "--"),
+    "you": ("you", "#D98200", "--"),
     "best_person": ("best person", "#D98200", "-."),
     "ceiling": ("ceiling", "#2b2b2b", "-"),
 }

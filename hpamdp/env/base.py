@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -14,9 +14,12 @@ from torchrl.data import Binary, Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.geometry import PlaneGeometry, Symmetries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from hpamdp.env.page import Page
 
 # Separates the seeds of an evaluation from the small ones that people give to training.
 _EVALUATION = 0x5EED0000
@@ -99,6 +102,16 @@ class PAMDPEnv(EnvBase):
         """Positions of the agents for drawing, `[N, 2]`; None where that means nothing."""
         return None
 
+    @property
+    def symmetries(self) -> Symmetries | None:
+        """The maps under which neither dynamics nor reward change; None: there are none, or none that is known."""
+        return None
+
+    @property
+    def geometry(self) -> PlaneGeometry | None:
+        """Which entries of the observation are vectors, and where the actions point; None where that means nothing."""
+        return None
+
     def fixed_episodes(self, seed: int) -> TensorDict | None:
         """Return what to `reset` with for the evaluation episodes of a seed, one for each environment.
 
@@ -163,6 +176,24 @@ class PAMDPEnv(EnvBase):
             summary: of the run; `references` has the figures to compare with.
         """
         return {}
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterable[np.ndarray]:
+        """Return the pictures of one episode, uint8 `[size, size, 3]` each; none where there is nothing to see.
+
+        Args:
+            track: its `env_state` at the start and after every step, columns `[1, ...]`.
+            fps: pictures a second.
+            size: px from edge to edge.
+        """
+        return ()
+
+    def page(self, seed: int) -> Page | None:
+        """Return the page on which people play this problem in a browser; None if there is none.
+
+        Args:
+            seed: of its episodes.
+        """
+        return None
 
     @property
     def keeps_episodes(self) -> bool:

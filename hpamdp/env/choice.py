@@ -90,10 +90,14 @@ class OptionChoiceEnv(PAMDPEnv):
         option = tensordict.get(keys.OPTION)
         td = self._observed(tensordict)
         total = torch.zeros(*self.batch_size, 1, device=self.device)
+        # What the policy carries from step to step, as a step of the environment alone keeps nothing.
+        state_keys = getattr(self._low_policy, "state_keys", [])
         # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
             for step in range(self._inner_env.max_steps):
-                td = self._inner_env._step(self._low_policy(td.set(keys.OPTION, option)))
+                acted = self._low_policy(td.set(keys.OPTION, option))
+                td = self._inner_env._step(acted)
+                td.update(acted.select(*state_keys))
                 total = total + self.gamma**step * td.get(keys.REWARD)
                 if td.get(keys.DONE).all():
                     break

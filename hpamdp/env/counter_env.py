@@ -6,13 +6,15 @@ is the same for all of them: specs, checks of actions, masked steps and resets, 
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
+from PIL import Image
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
@@ -29,6 +31,7 @@ from hpamdp.env.rows import Advance, Results, Rows
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
+_SECONDS_A_STEP = 0.25  # in films
 
 
 class EpisodeColumns(Columns, Protocol):
@@ -57,6 +60,10 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     action are clipped to their bounds; NaN and infinite ones are refused, and so are unknown actions. The parameters
     of the other actions are never read.
 
+    On the CPU a problem may hand over a kernel, `_use_kernel`, which then does the work of the three. Other devices,
+    compiled rules, subclasses that replace one of the three, and gradients (from the first parameters that require them
+    on) have the tensor functions. A kernel leaves the scripted action of `oracle` to them, too.
+
     Random numbers depend on the seed, the number of the environment and the episode. Training and evaluation draw
     theirs from separate streams, and so do the starts of episodes and the noise within them.
 
@@ -68,7 +75,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         seed: of all random numbers; the global generators are neither read nor moved.
         first_env: number of the first environment, where other processes have those before it.
         oracle: also write the action of the hand-written player, `scripted_action`, under `oracle`.
-        compile_rules: compile `start`, `act` and `observe`, which takes about half a minute.
+        compile_rules: compile `start`, `act` and `observe` (takes about half a minute) instead of using a kernel.
 
     Raises:
         ValueError: an argument or an action is invalid; the state is unchanged.
@@ -79,7 +86,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     result_keys = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
-    _rows: Rows | None = None
+    rows: Rows | None = None  # what the kernel moves; None where the tensor functions do
 
     def __init__(
         self,
@@ -130,7 +137,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
         state = self._columns
         num_integers = sum(not column.is_floating_point() for column in state)
-        self._rows = Rows(
+        self.rows = Rows(
             advance,
             self.num_envs,
             num_columns=(len(state._fields) - num_integers, num_integers),
@@ -140,20 +147,20 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             settings=[self.max_steps, *settings],
             first_env=int(self._environment[0]),
         )
-        self._rows.set_seed(int(self._seed), self._streams)
+        self.rows.set_seed(int(self._seed), self._streams)
         self._state = state
 
     @property
     def _state(self) -> EpisodeState:
         """The columns; where a kernel moves them, they change in place."""
-        if self._rows is None:
+        if self.rows is None:
             return self._columns
-        columns = (torch.from_numpy(column) for column in (*self._rows.floats, *self._rows.integers))
+        columns = (torch.from_numpy(column) for column in (*self.rows.floats, *self.rows.integers))
         return type(self._columns)(*columns)
 
     @_state.setter
     def _state(self, state: EpisodeState) -> None:
-        if self._rows is None:
+        if self.rows is None:
             self._columns = state
             return
         for column, new in zip(self._state, state, strict=True):
@@ -202,11 +209,20 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         """
         raise NotImplementedError(f"{type(self).__name__} has no pictures")
 
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+        """Yield the pictures of `draw`, each for a quarter of a second; none if there are none."""
+        if type(self).draw is CounterEnv.draw:
+            return
+        states = [type(self._state)(**columns) for columns in track]
+        for i in range(1, len(states) + 1):
+            picture = np.array(Image.fromarray(self.draw(states[:i])).resize((size, size), Image.Resampling.LANCZOS))
+            yield from itertools.repeat(picture, max(1, round(fps * _SECONDS_A_STEP)))
+
     @property
     def state(self) -> EpisodeState:
         """The columns of the state, `[N]` each."""
         state = self._state
-        return state if self._rows is None else type(state)(*(column.clone() for column in state))
+        return state if self.rows is None else type(state)(*(column.clone() for column in state))
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -273,8 +289,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def _begin(self) -> None:
         """Put every environment before its first episode."""
         self._state = self._start(torch.full_like(self._environment, -1))
-        if self._rows is not None:
-            self._rows.set_seed(int(self._seed), self._streams)
+        if self.rows is not None:
+            self.rows.set_seed(int(self._seed), self._streams)
 
     def _start(self, episode: Tensor) -> EpisodeState:
         return self.start(episode, counter_rng.key_for(self._seed, self._streams[0], self._environment, episode))
@@ -295,15 +311,15 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = self.reset_mask(tensordict)
-        if self._rows is not None:
-            return self._reading(self._rows.restart(mask.numpy()))
+        if self.rows is not None:
+            return self._reading(self.rows.restart(mask.numpy()))
         self._state = self._pure_reset(self._state, mask)
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_step", None)
         mask = None if mask is None else mask.reshape(self.num_envs)
-        if self._rows is not None:
+        if self.rows is not None:
             results = self._act(tensordict, mask)
             if results is not None:
                 return self._reading(results, has_reward=True)
@@ -316,7 +332,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         return self._read().set(keys.REWARD, reward.unsqueeze(-1))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        is_plain = self._rows is not None and not self._has_oracle and _PLAIN_KEYS.issuperset(tensordict.keys())
+        is_plain = self.rows is not None and not self._has_oracle and _PLAIN_KEYS.issuperset(tensordict.keys())
         results = self._act(tensordict, None, restarts=True) if is_plain else None
         if results is None:
             return super()._step_and_maybe_reset(tensordict)
@@ -330,13 +346,13 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _act(self, tensordict: TensorDictBase, mask: Tensor | None, *, restarts: bool = False) -> Results | None:
         """Act with the kernel; None where it cannot, since the parameters require gradients: it is given up then."""
-        assert self._rows is not None
+        assert self.rows is not None
         self.check_action(tensordict)
         discrete, parameters = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
         if parameters.requires_grad and torch.is_grad_enabled():
-            self._columns, self._rows = self.state, None
+            self._columns, self.rows = self.state, None
             return None
-        results = self._rows.act(
+        results = self.rows.act(
             discrete.long().contiguous().numpy(),
             parameters.detach().float().contiguous().numpy(),
             mask=None if mask is None else mask.numpy(),

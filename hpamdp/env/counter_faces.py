@@ -23,6 +23,7 @@ from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv
 from hpamdp.env.faces import After, Face, NumpyEnv, RenderMode, VectorFace, as_array, describe
+from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
 
 
 class CounterFace(Face):
@@ -76,6 +77,7 @@ class NumpyCounterEnv(NumpyEnv):
         self.observation_space = spaces.Box(low, high, dtype=np.float32)
         self._env = env
         self._batch = batch
+        self._outcome_names = np.array(env.outcomes, dtype=object)
 
     @property
     def state(self) -> Any:
@@ -88,17 +90,25 @@ class NumpyCounterEnv(NumpyEnv):
             raise ValueError(f"reset: unknown options {sorted(options)}; there are none")
         if seed is not None:
             self._env.set_seed(seed, static_seed=True)
+        self.is_reset = True
+        if self._env.rows is not None:
+            return self._env.rows.restart(mask).observations[0]
         given = TensorDict(batch_size=self._env.batch_size, device=self._env.device)
         if mask is not None:
             given["_reset"] = torch.from_numpy(mask.copy()).to(self._env.device).unsqueeze(-1)
-        self.is_reset = True
         return to_numpy(self._env.reset(given)[keys.OBSERVATION])
 
     def step(self, action: Any, *, restarts: bool = False) -> After:
         """Return what follows an action in every environment."""
         if not self.is_reset:
             raise gymnasium.error.ResetNeeded("step: call reset first")
-        discrete, parameters = self._leaves(action)
+        given, joined = self._leaves(action)
+        if self._env.rows is not None:
+            act = self._env.rows.act_or_restart if restarts else self._env.rows.act
+            results = act(given, joined)
+            if not isinstance(results, int):
+                return After(results.observations[0], results.rewards, results.flags[0, 1], results.flags[0, 2])
+        discrete, parameters = torch.from_numpy(given), torch.from_numpy(joined)
         over = self._env.state.outcome != GOING_ON
         restarts = restarts and bool(over.any())
         if restarts:
@@ -118,19 +128,30 @@ class NumpyCounterEnv(NumpyEnv):
     @property
     def is_over(self) -> np.ndarray:
         """Which episodes are over, bool `[N]`."""
-        return to_numpy(self._env.state.outcome != GOING_ON)
+        return self._integers()[1] != GOING_ON
+
+    def _integers(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the counts of steps and the outcomes, `[N]` each."""
+        if self._env.rows is not None:
+            return self._env.rows.integers[STEPS_ROW], self._env.rows.integers[OUTCOME_ROW]
+        return to_numpy(self._env.state.steps), to_numpy(self._env.state.outcome)
 
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each."""
-        state = self._env.state
-        outcome = to_numpy(state.outcome)
+        steps, outcome = self._integers()
         return {
-            "outcome": np.array(self._env.outcomes, dtype=object)[outcome],
-            "steps": to_numpy(state.steps).astype(np.int64),
+            "outcome": self._outcome_names[outcome],
+            "steps": steps.astype(np.int64),
             "is_success": outcome == SUCCESS,
         }
 
-    def _leaves(self, action: Any) -> tuple[torch.Tensor, torch.Tensor]:
+    def info(self) -> dict[str, Any]:
+        """Return the infos of the first environment as Python's numbers."""
+        steps, outcome = (int(column[0]) for column in self._integers())
+        values = {"outcome": self._env.outcomes[outcome], "steps": steps}
+        return values if outcome == GOING_ON else {**values, "is_success": outcome == SUCCESS}
+
+    def _leaves(self, action: Any) -> tuple[np.ndarray, np.ndarray]:
         """Check the structure, types and shapes of an action and return its leaves, `[N]` and `[N, num_parameters]`."""
         if not isinstance(action, (tuple, list)) or len(action) != 2:
             raise ValueError(f"step: the action must be a tuple (discrete, parameters), but is {describe(action)}")
@@ -143,8 +164,9 @@ class NumpyCounterEnv(NumpyEnv):
             as_array(f"step: parameters of action {number}", array, (*self._batch, dim))
             for number, (array, dim) in enumerate(zip(parameters, dims, strict=True))
         ]
-        joined = np.concatenate(arrays, axis=-1).astype(np.float32).reshape(self._env.num_envs, sum(dims))
-        return torch.from_numpy(given.reshape(self._env.num_envs)), torch.from_numpy(joined)
+        joined = np.empty((self._env.num_envs, sum(dims)), np.float32)
+        np.concatenate(arrays, axis=-1, out=joined if self._batch else joined[0], casting="same_kind")
+        return given.reshape(self._env.num_envs), joined
 
 
 def _load(problem: str) -> type[Any]:

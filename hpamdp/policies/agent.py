@@ -31,10 +31,16 @@ def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
 class OptionRouter(TensorDictModuleBase):
     """The low level's policy: in each environment, the policy of the held option's learner acts.
 
+    Keys that a learner's policy both reads and writes, its state, stay in the tensordict from step to step. A policy
+    finds none of them where nothing has been written yet.
+
     Args:
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
         is_shared: whether the single learner observes the option.
+
+    Attributes:
+        state_keys: the policies' state.
     """
 
     def __init__(self, learners: Sequence[Learner], specs: PAMDPSpecs, is_shared: bool) -> None:
@@ -42,19 +48,20 @@ class OptionRouter(TensorDictModuleBase):
         self.policies = nn.ModuleList(learner.policy for learner in learners)
         self.specs = specs
         self.is_shared = is_shared
-        in_keys = {key for learner in learners for key in learner.policy.in_keys}
-        self.in_keys = [*in_keys, *([keys.OPTION] if specs.num_options else [])]
         self.out_keys = list(learners[0].policy.out_keys)
+        in_keys = {key for learner in learners for key in learner.policy.in_keys}
+        self.state_keys = [key for key in self.out_keys if key in in_keys]
+        self.in_keys = [*in_keys, *([keys.OPTION] if specs.num_options else [])]
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the action leaves and the other `out_keys` of the learners' policies."""
         if self.is_shared:
-            acted = self.policies[0](with_option(td.select(*self.in_keys), self.specs.num_options))
+            acted = self.policies[0](with_option(self._seen(td), self.specs.num_options))
             return td.update(acted.select(*self.out_keys))
         if len(self.policies) == 1:
             return self.policies[0](td)
         option = td.get(keys.OPTION)
-        seen = td.select(*self.in_keys)
+        seen = self._seen(td)
         for i, policy in enumerate(self.policies):
             rows = option == i
             if not rows.any():
@@ -69,6 +76,10 @@ class OptionRouter(TensorDictModuleBase):
                 written[rows] = value
                 td.set(key, written)
         return td
+
+    def _seen(self, td: TensorDictBase) -> TensorDictBase:
+        """Return what the policies read, as far as it is there."""
+        return td.select(*self.in_keys, strict=False)
 
 
 class HeldOption(TensorDictModuleBase):
@@ -278,6 +289,18 @@ class HierarchicalAgent(nn.Module):
         if self.selector is not None:
             levels["selector"] = self.selector
         return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
+
+    def portable(self) -> dict[str, Any] | None:
+        """Return as JSON values what a program without torch needs to act greedily; None if a part of it cannot say.
+
+        `selector` is None where there is nothing to choose; `learners` has one entry for each option, or a single one,
+        which with `is_shared` observes the one-hot option at the end of the observation.
+        """
+        learners = [learner.portable() for learner in self._learners()]
+        selector = None if self.selector is None else self.selector.portable()
+        if any(learner is None for learner in learners) or (self.selector is not None and selector is None):
+            return None
+        return {"selector": selector, "learners": learners, "is_shared": self.is_shared}
 
     def _learners(self) -> Iterator[Learner]:
         for learner in self.learners:

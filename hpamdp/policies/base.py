@@ -222,6 +222,13 @@ class Selector(TensorDictModuleBase):
         """
         return {}
 
+    def portable(self) -> dict[str, Any] | None:
+        """Return as JSON values what a program without torch needs to choose greedily; None if that is not known.
+
+        `kind` names the form, which `hpamdp.policies.shared.portable` explains.
+        """
+        return None
+
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write `out_keys`: a fresh choice where `is_decision`, elsewhere what `td` already holds."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
@@ -259,9 +266,10 @@ class Learner(nn.Module):
     `policies.shared.replay.ReplayLearner` implements `learn`, `add_demonstrations`, `update` and `stateful` for
     off-policy learners. The smallest complete learner is `policies.low_level.random.Random`.
 
-    Constructor: `specs` holds the sizes and bounds of the problem, and `device`, if it is an argument, says where
-    tensors live. All other arguments are keyword-only; their names and type annotations are the schema of the learner's
-    yaml in `conf/low`. A learner never sees the environment, the config, the agent or another learner.
+    Constructor: `specs` holds the sizes and bounds of the problem, with the symmetries and the geometry that it
+    declares, and `device`, if it is an argument, says where tensors live. All other arguments are keyword-only; their
+    names and type annotations are the schema of the learner's yaml in `conf/low`. A learner never sees the environment,
+    the config, the agent or another learner.
 
     Policy: `policy` reads its `in_keys`, usually `observation` `[*B, observation_dim]`, and writes its `out_keys`:
     `("action", "discrete")` int64 `[*B]` and `("action", "parameters")` `[*B, num_parameters]`, within their bounds.
@@ -272,7 +280,10 @@ class Learner(nn.Module):
     - If `learn` needs to know more about an action, such as its log-probability, append a key to the policy's
       `out_keys`: it is there again in the batch.
     - The policy gets only the environments whose option is its learner's, so their number changes from step to step,
-      and it acts in evaluation, too. It must not remember anything about an episode.
+      and it acts in evaluation, too. So the module must not remember anything about an episode. What the policy needs
+      from step to step travels in the tensordict, under a key of its own, `[*B, ...]`, that is among its `in_keys` and
+      its `out_keys`. The key is missing before the first step; where `is_decision` is true, what it holds is left over
+      from an earlier option.
     - The policy may run as a copy in another process, which receives its parameters and buffers and nothing else. So
       whatever changes during training, such as an exploration rate, must be one of them.
 
@@ -349,6 +360,13 @@ class Learner(nn.Module):
         """
         fresh = {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in self.progress}
         self.load_state_dict({name: fresh.get(name, value) for name, value in state.items()})
+
+    def portable(self) -> dict[str, Any] | None:
+        """Return as JSON values what a program without torch needs to act greedily; None if that is not known.
+
+        `kind` names the form, which `hpamdp.policies.shared.portable` explains.
+        """
+        return None
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, as `Selector.stateful` does."""

@@ -31,6 +31,8 @@ from hpamdp.specs import PAMDPSpecs
 
 # Fewer steps or episodes than this need no estimate of their memory, for which an environment is built.
 _MANY = 1_000_000
+# Episodes of the film that every run leaves behind.
+FILMED_EPISODES = 3
 # A weight is there four times: itself, its gradient and two moments of Adam.
 _BYTES_A_WEIGHT = 16
 
@@ -114,9 +116,11 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     """
     selector = config.high.build(specs=specs, device=device) if specs.num_options else None
     is_shared = config.run.agent.sharing == "shared" and specs.num_options > 0
-    learner_specs = specs.with_option_observed() if is_shared else specs
-    num_learners = 1 if is_shared else max(1, specs.num_options)
-    learners = [config.low.build(specs=learner_specs, device=device) for _ in range(num_learners)]
+    if is_shared:
+        learner_specs = [specs.with_option_observed()]
+    else:
+        learner_specs = [specs.of_option(i) for i in range(specs.num_options)] or [specs]
+    learners = [config.low.build(specs=own_specs, device=device) for own_specs in learner_specs]
     agent = HierarchicalAgent(
         selector,
         learners,
@@ -141,11 +145,14 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
     return demonstrations
 
 
-def make_evaluation(config: Config, env: PAMDPEnv) -> Evaluation:
-    """Build the evaluation on environments of its own, which scale observations as `env` does."""
+def make_evaluation(config: Config, env: PAMDPEnv, num_filmed: int = FILMED_EPISODES) -> Evaluation:
+    """Build the evaluation on environments of its own, which scale observations as `env` does.
+
+    With `film=false` no episode is filmed, otherwise the first `num_filmed`.
+    """
     test_env = make_env(config, config.run.eval.layouts, env.device, seed=0)
     test_env.set_scaling_from(env)
-    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed)
+    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed, num_filmed if config.run.film else 0)
 
 
 def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:

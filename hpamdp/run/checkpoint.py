@@ -31,6 +31,7 @@ from hpamdp.messages import first_line, one_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.run.folder import CHECKPOINT_NAME as FILE_NAME
+from hpamdp.run.folder import POLICY_NAME
 
 _FORMAT = 2
 _MANIFEST = "manifest.json"
@@ -57,6 +58,8 @@ _DAMAGE = (
 def find(path: str | Path, where: str) -> Path:
     """Return the file of a checkpoint.
 
+    A folder without a checkpoint may hold the networks alone, which suffice for everything but to resume the run.
+
     Args:
         path: the file itself or the output folder of its run.
         where: the setting that gave the path, to name in an error.
@@ -66,8 +69,12 @@ def find(path: str | Path, where: str) -> Path:
     """
     path = Path(path).expanduser()
     file = path / FILE_NAME if path.is_dir() else path
+    if where != "resume" and path.is_dir() and not file.is_file() and (path / POLICY_NAME).is_file():
+        file = path / POLICY_NAME
     if not file.is_file():
-        raise ConfigError(f"{where}={path}: no checkpoint there; give a run's output folder or its {FILE_NAME}")
+        has_policy = (path / POLICY_NAME).is_file()
+        why = "networks alone, which cannot be resumed" if has_policy else "no checkpoint there"
+        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}")
     if not zipfile.is_zipfile(file):
         raise ConfigError(f"{where}={file}: not a checkpoint of this program")
     return file

@@ -23,11 +23,18 @@ class Evaluation:
     Args:
         env: a `PAMDPEnv` with its decisions tracked; one environment for each episode, used for nothing else.
         seed: of the episodes.
+        num_filmed: of how many episodes, the first ones, `run_agent` keeps the states.
+
+    Attributes:
+        states: the environment's `env_state` of these episodes at the start and after every step, columns
+            `[num_filmed, ...]`; empty before the first `run_agent` and where the environment has none.
     """
 
-    def __init__(self, env: TransformedEnv, seed: int) -> None:
+    def __init__(self, env: TransformedEnv, seed: int, num_filmed: int = 0) -> None:
         self.env = env
         self.seed = seed
+        self.num_filmed = num_filmed
+        self.states: list[dict[str, Tensor]] = []
         self.episodes = env.fixed_episodes(seed)
         self._reset()
         self.known = env.describe()
@@ -41,19 +48,26 @@ class Evaluation:
         self.problem.seed_evaluation(self.seed)  # the noise, too, is the same at every evaluation
         return self.env.reset(None if self.episodes is None else self.episodes.copy())
 
-    def run(self, policy: TensorDictModuleBase) -> dict[str, np.ndarray]:
+    def run(self, policy: TensorDictModuleBase, states: list[dict[str, Tensor]] | None = None) -> dict[str, np.ndarray]:
         """Play every episode greedily and return arrays whose first dimension is the episode.
 
-        - `return`, `steps`, and `score`: the return, where the environment has no score of its own;
-        - `option`: the first one of each episode, where the agent chooses;
-        - `path` `[N, T + 1, 2]`, NaN past an episode's end, where the environment has positions;
-        - what the environment's `describe` and `results` give.
+        Args:
+            policy: acts.
+            states: the states of the first `num_filmed` episodes are appended to it.
+
+        Returns:
+
+            - `return`, `steps`, and `score`: the return, where the environment has no score of its own;
+            - `option`: the first one of each episode, where the agent chooses;
+            - `path` `[N, T + 1, 2]`, NaN past an episode's end, where the environment has positions;
+            - what the environment's `describe` and `results` give.
         """
         device = self.env.device
         td = self._reset()
         total = torch.zeros(td.batch_size, device=device)
         steps = torch.zeros(td.batch_size, dtype=torch.long, device=device)
         over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]
+        self._film(states)
         # A policy that samples even when greedy (a random one) must not move the run's generators.
         with (
             torch.random.fork_rng(devices=[device] if device.type == "cuda" else []),
@@ -67,6 +81,7 @@ class Evaluation:
                 steps += ~over
                 options.append(td.get(keys.OPTION, None))
                 path.append(_unless(over, self.env.position))
+                self._film(states)
                 td = self.env.step_mdp(td)
                 over = td.get(keys.DONE).squeeze(-1)
                 if over.all():
@@ -84,11 +99,18 @@ class Evaluation:
 
         The latter gives `option_scores` `[N, num_options]`: the scores of the agent's own learners with each option.
         """
-        played = self.run(agent.policy)
+        self.states = []
+        played = self.run(agent.policy, self.states)
         if agent.selector is not None:
             each = [self.run(agent.policy_of(i))["score"] for i in range(agent.specs.num_options)]
             played["option_scores"] = np.stack(each, -1)
         return played
+
+    def _film(self, states: list[dict[str, Tensor]] | None) -> None:
+        """Append the present state of the filmed episodes to `states`."""
+        if states is not None and self.num_filmed > 0:
+            columns = self.problem.env_state()
+            states.append({name: column[: self.num_filmed].cpu().clone() for name, column in columns.items()})
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of an evaluation: score, return, steps, success and the environment's own metrics.

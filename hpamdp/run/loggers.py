@@ -37,6 +37,9 @@ class Logger(Protocol):
     def images(self, paths: Iterable[Path]) -> None:
         """Take figures, under their file names."""
 
+    def film(self, path: Path) -> None:
+        """Take a GIF of episodes, under its file name."""
+
     def summary(self, figures: dict[str, Any]) -> None:
         """Take what closes the run; entries may be mappings."""
 
@@ -59,6 +62,9 @@ class CSVLogger:
 
     def images(self, paths: Iterable[Path]) -> None:
         """Do nothing: the figures are in the folder."""
+
+    def film(self, path: Path) -> None:
+        """Do nothing: the film is in the folder."""
 
     def summary(self, figures: dict[str, Any]) -> None:
         """Do nothing: the summary is in `summary.json`."""
@@ -94,6 +100,18 @@ class TensorboardLogger:
         for path in paths:
             with Image.open(path) as image:
                 self._writer.add_image(path.stem, np.asarray(image.convert("RGB")), self._step, dataformats="HWC")
+
+    def film(self, path: Path) -> None:
+        """Write the GIF as it is, which TensorBoard shows moving."""
+        from PIL import Image
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        with Image.open(path) as image:
+            width, height = image.size
+        # SummaryWriter.add_video would encode the pictures once more, and wants moviepy for it.
+        encoded = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
+        summary = Summary(value=[Summary.Value(tag=path.stem, image=encoded)])
+        self._writer._get_file_writer().add_summary(summary, self._step)
 
     def summary(self, figures: dict[str, Any]) -> None:
         """Write the summary as a table in text."""
@@ -169,7 +187,7 @@ class WandbLogger:
                 raise
             warn(f"wandb could not start online, the run is logged offline: {first_line(error)}")
             self._run = start("offline")
-        self._image = wandb.Image
+        self._image, self._video = wandb.Image, wandb.Video
         self._step = 0
 
     @property
@@ -185,6 +203,10 @@ class WandbLogger:
     def images(self, paths: Iterable[Path]) -> None:
         """Send figures under their file names."""
         self._run.log({path.stem: self._image(str(path)) for path in paths}, step=self._step)
+
+    def film(self, path: Path) -> None:
+        """Send the GIF under its file name."""
+        self._run.log({path.stem: self._video(str(path), format="gif")}, step=self._step)
 
     def summary(self, figures: dict[str, Any]) -> None:
         """Send what closes the run."""

@@ -11,13 +11,17 @@ import numpy as np
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.analysis import figures
+from hpamdp.analysis import figures, film
 from hpamdp.config import Config
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
 from hpamdp.run.closing_table import closing_table
 from hpamdp.run.metrics import MetricsFile
 from hpamdp.run.summary import summarise
+
+FILM_NAME = "episodes.gif"
+# Small and short enough to take a second or two.
+_FPS, _FILM_SIZE, _FILMED_STEPS = 20.0, 200, 40
 
 
 class Recorder:
@@ -96,9 +100,23 @@ class Recorder:
         (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
         logger = self.parts.logger
         logger.images(figures.draw_all(self.output_dir, type(env)))
+        filmed = self._film()
+        if filmed is not None:
+            logger.film(filmed)
         logger.summary(summary)
         logger.close()
         return closing_table(summary, env.table_metrics)
+
+    def _film(self) -> Path | None:
+        """Film the first episodes of the last evaluation, if the problem can be seen, and return the file."""
+        evaluation = self.parts.evaluation
+        tracks = film.tracks_of(evaluation.states, _FILMED_STEPS)
+        pictures = film.film(evaluation.problem, tracks, _FPS, _FILM_SIZE)
+        if not pictures:
+            return None
+        path = self.output_dir / FILM_NAME
+        film.write(path, pictures, _FPS)
+        return path
 
     def _play(self) -> dict[str, np.ndarray]:
         if self._played is None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hpamdp.data import export
 from hpamdp.data.errors import DataError
-from hpamdp.data.human import minari, statistics, validation
+from hpamdp.data.human import minari, played_file, statistics, validation
 from hpamdp.data.human.download import download
 from hpamdp.data.human.episodes import scores_by_person, select
 from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SHA256, HumanData, default_path, read
@@ -70,7 +70,10 @@ def _parser() -> argparse.ArgumentParser:
 
     file_arguments = _Parser(add_help=False)
     file_arguments.add_argument(
-        "file", nargs="?", type=Path, help=f"the recording (default: ${PATH_VARIABLE}, else the one in the cache)"
+        "file",
+        nargs="?",
+        type=Path,
+        help=f"the recording (default: ${PATH_VARIABLE}, else the one in the cache), or a .jsonl of `hpamdp play`",
     )
     file_arguments.add_argument(
         "--any-file", action="store_true", help="take any file of the same schema, whatever its checksum"
@@ -112,7 +115,14 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _read(options: argparse.Namespace, one_frame: bool = False) -> HumanData:
+    if _is_played(options):
+        return played_file.read(options.file)
     return read(options.file, checksum=None if options.any_file else SHA256, one_frame=one_frame)
+
+
+def _is_played(options: argparse.Namespace) -> bool:
+    """Return whether the file is one of `hpamdp play`."""
+    return options.file is not None and options.file.suffix == played_file.SUFFIX
 
 
 def _download(options: argparse.Namespace) -> None:
@@ -120,10 +130,14 @@ def _download(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> None:
+    if _is_played(options):
+        num = played_file.verify(options.file)
+        checksum = f"every one of {num} episodes, practice too, is what its key events come to"
+    else:
+        checksum = "any file was allowed" if options.any_file else f"SHA-256 {SHA256}"
     data = _read(options)
     episodes, presses = data
     people = episodes["person"].unique()
-    checksum = "any file was allowed" if options.any_file else f"SHA-256 {SHA256}"
     print(f"{options.file or default_path()}: {checksum}")
     print(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses; contents fit together")
     num_empty = (episodes["presses"] == 0).sum()
@@ -144,7 +158,8 @@ def _check(options: argparse.Namespace) -> None:
     if len(firsts.is_inside):
         share = firsts.is_inside.float().mean().item()
         print(f"first presses go as far as our physics allows: {share:.1%} of {len(firsts.is_inside)}")
-    print("To know:", *QUIRKS, sep="\n- ")
+    if not _is_played(options):
+        print("To know:", *QUIRKS, sep="\n- ")
 
 
 def _print_counts(name: str, values: Tensor) -> None:

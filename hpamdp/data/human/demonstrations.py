@@ -6,8 +6,10 @@ from pathlib import Path
 
 import torch
 from pydantic import PositiveInt
+from tensordict import TensorDict
 
 from hpamdp.data.demonstrations import Demonstrations
+from hpamdp.data.human import played_file
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.rest_to_rest import to_rest_to_rest
@@ -49,23 +51,73 @@ class HumanDemonstrations(Demonstrations):
         best_people: PositiveInt | None,
         rest_to_rest: bool,
     ) -> None:
-        if not isinstance(env, BoatDockEnv):
-            raise ValueError("people docked boats; use env=boatdock or data=none")
-        rules = env.rules
+        boats = _boats(env)
         data = select(
             read(None if path is None else Path(path), checksum=checksum, one_frame=True),
             complete=complete,
             successes=successes,
             best_people=best_people,
-            controller=rules.controller if rules.controller in harbour.CONTROLLERS else None,
+            controller=_controller_of(boats),
         )
-        recorded = decisions(data, reward=rules.reward, observation=rules.observation) if env.has_choice else None
-        if rest_to_rest:
-            data = to_rest_to_rest(data)
-        if isinstance(rules.keymap, int):
-            data = with_keymap(data, rules.keymap)
-        rows = transitions(data, reward=rules.reward, observation=rules.observation, has_choice=env.has_choice)
-        super().__init__(rows, env.device, decisions=recorded)
+        rows, recorded = _as_returned(data, boats, rest_to_rest=rest_to_rest)
+        super().__init__(rows, boats.device, decisions=recorded)
+
+
+class PlayedDemonstrations(Demonstrations):
+    """The presses of episodes that were played in the page of `hpamdp play`, otherwise as in `HumanDemonstrations`.
+
+    Args:
+        env: the boat-docking environment, which determines controller, key map, reward and observation.
+        path: the file of episodes.
+        practice: whether the episodes of practice count, too.
+        successes, best_people, rest_to_rest: as in `HumanDemonstrations`.
+
+    Raises:
+        ValueError: `env` is not a boat-docking environment.
+        DataError: the file is missing or damaged, or no episode is left.
+    """
+
+    def __init__(
+        self,
+        env: object,
+        *,
+        path: str,
+        practice: bool,
+        successes: bool,
+        best_people: PositiveInt | None,
+        rest_to_rest: bool,
+    ) -> None:
+        boats = _boats(env)
+        data = select(
+            played_file.read(path, practice=practice),
+            successes=successes,
+            best_people=best_people,
+            controller=_controller_of(boats),
+        )
+        rows, recorded = _as_returned(data, boats, rest_to_rest=rest_to_rest)
+        super().__init__(rows, boats.device, decisions=recorded)
+
+
+def _boats(env: object) -> BoatDockEnv:
+    if not isinstance(env, BoatDockEnv):
+        raise ValueError("people docked boats; use env=boatdock or data=none")
+    return env
+
+
+def _controller_of(env: BoatDockEnv) -> str | None:
+    return env.rules.controller if env.rules.controller in harbour.CONTROLLERS else None
+
+
+def _as_returned(data: HumanData, env: BoatDockEnv, *, rest_to_rest: bool) -> tuple[TensorDict, TensorDict | None]:
+    """Return the transitions and, where the agent chooses, the decisions, as the environment would have them."""
+    rules = env.rules
+    recorded = decisions(data, reward=rules.reward, observation=rules.observation) if env.has_choice else None
+    if rest_to_rest:
+        data = to_rest_to_rest(data)
+    if isinstance(rules.keymap, int):
+        data = with_keymap(data, rules.keymap)
+    rows = transitions(data, reward=rules.reward, observation=rules.observation, has_choice=env.has_choice)
+    return rows, recorded
 
 
 def with_keymap(data: HumanData, keymap: int) -> HumanData:

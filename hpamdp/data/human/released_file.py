@@ -144,7 +144,7 @@ def _tables(columns: schema.Columns, one_frame: bool) -> HumanData:
     next_position = np.full((len(episode), 2), np.nan)
     next_position[~is_final] = fields["next_obs"]
 
-    episodes = _table(
+    episodes = table(
         num_episodes,
         person=columns.person,
         index=columns.episode_index,
@@ -159,7 +159,7 @@ def _tables(columns: schema.Columns, one_frame: bool) -> HumanData:
         goal=fields["SG"][:, [1, 3]] + shift,
         centre=fields["center"] + shift,
     )
-    presses = _table(
+    presses = table(
         len(episode),
         episode=episode,
         press=press,
@@ -175,7 +175,7 @@ def _tables(columns: schema.Columns, one_frame: bool) -> HumanData:
     return HumanData(episodes, presses)
 
 
-def _table(size: int, **columns: np.ndarray) -> TensorDict:
+def table(size: int, **columns: np.ndarray) -> TensorDict:
     """Return a table of these columns, with float64 made float32."""
     table = TensorDict(batch_size=[size])
     for name, values in columns.items():

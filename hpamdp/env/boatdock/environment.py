@@ -6,7 +6,8 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -29,13 +30,17 @@ from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import check_arguments, invalid_press, one_or_two
 from hpamdp.env.columns import where
+from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from hpamdp.env.boatdock.play.boat_page import BoatPage
+
 Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
+_CONTROLLER_ENTRY = episode.OBSERVATION_NAMES.index("controller")
 # What a tensordict has whose next root holds nothing else.
 _PLAIN_KEYS = {
     keys.OBSERVATION,
@@ -71,8 +76,9 @@ class BoatDockEnv(PAMDPEnv):
             congruent boat.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
-        compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU; on the CPU
-            the kernel is as fast.
+        recording: a file of `hpamdp play`, whose figures stand in tables and curves in place of people's.
+        compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU, instead
+            of using the kernel.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
@@ -131,6 +137,7 @@ class BoatDockEnv(PAMDPEnv):
         motor_noise: float | Pair = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
+        recording: str | None = None,
         compile_rules: bool = False,
         oracle: bool = False,
         human: bool = False,
@@ -140,6 +147,7 @@ class BoatDockEnv(PAMDPEnv):
     ) -> None:
         rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
         check_arguments(num_envs, rules)
+        self._played = None if recording is None else _figures_of(recording, controller)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
@@ -197,6 +205,84 @@ class BoatDockEnv(PAMDPEnv):
         """Where the boats are, px from the harbour's centre, `[N, 2]`."""
         return torch.stack([self._state.x, self._state.y], -1)
 
+    @property
+    def symmetries(self) -> Symmetries:
+        """The turns and mirrors of the plane that permute a boat's directions and, where both occur, swap the boats.
+
+        Six maps keep a boat, and six more swap it for the other, whose directions are the opposite ones. With a random
+        key map, which is not observed, only those remain that permute the keys of both key maps alike; with motor noise
+        that differs between the boats, those that keep the boat.
+        """
+        tables = self._directions()
+        plane = plane_maps(6)
+        flips = []  # for each map, whether every boat's directions become those of the other boat
+        discrete = []
+        for each in plane:
+            for is_swap in {False, len(tables) > 1}:
+                targets = tables[::-1] if is_swap else tables
+                rows = [_as_one_table(each, own, other) for own, other in zip(tables, targets, strict=True)]
+                found = [row for row in rows if row is not None]
+                if len(found) == len(rows) and not (is_swap and len(set(self.rules.motor_noise)) > 1):
+                    flips.append((each, is_swap))
+                    discrete.append(torch.stack(found))
+        kept = torch.stack([each for each, _ in flips])
+        weight, offset = on_observations(kept, self._observation_dim, *self._vectors())
+        keys_after = torch.stack(discrete)
+        contexts = torch.stack([torch.tensor([1, 0] if is_swap else range(len(tables))) for _, is_swap in flips])
+        return make_symmetries(
+            weight,
+            offset=offset,
+            discrete=keys_after,
+            source=keys_after.argsort(-1),  # key k has parameter k
+            contexts=contexts,
+            context_entry=_CONTROLLER_ENTRY if len(tables) > 1 else None,
+            num_parameters=harbour.NUM_KEYS,
+        )
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """The places and the velocity, and where the keys point, unless a random key map leaves that open.
+
+        Every press begins at rest, so that the velocity tells nothing; where the start was shows in the distances
+        alone. The harbour is always the same. With the goal's offset, the goal itself is known, too.
+        """
+        names = ["start_x", "start_y", "centre_x", "centre_y", "radius", "velocity_x", "velocity_y"]
+        if self.rules.observation == "scaled" and self.rules.sensor_noise == 0.0:
+            names += ["goal_x", "goal_y"]
+        tables = self._directions()
+        vectors, origins = self._vectors()
+        is_known = all(len(table) == 1 for table in tables)
+        return PlaneGeometry(
+            num_contexts=len(tables),
+            context_entry=_CONTROLLER_ENTRY if len(tables) > 1 else None,
+            vectors=vectors,
+            origins=origins,
+            directions=torch.stack([table[0] for table in tables]).float() if is_known else None,
+            kinds=(0,) * harbour.NUM_KEYS if is_known else (),
+            has_mirror=True,
+            redundant=tuple(episode.OBSERVATION_NAMES.index(name) for name in names),
+        )
+
+    def _directions(self) -> list[list[Tensor]]:
+        """Return for each boat that occurs the possible tables of its keys' directions, float64 `[3, 2]`."""
+        maps = (1, 2) if self.rules.keymap == "random" else (self.rules.keymap,)
+        table = torch.tensor(harbour.DIRECTIONS, dtype=torch.float64)
+        both = [[table[number - 1] for number in maps], [table[2]]]
+        if self.rules.controller in harbour.CONTROLLERS:
+            return [both[harbour.CONTROLLERS.index(self.rules.controller)]]
+        return both
+
+    @property
+    def _observation_dim(self) -> int:
+        return self.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
+
+    def _vectors(self) -> tuple[tuple[tuple[int, int], ...], tuple[tuple[float, float], ...]]:
+        """Return which entries of the observation are vectors, and from where on they are measured."""
+        places: tuple[tuple[int, int], ...] = ((0, 1), (2, 3), (8, 9))
+        if self.rules.observation == "pixels":
+            return (*places, (10, 11)), (*[harbour.CENTRE] * len(places), (0.0, 0.0))
+        return (*places, (10, 11), (14, 15)), ()
+
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return layouts to `reset` with, one for each boat, that no training episode meets, whatever its seed."""
         layout = harbour.fixed_layouts(self.num_envs, seed)
@@ -243,11 +329,13 @@ class BoatDockEnv(PAMDPEnv):
         return "chosen" if self.has_choice else self.rules.controller
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the figures of people, of the best of them and of the ceiling on the same layouts."""
+        """Return the figures of people, of the best of them, or of a recording, and of the ceiling on these layouts."""
         ceiling = {**super().references(measured)["ceiling"], "success": 1.0}
         ceiling["human_normalised"] = human_normalised(ceiling["score"], self._controller_of_run)
         if self.has_choice:
             ceiling["oracle_agreement"] = 1.0
+        if self._played is not None:
+            return {"you": self._played, "ceiling": ceiling}
         return {**human_references(self._controller_of_run), "ceiling": ceiling}
 
     def summary_entries(self) -> dict[str, str]:
@@ -260,6 +348,18 @@ class BoatDockEnv(PAMDPEnv):
         from hpamdp.env.boatdock import figures  # matplotlib takes long to import
 
         return figures.draw(evaluation, summary)
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+        """Return the pictures of one episode, in which the boat moves as it does in the task."""
+        from hpamdp.env.boatdock import film  # which draws, as few who sail do
+
+        return film.film(track, fps, size)
+
+    def page(self, seed: int) -> BoatPage:
+        """Return the page on which people dock boats."""
+        from hpamdp.env.boatdock.play.boat_page import BoatPage
+
+        return BoatPage(seed)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
@@ -427,6 +527,35 @@ class BoatDockEnv(PAMDPEnv):
         if self._has_human:
             seen.set(keys.HUMAN_OPTION, human_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
+
+
+def _figures_of(recording: str, controller: str) -> dict[str, float]:
+    """Return the means of a recording, of the episodes with this controller where it is fixed."""
+    from hpamdp.env.boatdock.play import episodes  # which few need
+
+    of_controller = controller if controller in harbour.CONTROLLERS else None
+    means = episodes.figures(episodes.read(Path(recording)), of_controller)
+    return {
+        **means,
+        "human_normalised": human_normalised(means["score"], "chosen" if of_controller is None else controller),
+    }
+
+
+def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) -> Tensor | None:
+    """Return which keys the keys become, int64 `[3]`, if a map makes every table the target of its number.
+
+    None: some direction becomes none of the targets, or another key with another key map.
+    """
+    if len(tables) != len(targets):
+        return None
+    found = None
+    for table, target in zip(tables, targets, strict=True):
+        keys_after = as_directions(plane.unsqueeze(0), table, target)[0]
+        is_exact = torch.allclose(table @ plane.T, target[keys_after], atol=1e-6)
+        if not is_exact or (found is not None and not keys_after.equal(found)):
+            return None
+        found = keys_after
+    return found
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -82,6 +82,25 @@ def press_for(distance: Tensor) -> Tensor:
     return duration_for(distance / (1.0 + GLIDE))
 
 
+def distance_at(duration: Tensor, elapsed: Tensor) -> Tensor:
+    """Return the distance (px) covered `elapsed` seconds after the beginning of a press of `duration` seconds."""
+    pressed = pressed_distance(torch.minimum(elapsed, duration).clamp(min=0.0))
+    # The glide runs back down the speed curve; this is the press time that would give the speed at that moment.
+    virtual = (duration - (elapsed - duration).clamp(min=0.0) / GLIDE).clamp(min=0.0)
+    return torch.where(elapsed > duration, pressed + GLIDE * (pressed - pressed_distance(virtual)), pressed)
+
+
+def time_at(duration: Tensor, distance: Tensor) -> Tensor:
+    """Return the seconds until a press of `duration` seconds has covered `distance` px: the inverse of `distance_at`.
+
+    Where the boat comes to rest before, it is the time at which it does.
+    """
+    pressed = pressed_distance(duration)
+    virtual = torch.minimum(duration_for(pressed - (distance - pressed) / GLIDE), duration)
+    in_glide = duration + GLIDE * (duration - virtual)
+    return torch.where(distance > pressed, in_glide, torch.minimum(duration_for(distance), duration))
+
+
 def distance_to_dock(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, dir_x: Tensor, dir_y: Tensor) -> Tensor:
     """Return the distance (px) along the course to the dock circle; `inf` where the course misses it."""
     ahead = (goal_x - x) * dir_x + (goal_y - y) * dir_y

@@ -17,7 +17,9 @@ from hpamdp.env.catch_point import kernel, rules
 from hpamdp.env.catch_point.rules import CatchPointState
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.point_env import PointEnv
+from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 
+_TURNS = 8  # of all the turns, so many are declared
 _CEILING = {25: 0.964, 30: 0.997}  # of success, by the limit of steps: who starts too far away cannot arrive
 
 
@@ -38,7 +40,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         late_end: whether an episode that has no catches left ends a step later, in which it earns 0, as the published
             code does it.
         progress: whether misses and time are observed, too, `[N, 6]` instead of `[N, 4]`, as DLPA has it.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
@@ -93,6 +95,30 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         if not self.progress:
             return low, high
         return [*low, -1.0, -1.0], [*high, 1.0, self.max_steps / 12.0 - 0.99]
+
+    @property
+    def symmetries(self) -> Symmetries:
+        """Turns of the plane by multiples of 45 degrees and their mirrors; any other turn would do as well."""
+        plane = plane_maps(_TURNS)
+        weight, offset = on_observations(plane, len(self.observation_names), point_agent.VECTORS)
+        # A direction runs from +y to +x, so a turn by a, from +x to +y, makes p into p - a; the mirror x -> -x before
+        # it makes p into -p.
+        turn = 2.0 * torch.arange(_TURNS).repeat(2) / _TURNS
+        sign = torch.ones(2 * _TURNS).index_fill(0, torch.arange(_TURNS, 2 * _TURNS), -1.0)
+        return make_symmetries(
+            weight,
+            offset=offset,
+            discrete=torch.arange(len(rules.ACTIONS)).expand(2 * _TURNS, -1),
+            sign=sign.unsqueeze(-1),
+            shift=-turn.unsqueeze(-1),
+            is_periodic=[True],
+            num_parameters=1,
+        )
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """The speed and the way to the target; where a move points is its parameter."""
+        return PlaneGeometry(vectors=point_agent.VECTORS)
 
     def start(self, episode: Tensor, rng: Key) -> CatchPointState:
         """Return states with agent and target anywhere in the square."""

@@ -21,6 +21,7 @@ from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.goal import kernel, rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
+from hpamdp.geometry import Symmetries, make_symmetries
 
 Slip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]  # the last is Hard Goal's alone
 
@@ -50,7 +51,7 @@ class GoalEnv(CounterEnv[GoalState]):
         observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
         noise: factor on the published noise of the motions; 0 is none. Starts are random all the same.
         repaired: the slips to take out; `slips` are those that the problem has.
-        compile_rules: compile the ticks: faster with many pitches, but the first action takes about a minute.
+        compile_rules: compile the ticks (takes about a minute) instead of using the kernel, for a GPU.
         device: of the tensors.
         seed: of starts and noise; the global generators are neither read nor moved.
         first_env: number of the first pitch, where other processes have the pitches before it.
@@ -190,6 +191,40 @@ class GoalEnv(CounterEnv[GoalState]):
         """Return a picture of the pitch and the way of the ball, uint8 `[480, 480, 3]`."""
         return rendering.draw(track)
 
+    @property
+    def symmetries(self) -> Symmetries | None:
+        """The mirror y -> -y, with all slips repaired; each of them breaks it, so that else there is none.
+
+        An unrepaired kick goes to (x, x), on one side of the pitch; the distance from the goal is wrong on the other
+        side alone, and the keeper's shadow is clipped differently on the two sides.
+        """
+        if set(self.repaired) != set(self.slips):
+            return None
+        # y, vertical velocities and orientations change their sign.
+        flips = torch.tensor([name.endswith(("_y", "_vy", "_angle", "_projection")) for name in self.observation_names])
+        sign = torch.where(flips, -1.0, 1.0)
+        offset = torch.zeros_like(sign)
+        if self._is_scaled:
+            low, high = torch.tensor(rules.OBSERVATION_LOW), torch.tensor(rules.OBSERVATION_HIGH)
+            offset = torch.where(flips, -2.0 * (high + low) / (high - low), 0.0)
+        discrete, parameters = self._mirrored_actions()
+        return make_symmetries(
+            torch.stack([torch.eye(len(sign)), sign.diag()]),
+            offset=torch.stack([torch.zeros_like(offset), offset]),
+            discrete=torch.stack([torch.arange(len(self.parameter_dims)), discrete]),
+            source=torch.stack([torch.arange(len(parameters)), parameters]),
+            sign=torch.stack([torch.ones(len(parameters)), self._mirrored_signs()]),
+            num_parameters=len(parameters),
+        )
+
+    def _mirrored_actions(self) -> tuple[Tensor, Tensor]:
+        """Return what each action becomes on the mirrored pitch, and which parameter takes each place."""
+        return torch.arange(3), torch.arange(4)
+
+    def _mirrored_signs(self) -> Tensor:
+        """Return the signs that the parameters get: only x of a kick keeps its own."""
+        return torch.tensor([1.0] + [-1.0] * (len(self.parameter_low) - 1))
+
     def _aim(self, discrete: Tensor, parameters: Tensor) -> Aim:
         return rules.goal_aim(discrete, parameters, kicks_to_point="kick_to" in self.repaired)
 
@@ -228,6 +263,11 @@ class HardGoalEnv(GoalEnv):
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return None: there are no published ones."""
         return None
+
+    def _mirrored_actions(self) -> tuple[Tensor, Tensor]:
+        # Each foot's five stretches change places, and with them their parameters.
+        shots = torch.arange(1, 11).reshape(2, 5).flip(-1).flatten()
+        return torch.cat([torch.zeros(1, dtype=torch.long), shots]), torch.cat([torch.arange(2), shots + 1])
 
     def _aim(self, discrete: Tensor, parameters: Tensor) -> Aim:
         return rules.hard_goal_aim(

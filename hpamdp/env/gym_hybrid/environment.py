@@ -15,6 +15,7 @@ from hpamdp.env.counter_rng import Key
 from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
 from hpamdp.env.point_env import PointEnv
+from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 
 
 class _VehicleEnv(PointEnv[VehicleState]):
@@ -57,6 +58,27 @@ class _VehicleEnv(PointEnv[VehicleState]):
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[10]` each."""
         return rules.observation_bounds(self.max_steps)
+
+    @property
+    def symmetries(self) -> Symmetries:
+        """The turns of the square field and their mirrors, which also mirror a turn of the vehicle."""
+        plane = plane_maps(4)
+        weight, offset = on_observations(plane, len(self.observation_names), rules.VECTORS)
+        is_mirrored = torch.arange(len(plane)) >= 4
+        turn_sign = torch.where(is_mirrored, -1.0, 1.0)
+        # Unit parameters: the acceleration stays, the turn changes its sign.
+        return make_symmetries(
+            weight,
+            offset=offset,
+            discrete=torch.arange(len(rules.ACTIONS)).expand(len(plane), -1),
+            sign=torch.stack([torch.ones_like(turn_sign), turn_sign], -1),
+            num_parameters=2,
+        )
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """The places of vehicle and target, and the heading."""
+        return PlaneGeometry(vectors=rules.VECTORS)
 
     def start(self, episode: Tensor, rng: Key) -> VehicleState:
         """Return states with vehicle and target anywhere in the field, at rest."""
@@ -104,7 +126,7 @@ class MovingEnv(_VehicleEnv):
     Args:
         num_envs: number of fields.
         max_steps: actions after which an episode is truncated; gym-hybrid has 201.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.

@@ -32,6 +32,7 @@ OBSERVATION_NAMES = (
     "inside",
     "time_share",
 )
+VECTORS = ((0, 1), (3, 4), (5, 6))  # of the observation
 PUBLISHED_STEPS = 201
 TARGET_RADIUS = 0.1
 LARGEST_PUSH = 0.5  # what an acceleration adds to the speed at most

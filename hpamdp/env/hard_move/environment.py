@@ -16,6 +16,7 @@ from hpamdp.env.counter_rng import Key
 from hpamdp.env.hard_move import kernel, rules
 from hpamdp.env.hard_move.rules import HardMoveState
 from hpamdp.env.point_env import PointEnv
+from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 
 NumActuators = Literal[4, 6, 8, 10]
 
@@ -41,7 +42,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         n: number of actuators.
         max_steps: actions after which an episode is truncated; HyAR has 30, DLPA 25.
         rounded_directions: whether the actuators' directions have three decimals, as published.
-        compile_rules: compile the rules (takes about half a minute): faster with thousands of environments.
+        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
         seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
@@ -94,6 +95,40 @@ class HardMoveEnv(PointEnv[HardMoveState]):
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[4]` each."""
         return point_agent.observation_bounds(self.max_steps)
+
+    @property
+    def symmetries(self) -> Symmetries:
+        """Turns by the angle between two actuators and their mirrors.
+
+        With 4 actuators they hold to rounding, with 6, 8 and 10 to 1e-4 of the observation a step, since the published
+        directions have three decimals; without `rounded_directions` to rounding.
+        """
+        n = self.n
+        plane = plane_maps(n)
+        weight, offset = on_observations(plane, len(self.observation_names), point_agent.VECTORS)
+        actuator = torch.arange(n)
+        turned = [(actuator + turn) % n for turn in range(n)]
+        # The mirror x -> -x takes the angle a to half a turn - a.
+        mirrored = [(n // 2 - actuator + turn) % n for turn in range(n)]
+        bit = 1 << (n - 1 - actuator)  # actuator 0 is the highest
+        is_in = (torch.arange(2**n).unsqueeze(-1) & bit) > 0
+        sets = torch.stack([(is_in * bit[becomes]).sum(-1) for becomes in turned + mirrored])
+        return make_symmetries(
+            weight, offset=offset, discrete=sets, source=sets.argsort(-1), num_parameters=len(self.parameter_dims)
+        )
+
+    @property
+    def geometry(self) -> PlaneGeometry:
+        """Where each set pushes; sets that push equally strongly are of one kind, to the rounding of the directions."""
+        strength = self._motions.norm(dim=-1, keepdim=True)
+        directions = torch.where(strength > 1e-6, self._motions / strength.clamp(min=1e-6), 0.0)
+        kinds = strength.squeeze(-1).round(decimals=2).unique(return_inverse=True)[1]
+        return PlaneGeometry(
+            vectors=point_agent.VECTORS,
+            directions=directions.unsqueeze(0).cpu(),
+            kinds=tuple(kinds.tolist()),
+            has_mirror=True,
+        )
 
     def start(self, episode: Tensor, rng: Key) -> HardMoveState:
         """Return states with agent and target anywhere in the square."""

@@ -30,6 +30,7 @@ _MAX_SPEED, _MAX_PUSH = _F(rules._MAX_SPEED), _F(rules._MAX_PUSH)
 _HOP_RISE, _LEAP_RISE = _F(rules._HOP_RISE), _F(rules._LEAP_RISE)
 _ENEMY, _FIRST_START, _SECOND_START = _F(rules._ENEMY_SPEED), _F(rules._FIRST_START), _F(rules._SECOND_START)
 _JUMP_NOISE, _TICK_NOISE = _F(rules._JUMP_NOISE), _F(rules._TICK_NOISE)
+_RUN_TICKS = int(rules._RUN_TICKS)
 _FALL = _F(0.5 * rules._GRAVITY * rules._TICK)
 _FEATURES = np.array(rules._PLATFORM_FEATURES, np.float32)
 _LENGTH, _HUNDRED = _F(rules.END + rules.BODY_WIDTH), _F(100.0)
@@ -77,7 +78,8 @@ def _act(floats: Any, row: Any, action: Any, given: Any, first: Any, bits: Any, 
     enemy_x, enemy_speed = floats[_ENEMY_X, row], floats[_ENEMY_SPEED, row]
     edge = _edge(x)
     is_jump = (action != rules.RUN) & (x <= edge)
-    power, rise, length = given, ZERO, int32(rules._RUN_TICKS)
+    power, rise = given, ZERO
+    length = _RUN_TICKS
     if is_jump:
         power = ZERO
         rise = _HOP_RISE if action == rules.HOP else _LEAP_RISE
@@ -85,7 +87,7 @@ def _act(floats: Any, row: Any, action: Any, given: Any, first: Any, bits: Any, 
         push -= noise * _JUMP_NOISE * abs(kernels.normal(bits, step, first))
         rise -= noise * _JUMP_NOISE * abs(kernels.normal(bits, step, first + 1))
         speed += min(max(push, -_MAX_PUSH), _MAX_PUSH)
-        length = int32(max(math.floor(rise / _FALL), -1) + 2)
+        length = int(max(math.floor(rise / _FALL), -1) + 2)
     height, has_met, is_off = ZERO, False, False
     for tick in range(max(length, 1)):
         drag = noise * _TICK_NOISE * abs(kernels.normal(bits, step, first + 2 + 2 * tick))

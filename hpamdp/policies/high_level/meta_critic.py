@@ -7,6 +7,9 @@ Where the selector decides when options end, an option is interrupted as soon as
 the first source).
 
 Differs from the sources: where a time limit ends an episode, nothing follows.
+
+Differs from Chen et al.: which decisions a member of the ensemble learns from is drawn anew at every update, not once
+for each decision, and all members share one target, the mean of the target members.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
+from hpamdp.policies.shared.portable import portable_ensemble
 from hpamdp.policies.shared.replay import linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
@@ -94,6 +98,10 @@ class MetaCritic(Selector):
     def stateful(self) -> dict[str, Any]:
         """Return the optimiser and the replay buffer."""
         return {"critics": self.optimizer, "buffer": self.buffer}
+
+    def portable(self) -> dict[str, Any]:
+        """Return the critics: see `hpamdp.policies.shared.portable`."""
+        return portable_ensemble(self.critics)
 
     @property
     def epsilon(self) -> float:

@@ -38,8 +38,9 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
-from hpamdp.policies.low_level.dlpa_model import PAMDPModel, Prediction
+from hpamdp.policies.low_level.dlpa_model import PAMDPModel
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -141,16 +142,16 @@ class Planner:
     def returns(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
         """Return the predicted returns `[N, S]` of action sequences from states `[N, observation_dim]`."""
         rows = state.repeat_interleave(discrete.shape[1], 0)
-        total = rows.new_zeros(())
-        survival = rows.new_ones(())
-        for h in range(discrete.shape[2]):
-            with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
-                predicted = self.model(rows, discrete[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
-            ends = predicted.logit.float().sigmoid()
-            reward = ends * predicted.terminating + (1.0 - ends) * predicted.continuing
-            total = total + self.gamma**h * survival * reward.float()
-            survival = survival * (1.0 - ends)
-            rows = predicted.next_state
+
+        def steps() -> Iterator[Prediction]:
+            nonlocal rows
+            for h in range(discrete.shape[2]):
+                with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
+                    predicted = self.model(rows, discrete[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
+                rows = predicted.next_state
+                yield predicted
+
+        total = discounted_return(steps(), self.gamma)
         value = total.mean(0)
         if self.pessimism > 0.0:
             value = value - self.pessimism * total.std(0, correction=0)
@@ -162,10 +163,9 @@ class Planner:
         The parameters of a discrete action are estimated from the elites that choose it; they stay as they were if
         there are none.
         """
-        value, elite = returns.topk(self.num_elites, 1)
+        elite, elite_weight = elite_weights(returns, self.num_elites, self.temperature)
         discrete = discrete.take_along_dim(elite[..., None], 1)
         unit = unit.take_along_dim(elite[..., None, None], 1)
-        elite_weight = (value / self.temperature).softmax(1)
         discrete_weight = elite_weight[..., None, None] * F.one_hot(discrete, self.specs.num_discrete)
         parameter_weight = discrete_weight @ self.specs.parameter_mask.to(discrete_weight)
         total = parameter_weight.sum(1)
@@ -255,6 +255,7 @@ class DLPA(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
         warmup_frames: PositiveInt,
         epsilon: FractionBelowOne,
         gamma: PositiveFraction,
@@ -276,6 +277,7 @@ class DLPA(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.loss_weights = {"state": state_weight, "reward": reward_weight, "termination": termination_weight}
         self.rho = rho
@@ -376,7 +378,7 @@ class DLPA(ReplayLearner):
         """Yield `num_batches` samples of windows that start at any stored step."""
         starts = torch.randint(len(self.buffer), (num_batches, self.batch_size), device=self.frames.device)
         for start in starts:
-            yield self.windows(start)
+            yield self.augmented(self.windows(start))
 
     def windows(self, start: Tensor) -> TensorDictBase:
         """Return the windows `[N, horizon]` of consecutive steps that start at places `[N]`.

@@ -5,13 +5,12 @@ Source: Zhang, Fu, Miao and Konidaris, 2024, arXiv 2404.03037, section 4. See `d
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp.policies.shared.networks import EnsembleMLP
+from hpamdp.policies.shared.planning import Prediction
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -52,15 +51,6 @@ class Predictor(nn.Module):
         if self.first is not None:
             x = self.first(x).relu()
         return self.net(torch.cat([x, own], -1))
-
-
-class Prediction(NamedTuple):
-    """What the model predicts for one step."""
-
-    next_state: Tensor  # [B, observation_dim], if the step does not terminate
-    continuing: Tensor  # [E, B] reward if the step does not terminate
-    terminating: Tensor  # [E, B] reward if it does
-    logit: Tensor  # [E, B] of termination
 
 
 class PAMDPModel(nn.Module):

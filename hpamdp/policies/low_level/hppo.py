@@ -19,7 +19,7 @@ product.
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -35,6 +35,7 @@ from hpamdp.policies.shared.fractions import Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy
+from hpamdp.policies.shared.portable import portable_actor
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes what the ratios need: the raw sample of the parameters and the log-likelihoods.
@@ -128,6 +129,10 @@ class HPPO(OnPolicy, Learner):
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
+
+    def portable(self) -> dict[str, Any] | None:
+        """Return the actor: see `hpamdp.policies.shared.portable`."""
+        return portable_actor(self.policy.actor, self.specs)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.

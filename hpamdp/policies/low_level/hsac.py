@@ -131,6 +131,7 @@ class HSAC(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
         policy_delay: PositiveInt,
         gamma: PositiveFraction,
         tau: PositiveFraction,
@@ -147,6 +148,7 @@ class HSAC(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.discrete_target_entropy = discrete_target_entropy * math.log(specs.num_discrete)
         self.parameter_target_entropy = parameter_target_entropy

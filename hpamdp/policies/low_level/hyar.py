@@ -243,6 +243,7 @@ class HyAR(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
         gamma: PositiveFraction,
         tau: PositiveFraction,
         actor_lr: LearningRate,
@@ -264,6 +265,7 @@ class HyAR(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.codec_pretrain_updates = codec_pretrain_updates
         self.codec_every = codec_every
@@ -304,6 +306,13 @@ class HyAR(ReplayLearner):
         """Return the rows to store, with the latent actions that the actor gave."""
         return super().transitions(batch).set(LATENT, batch[LATENT])
 
+    def augmented(self, sample: TensorDictBase) -> TensorDictBase:
+        """Return a sample mapped by random symmetries; the latent actions are to be encoded anew."""
+        if self.symmetry is None:
+            return sample
+        mapped = self.symmetry(sample)
+        return mapped.set(LATENT, torch.full_like(mapped[LATENT], torch.nan))
+
     def start(self) -> None:
         """Train the codec alone."""
         stored = self.buffer[:]
@@ -311,7 +320,7 @@ class HyAR(ReplayLearner):
         # The lower bound keeps entries that never change from dividing by 0.
         self.codec.change_scale.copy_(change.std(0).clamp(min=1e-2))
         for _ in range(self.codec_pretrain_updates):
-            self._update_codec(self.buffer.sample(self.batch_size))
+            self._update_codec(self.augmented(self.buffer.sample(self.batch_size)))
         self._fit_latent_range()
 
     def explore(self, frames: int) -> None:

@@ -56,6 +56,7 @@ class IQL(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
     ) -> None:
         if not min_scale < max_scale:
             raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
@@ -67,6 +68,7 @@ class IQL(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.expectile = expectile
         self.temperature = temperature

@@ -123,6 +123,7 @@ class PDQN(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
         gamma: PositiveFraction,
         reward_scale: PositiveFloat,
         actor_lr: LearningRate,
@@ -143,6 +144,7 @@ class PDQN(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.stores_own_parameters = multipass
         self.double_q = double_q

@@ -118,6 +118,7 @@ class TD3BC(ReplayLearner):
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
         updates_per_frame: PositiveFloat,
+        augment: bool,
     ) -> None:
         super().__init__(
             specs,
@@ -127,6 +128,7 @@ class TD3BC(ReplayLearner):
             buffer_size=buffer_size,
             batch_size=batch_size,
             updates_per_frame=updates_per_frame,
+            augment=augment,
         )
         self.behaviour_weight = behaviour_weight
         self.target_smoothing = target_smoothing

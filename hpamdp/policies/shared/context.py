@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
@@ -127,19 +127,39 @@ class LinearBandit(Selector):
         Both are `[B, num_options]`. The deviation is that of the estimate, not of a single reward.
         """
         x = self.features(observation)
-        identity = torch.eye(self.features.num_features, dtype=x.dtype, device=x.device)
-        gram = self.gram + self.ridge * identity
-        # The magnitudes of monomials may differ so much that rounding leaves a matrix that is not positive definite.
-        # Therefore each feature is scaled by its own size, and a little is added to the diagonal.
-        size = gram.diagonal(dim1=-2, dim2=-1).sqrt()
-        factor = torch.linalg.cholesky(gram / (size.unsqueeze(-1) * size.unsqueeze(-2)) + 1e-11 * identity)
-        theta = torch.cholesky_solve((self.moment / size).unsqueeze(-1), factor).squeeze(-1) / size
+        theta, factor, size = self._regression()
         # x' A^-1 x is the squared length of L^-1 x.
         spread = torch.linalg.solve_triangular(factor, (x / size.unsqueeze(1)).mT, upper=False)
         total = self.statistics.counts.sum().clamp(min=1.0)
         explained = (theta * self.moment).sum() / total
         noise = (self.statistics.squares.sum() / total - explained).clamp(min=1e-12).sqrt()
         return x @ theta.T, noise * spread.square().sum(1).sqrt().T
+
+    def _regression(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return each option's coefficients `[num_options, num_features]`, and how its Gram matrix is factorised.
+
+        The factor is that of the matrix scaled by the features' sizes, `[num_options, num_features]`.
+        """
+        identity = torch.eye(self.features.num_features, dtype=self.gram.dtype, device=self.gram.device)
+        gram = self.gram + self.ridge * identity
+        # The magnitudes of monomials may differ so much that rounding leaves a matrix that is not positive definite.
+        # Therefore each feature is scaled by its own size, and a little is added to the diagonal.
+        size = gram.diagonal(dim1=-2, dim2=-1).sqrt()
+        factor = torch.linalg.cholesky(gram / (size.unsqueeze(-1) * size.unsqueeze(-2)) + 1e-11 * identity)
+        theta = torch.cholesky_solve((self.moment / size).unsqueeze(-1), factor).squeeze(-1) / size
+        return theta, factor, size
+
+    def portable(self) -> dict[str, Any] | None:
+        """Return the polynomials: see `hpamdp.policies.shared.portable`; None for other features."""
+        if not self.features.is_polynomial:
+            return None
+        theta, _, _ = self._regression()
+        return {
+            "kind": "polynomial",
+            "inputs": self.features.inputs.tolist(),
+            "factors": self.features.factors.tolist(),
+            "coefficients": theta.tolist(),
+        }
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return a score for each option, `[B, num_options]`; exploring choices take the highest.

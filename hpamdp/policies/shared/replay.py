@@ -12,6 +12,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
+from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -28,6 +29,7 @@ class ReplayLearner(Learner):
     The target of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
     Attributes:
+        symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
         stores_own_parameters: whether the buffer holds the parameters of the discrete action taken alone, which is less
             where there are many; samples then have 0 for the others.
     """
@@ -51,6 +53,7 @@ class ReplayLearner(Learner):
         buffer_size: int,
         batch_size: int,
         updates_per_frame: float,
+        augment: bool = False,
     ) -> None:
         if batch_size > buffer_size:
             raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
@@ -61,6 +64,7 @@ class ReplayLearner(Learner):
         self.warmup_frames = warmup_frames
         self.batch_size = batch_size
         self.updates_per_frame = updates_per_frame
+        self.symmetry = RandomSymmetry(specs, device) if augment else None
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
@@ -124,7 +128,11 @@ class ReplayLearner(Learner):
         for sample in self.buffer.sample(num_batches * self.batch_size).split(self.batch_size):
             if self.stores_own_parameters:
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
-            yield sample
+            yield self.augmented(sample)
+
+    def augmented(self, sample: TensorDictBase) -> TensorDictBase:
+        """Return a sample `[N, *]` with each row mapped by a random symmetry of the problem, if `augment` is set."""
+        return sample if self.symmetry is None else self.symmetry(sample)
 
     def _all_parameters(self, discrete: Tensor, own: Tensor) -> Tensor:
         """Return parameters `[B, num_parameters]`, 0 but for the discrete actions' own `[B, max(parameter_dims)]`."""

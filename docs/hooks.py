@@ -1,0 +1,287 @@
+"""What mkdocs needs to make the site of the repository's own files, so that nothing is written twice.
+
+- Pages outside docs/ become pages of the site: the README, the changelog, the studies.
+- Relative links are turned from files into pages. Code that a page links to gets a page of its own. A link that leads
+  nowhere is a warning, and so an error.
+- Directives, which are HTML comments on lines of their own, are filled in:
+  `<!-- settings of conf/low/hppo.yaml -->`, every value with its default and its comment;
+  `<!-- docstring of hpamdp/policies/low_level/hppo.py: Source -->`, the parts of a module's docstring that begin so;
+  `<!-- rows of experiments/table1/README.md, table 2: hppo -->`, the rows of a study's table by their first cell;
+  `<!-- csv experiments/domains/published.csv: domain=platform -->`, the rows of a csv file by a column.
+- Every module of the package with a public docstring gets a page in the API.
+"""
+
+from __future__ import annotations
+
+import ast
+import csv
+import logging
+import posixpath
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = "docs/"
+log = logging.getLogger("mkdocs.hooks.pages")
+
+FENCE = re.compile(r"^ *```.*?^ *```[^\n]*$", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?(?=\))")
+DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv) (.+?) -->$", re.MULTILINE)
+TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
+LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
+PICTURES = {".png", ".gif", ".svg"}
+
+
+class SiteError(Exception):
+    """A directive or a link that leads nowhere."""
+
+
+def page_of(path: str) -> str | None:
+    """Return the place of a file of the repository in the site, None if it is no page.
+
+    Args:
+        path: relative to the repository, as `experiments/table1/README.md`.
+    """
+    fixed = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+    if path in fixed:
+        return fixed[path]
+    study = re.fullmatch(r"experiments/(\w+)/README\.md", path)
+    if study:
+        return f"studies/{study[1]}.md"
+    if path.startswith(DOCS) and path.endswith(".md"):
+        return path.removeprefix(DOCS)
+    if path == "experiments":
+        return "results.md"
+    if path.startswith("hpamdp/") and path.endswith(".py"):
+        return api_page(path)
+    return None
+
+
+def pages() -> list[str]:
+    """Return all Markdown files of the repository that are pages."""
+    files = [*ROOT.glob("*.md"), *ROOT.glob("experiments/*/README.md"), *ROOT.glob("docs/**/*.md")]
+    paths = (file.relative_to(ROOT).as_posix() for file in sorted(files))
+    return [path for path in paths if page_of(path) is not None]
+
+
+def modules() -> list[str]:
+    """Return the package's modules that have something public to show."""
+    files = (file for file in sorted((ROOT / "hpamdp").rglob("*.py")) if not file.name.startswith("__main"))
+    return [file.relative_to(ROOT).as_posix() for file in files if ast.get_docstring(ast.parse(file.read_text()))]
+
+
+def dotted(path: str) -> str:
+    """Return a module's name, as `hpamdp.env.base` for `hpamdp/env/base.py`."""
+    return path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def api_page(path: str) -> str:
+    """Return the place of a module's page in the API."""
+    return f"api/{path.removesuffix('.py').replace('__init__', 'index')}.md"
+
+
+class Site:
+    """The site's pages and what they need besides.
+
+    Attributes:
+        pages: the text of each page, by its place in the site.
+        pictures: the file of each picture, by its place in the site.
+        problems: a line for each link or directive that leads nowhere.
+    """
+
+    def __init__(self) -> None:
+        self.pages: dict[str, str] = {}
+        self.pictures: dict[str, Path] = {}
+        self.problems: list[str] = []
+        for path in modules():
+            name = dotted(path)
+            self.pages[api_page(path)] = f"# {name}\n\n::: {name}\n"
+        for path in pages():
+            self.pages[str(page_of(path))] = self.converted(path)
+
+    def converted(self, path: str) -> str:
+        """Return the text of a page with its directives filled in and its links turned into the site's."""
+        text = TABLE_MARK.sub("", (ROOT / path).read_text(encoding="utf-8"))
+
+        def fill(found: re.Match[str]) -> str:
+            try:
+                return DIRECTIVES[found[1]](found[2])
+            except (SiteError, OSError) as error:
+                self.problems.append(f"{path}: {found[0]}: {error}")
+                return ""
+
+        text = outside_code(text, lambda part: DIRECTIVE.sub(fill, part))
+        return outside_code(text, lambda part: LINK.sub(lambda link: self._link(path, link), part))
+
+    def _link(self, path: str, found: re.Match[str]) -> str:
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(path), found[1]))
+        here = posixpath.dirname(str(page_of(path)))
+        if not (ROOT / target).exists():
+            self.problems.append(f"{path}: {found[1]} leads nowhere")
+            return found[0]
+        place = page_of(target) or self._extra(target)
+        return posixpath.relpath(place, here or ".") + (found[2] or "")
+
+    def _extra(self, target: str) -> str:
+        """Return the place of a file that is no page: a picture, or a page that shows its text."""
+        file = ROOT / target
+        if file.suffix in PICTURES:
+            place = target.removeprefix(DOCS) if target.startswith(DOCS) else f"source/{target}"
+            if not target.startswith(DOCS):
+                self.pictures[place] = file
+            return place
+        place = f"source/{target}.md"
+        if file.is_dir():
+            names = sorted(each.name + "/" * each.is_dir() for each in file.iterdir() if not each.name.startswith("_"))
+            body = "\n".join(f"- `{name}`" for name in names)
+        else:
+            body = f"```{LANGUAGES.get(file.suffix, 'text')}\n{file.read_text(encoding='utf-8').rstrip()}\n```"
+        self.pages[place] = f"---\nsearch:\n  exclude: true\n---\n# `{target}`\n\n{body}\n"
+        return place
+
+
+def outside_code(text: str, change: Callable[[str], str]) -> str:
+    """Change the parts of a page that are not fenced code."""
+    parts, end = [], 0
+    for fence in FENCE.finditer(text):
+        parts += [change(text[end : fence.start()]), fence[0]]
+        end = fence.end()
+    return "".join([*parts, change(text[end:])])
+
+
+def settings_of(path: str) -> str:
+    """Return what a yaml says at its head, and a table of its values: name, default, the comment above."""
+    head, section = "", ""
+    comment: list[str] = []
+    rows = ["| setting | default | |", "|---|---|---|"]
+    for line in (ROOT / path).read_text(encoding="utf-8").splitlines():
+        entry = re.match(r"(  )?(\w+):(?: (.+))?$", line)
+        if line.lstrip().startswith("#"):
+            comment.append(line.lstrip()[1:].strip())
+        elif not entry or entry[2] == "_target_":
+            head = head or cell(" ".join(comment))
+            comment = []
+        elif entry[3] is None:
+            section = f"{entry[2]}."
+        else:
+            name = f"{section}{entry[2]}" if entry[1] else entry[2]
+            section = section if entry[1] else ""
+            rows.append(f"| `{name}` | `{cell(entry[3])}` | {cell(' '.join(comment))} |")
+            comment = []
+    if len(rows) == 2:
+        return "It has no settings."
+    return "\n".join([head, "", *rows])
+
+
+def cell(text: str) -> str:
+    """Return a text as a cell of a Markdown table."""
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+def docstring_of(words: str) -> str:
+    """Return the paragraphs of a module's docstring that begin with a word, as `PATH: Source`."""
+    path, _, start = words.partition(": ")
+    paragraphs = (ast.get_docstring(ast.parse((ROOT / path).read_text(encoding="utf-8"))) or "").split("\n\n")
+    found = [paragraph for paragraph in paragraphs if paragraph.startswith(start)]
+    if not found:
+        raise SiteError(f"no paragraph begins with {start}")
+    # The page's own headings say what these are.
+    text = "\n\n".join(re.sub(r"^(Sources?|Differs from the sources?):\s", "", paragraph) for paragraph in found)
+    # Docstrings have no empty line between a sentence and its list, which Markdown needs.
+    text = re.sub(r":\n- ", ":\n\n- ", text)
+    text = text[0].upper() + text[1:]
+    return re.sub(r"arXiv([ :\n])(\d{4}\.\d{4,5})", r"arXiv\1[\2](https://arxiv.org/abs/\2)", text)
+
+
+def rows_of(words: str) -> str:
+    """Return rows of a table of a page by their first cell, as `PATH, table 2: hppo, random`."""
+    match = re.fullmatch(r"(\S+), table (\d+): (.+)", words)
+    if not match:
+        raise SiteError("must read PATH, table NUMBER: ROW, ROW")
+    text = (ROOT / match[1]).read_text(encoding="utf-8")
+    tables = re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    if int(match[2]) > len(tables):
+        raise SiteError(f"it has {len(tables)} tables")
+    head, line, *rows = tables[int(match[2]) - 1].splitlines()
+    wanted = [name.strip() for name in match[3].split(",")]
+    found = [row for row in rows if row.split("|")[1].strip() in wanted]
+    missing = set(wanted) - {row.split("|")[1].strip() for row in found}
+    if missing:
+        raise SiteError(f"no row {', '.join(sorted(missing))}")
+    return "\n".join([head, line, *found])
+
+
+def csv_table(words: str) -> str:
+    """Return the rows of a csv file in which a column has a value, as `PATH: column=value`, without that column."""
+    path, _, condition = words.partition(": ")
+    column, _, value = condition.partition("=")
+    with (ROOT / path).open(newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row[column] == value]
+    if not rows:
+        raise SiteError(f"no row has {condition}")
+    names = [name for name in rows[0] if name != column]
+    table = [names, ["---"] * len(names), *([cell(row[name]) for name in names] for row in rows)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in table)
+
+
+DIRECTIVES: dict[str, Callable[[str], str]] = {
+    "settings of": settings_of,
+    "docstring of": docstring_of,
+    "rows of": rows_of,
+    "csv": csv_table,
+}
+
+
+def studies() -> list[str]:
+    """Return the places of the studies' pages, those to begin with first."""
+    first = ["table1", "learners", "hierarchy", "quickstart", "human"]
+    names = sorted(file.parent.name for file in ROOT.glob("experiments/*/README.md"))
+    return [f"studies/{name}.md" for name in sorted(names, key=lambda n: first.index(n) if n in first else len(first))]
+
+
+def api_nav() -> list[object]:
+    """Return the navigation of the API, nested as the package is."""
+    tree: dict[str, object] = {}
+    for path in modules():
+        *folders, name = Path(path).parts[1:]
+        node = tree
+        for folder in folders:
+            node = node.setdefault(folder, {})
+        node["" if name == "__init__.py" else name.removesuffix(".py")] = api_page(path)
+    return list(_nested(tree))
+
+
+def _nested(tree: dict[str, object]) -> Iterator[object]:
+    for name, node in sorted(tree.items()):
+        if isinstance(node, dict):
+            yield {name: list(_nested(node))}
+        else:
+            yield {name: node} if name else node
+
+
+def on_config(config):
+    """Put the studies and the API into the navigation."""
+    for item in config.nav:
+        if "Results" in item:
+            item["Results"] += studies()
+        if "API" in item:
+            item["API"] = api_nav()
+    return config
+
+
+def on_files(files, config):
+    """Replace the pages of docs/ by their converted text, and add those from elsewhere."""
+    from mkdocs.structure.files import File
+
+    site = Site()
+    for line in site.problems:
+        log.warning(line)
+    for place, text in site.pages.items():
+        existing = files.get_file_from_path(place)
+        if existing is not None:
+            files.remove(existing)
+        files.append(File.generated(config, place, content=text))
+    for place, file in site.pictures.items():
+        files.append(File.generated(config, place, abs_src_path=str(file)))
+    return files

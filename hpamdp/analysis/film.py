@@ -1,0 +1,105 @@
+"""Films of episodes as files: GIF by Pillow, which draws the pictures anyway, MP4 by imageio, which brings its encoder.
+
+Matplotlib's writers would do, too, but draw through a figure, ten times slower, and want an ffmpeg of the system.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from torch import Tensor
+
+from hpamdp.env.base import PAMDPEnv
+
+SUFFIXES = (".gif", ".mp4")
+COLUMNS = 3
+# For how long the last picture stays, s.
+_PAUSE = 1.5
+_GIF_COLOURS = 128
+
+Track = Sequence[Mapping[str, Tensor]]
+
+
+class FilmError(ValueError):
+    """A film that cannot be written; told in one line."""
+
+
+def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> list[np.ndarray]:
+    """Return the pictures of several episodes side by side, uint8 `[height, width, 3]`; none where nothing can be seen.
+
+    Args:
+        env: the problem, which draws.
+        tracks: of each episode the `env_state` at the start and after every step, columns `[1, ...]`.
+        fps: pictures a second.
+        size: px from edge to edge of one episode.
+    """
+    episodes = [list(env.film(track, fps, size)) for track in tracks]
+    if not episodes or not all(episodes):
+        return []
+    length = max(map(len, episodes)) + round(_PAUSE * fps)
+    columns = min(COLUMNS, len(episodes))
+    blank = np.full_like(episodes[0][0], 255)
+    pictures = []
+    for i in range(length):
+        shown = [episode[min(i, len(episode) - 1)] for episode in episodes]
+        shown += [blank] * (-len(shown) % columns)
+        rows = [np.concatenate(shown[row : row + columns], 1) for row in range(0, len(shown), columns)]
+        pictures.append(np.concatenate(rows))
+    return pictures
+
+
+def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = None) -> list[Track]:
+    """Return the tracks of each of N episodes.
+
+    Args:
+        states: the columns `[N, ...]` at the start and after every step.
+        num_steps: of each track at most; None: all.
+    """
+    if not states or not states[0]:
+        return []
+    num = len(next(iter(states[0].values())))
+    states = states if num_steps is None else states[: num_steps + 1]
+    return [[{name: column[i : i + 1] for name, column in state.items()} for state in states] for i in range(num)]
+
+
+def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
+    """Write pictures as a GIF that repeats for ever, or as an MP4, by the ending of the path.
+
+    Raises:
+        FilmError: another ending, no picture, or imageio is missing.
+    """
+    frames = iter(pictures)
+    first = next(frames, None)
+    if first is None:
+        raise FilmError(f"{path}: there is no picture to write")
+    frames = itertools.chain([first], frames)
+    if path.suffix == ".gif":
+        _write_gif(path, frames, fps)
+    elif path.suffix == ".mp4":
+        _write_mp4(path, frames, fps)
+    else:
+        raise FilmError(f"{path}: must end in {' or '.join(SUFFIXES)}")
+
+
+def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+    pictures = [Image.fromarray(frame) for frame in frames]
+    # One palette for all pictures, made from three of them: one for each would flicker.
+    samples = [np.asarray(pictures[i]) for i in (0, len(pictures) // 2, -1)]
+    palette = Image.fromarray(np.concatenate(samples)).quantize(_GIF_COLOURS)
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=round(1000.0 / fps), loop=0)
+
+
+def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+    try:
+        import imageio.v2 as imageio
+        import imageio_ffmpeg  # noqa: F401  (the encoder, which imageio misses only when it writes)
+    except ImportError as error:
+        raise FilmError(f"{path}: imageio is not installed; pip install 'hpamdp[video]', or write a .gif") from error
+    with imageio.get_writer(path, fps=fps, macro_block_size=2, codec="libx264", quality=8) as writer:
+        for frame in frames:
+            writer.append_data(frame)

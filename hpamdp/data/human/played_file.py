@@ -1,0 +1,124 @@
+"""Episodes that were played in a page (`hpamdp play`), read into the tables of the recording of 40 people.
+
+What differs from that recording: every press is logged, so all episodes are complete; a press that was interrupted has
+the time until then; `person` numbers the players in the order in which they appear; `tank` is the fuel in whole frames.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hpamdp.data.errors import DataError
+from hpamdp.data.human.released_file import EPISODES_PER_BLOCK, FRAMES_PER_SECOND, HumanData, table
+from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock.play import episodes as played
+from hpamdp.env.boatdock.play.episodes import Episode
+from hpamdp.env.page import EpisodeError
+
+SUFFIX = ".jsonl"
+
+
+def read(path: Path | str, *, practice: bool = False) -> HumanData:
+    """Read a file of played episodes.
+
+    Args:
+        path: of `hpamdp play`, or downloaded from its page.
+        practice: whether the episodes of practice count, too.
+
+    Raises:
+        DataError: the file is missing, a line is no episode, an episode does not end as it says, or none counts.
+    """
+    try:
+        read_episodes = played.read(Path(path))
+    except EpisodeError as error:
+        raise DataError(str(error)) from error
+    counted = [episode for episode in read_episodes if practice or episode.mode != played.PRACTICE]
+    if not counted:
+        raise DataError(f"{path}: no episode{'' if practice else ' but those of practice'}")
+    return _tables(counted, path)
+
+
+def verify(path: Path | str) -> int:
+    """Check every episode of a file as the page's server does, from its raw events on; return how many there are.
+
+    Raises:
+        DataError: with the first that nobody can have played.
+    """
+    try:
+        found = played.read(Path(path))
+        for number, episode in enumerate(found, 1):
+            try:
+                played.check(episode.model_dump(mode="json"))
+            except EpisodeError as error:
+                raise DataError(f"{path}, episode {number}: {error}") from error
+    except EpisodeError as error:
+        raise DataError(str(error)) from error
+    return len(found)
+
+
+def _tables(episodes: list[Episode], path: Path | str) -> HumanData:
+    sailed = played.sail(episodes)
+    outcome = np.array([physics.OUTCOMES.index(episode.outcome) for episode in episodes])
+    differs = outcome != sailed.outcome.numpy()
+    if differs.any():
+        raise DataError(f"{path}, episode {int(differs.argmax()) + 1}: its presses do not end as it says")
+    players = list(dict.fromkeys(episode.player for episode in episodes))
+    person = np.array([players.index(episode.player) for episode in episodes])
+    num_presses = np.array([len(episode.presses) for episode in episodes])
+    number = np.repeat(np.arange(len(episodes)), num_presses)
+    press = np.arange(len(number)) - np.repeat(np.cumsum(num_presses) - num_presses, num_presses)
+    is_final = press == num_presses[number] - 1
+    centre = np.array(harbour.CENTRE)
+    begun = torch.stack([sailed.x, sailed.y], -1).numpy()[number, press] + centre
+    following = np.full_like(begun, np.nan)
+    following[~is_final] = begun[np.flatnonzero(~is_final) + 1]
+    duration = np.array([each.duration for episode in episodes for each in episode.presses])
+    goal = np.array([episode.goal for episode in episodes]) + centre
+    elapsed = np.array([t for episode in episodes for t in np.cumsum([each.duration for each in episode.presses])])
+    index = _count(person)
+    return HumanData(
+        table(
+            len(episodes),
+            person=person,
+            index=index,
+            block=index // EPISODES_PER_BLOCK,
+            controller=np.array([harbour.CONTROLLERS.index(episode.controller) for episode in episodes]),
+            keymap=np.array([episode.keymap for episode in episodes]),
+            presses=num_presses,
+            outcome=outcome,
+            tank=np.rint(_numpy(sailed.fuel) * FRAMES_PER_SECOND).astype(np.int64),
+            complete=np.ones(len(episodes), bool),
+            start=np.array([episode.start for episode in episodes]) + centre,
+            goal=goal,
+            centre=np.tile(centre, (len(episodes), 1)),
+        ),
+        table(
+            len(number),
+            episode=number,
+            press=press,
+            is_final=is_final,
+            position=begun,
+            next_position=following,
+            key=np.array([each.key for episode in episodes for each in episode.presses]),
+            duration=duration,
+            speed=_numpy(physics.speed(torch.from_numpy(duration))),
+            distance=np.linalg.norm(goal[number] - begun, axis=1),
+            gas=1.0 - elapsed / 5.0,
+        ),
+    )
+
+
+def _numpy(values: Tensor) -> np.ndarray:
+    return values.double().numpy()
+
+
+def _count(person: np.ndarray) -> np.ndarray:
+    """Return the number of each episode among those of its person, in the order of the file."""
+    index = np.zeros_like(person)
+    for each in np.unique(person):
+        index[person == each] = np.arange((person == each).sum())
+    return index

@@ -1,0 +1,92 @@
+"""Films of an episode: the boat moves as it does in the task, in closed form, between the states before and after."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hpamdp.env.boatdock import harbour, physics, rendering
+from hpamdp.env.boatdock.episode import MAX_PRESSES, BoatState
+from hpamdp.env.boatdock.rendering import Leg, Scene
+
+
+def film(track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+    """Yield the pictures of one episode, uint8 `[size, size, 3]` each, from its start to its end.
+
+    Args:
+        track: the states at the start and after every press, columns `[1]`; columns that are no boat's are ignored.
+        fps: pictures a second.
+        size: px from edge to edge.
+    """
+    states = [BoatState(*(columns[name].double() for name in BoatState._fields)) for columns in track]
+    scene = _scene(states[0], states[-1])
+    yield rendering.draw(scene, size)
+    late = 0.0  # from the last press's end to the next picture, s
+    for before, after in itertools.pairwise(states):
+        if before.outcome.item() != physics.SAILING:
+            break
+        length = math.hypot((after.x - before.x).item(), (after.y - before.y).item())
+        burnt = (before.fuel - after.fuel).clamp(min=0.0)  # how long the key was down
+        seconds = physics.time_at(burnt, burnt.new_tensor([length])).item()
+        times = np.arange(late, seconds, 1.0 / fps)
+        for time in times.tolist():
+            yield rendering.draw(_underway(scene, before, after, burnt, length, time), size)
+        late += len(times) / fps - seconds
+        scene = _rested(scene, before, after, burnt, length)
+    yield rendering.draw(scene, size)
+
+
+def _scene(first: BoatState, last: BoatState) -> Scene:
+    """Return the scene before the first press; the controller is the one that will be held."""
+    return Scene(
+        start=(first.start_x.item(), first.start_y.item()),
+        goal=(first.goal_x.item(), first.goal_y.item()),
+        boat=(first.x.item(), first.y.item()),
+        fuel=first.fuel.item() / physics.TANK,
+        controller=int(last.controller),
+        keymap=int(first.keymap),
+    )
+
+
+def _underway(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float, seconds: float) -> Scene:
+    """Return the scene `seconds` after the beginning of a press."""
+    elapsed = burnt.new_tensor([seconds])
+    share = min(physics.distance_at(burnt, elapsed).item() / length, 1.0) if length > 0.0 else 0.0
+    start = (before.x.item(), before.y.item())
+    end = (after.x.item(), after.y.item())
+    boat = (start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1]))
+    pressed = physics.pressed_distance(torch.minimum(burnt, elapsed)).item()
+    made = share * length
+    leg = Leg(start, boat, min(pressed / made, 1.0) if made > 0.0 else 1.0)
+    return replace(
+        scene,
+        boat=boat,
+        heading=(end[0] - start[0], end[1] - start[1]),
+        legs=(*scene.legs, leg),
+        fuel=(before.fuel.item() - min(seconds, burnt.item())) / physics.TANK,
+        presses=scene.presses + 1,
+    )
+
+
+def _rested(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float) -> Scene:
+    """Return the scene when a press has come to its end."""
+    start, end = (before.x.item(), before.y.item()), (after.x.item(), after.y.item())
+    share = min(physics.pressed_distance(burnt).item() / length, 1.0) if length > 0.0 else 1.0
+    outcome = int(after.outcome)
+    is_over = outcome != physics.SAILING
+    return replace(
+        scene,
+        boat=end,
+        heading=(after.velocity_x.item(), after.velocity_y.item()) if length > 0.0 else scene.heading,
+        legs=(*scene.legs, Leg(start, end, share)),
+        fuel=after.fuel.item() / physics.TANK,
+        presses=min(scene.presses + 1, MAX_PRESSES),
+        outcome=physics.OUTCOMES[outcome],
+        score=harbour.score(after.outcome, after.fuel / physics.TANK).item() if is_over else None,
+    )

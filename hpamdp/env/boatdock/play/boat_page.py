@@ -1,0 +1,145 @@
+"""The page on which people dock boats, beside agents and the best plans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hpamdp import __version__
+from hpamdp.env.boatdock import harbour, physics, planner
+from hpamdp.env.boatdock.episode import MAX_PRESSES, Rules
+from hpamdp.env.boatdock.play import episodes
+from hpamdp.env.boatdock.reference import (
+    BEST_PERSON,
+    HUMAN,
+    HUMAN_CONGRUENT_BY_OFFSET,
+    HUMAN_SUCCESS_BY_BLOCK,
+    OFFSET_EDGES,
+)
+from hpamdp.env.page import EpisodeError
+
+BLOCK, NUM_BLOCKS = 60, 6  # as people had them
+_PRACTICE, _FREE = 10, 120
+# Options of an agent's environment that the page's boats do not have.
+_PLAIN = {"observation": "scaled", "motor_noise": 0.0, "sensor_noise": 0.0, "slip": 0.0}
+
+
+class BoatPage:
+    """The page, with layouts of its own, which no training and no evaluation meets.
+
+    Args:
+        seed: of the layouts.
+    """
+
+    folder = Path(__file__).resolve().parent / "page"
+    files: Sequence[str] = ("index.html", "style.css", "physics.js", "network.js", "game.js")
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+
+    def data(self, agents: Sequence[Mapping[str, Any]], *, has_server: bool) -> dict[str, Any]:
+        """Return the rules, the layouts with their best plans, the agents, and what people reached."""
+        for agent in agents:
+            _check_agent(agent)
+        return {
+            "format": episodes.FORMAT,
+            "software": __version__,
+            "has_server": has_server,
+            "rules": {
+                "harbour_radius": physics.HARBOUR_RADIUS,
+                "dock_radius": physics.DOCK_RADIUS,
+                "glide": physics.GLIDE,
+                "docking_speed": physics.DOCKING_SPEED,
+                "tank": physics.TANK,
+                "max_duration": physics.MAX_DURATION,
+                "max_presses": MAX_PRESSES,
+                "block": BLOCK,
+                "num_blocks": NUM_BLOCKS,
+            },
+            "directions": {
+                "incongruent_1": harbour.DIRECTIONS[0],
+                "incongruent_2": harbour.DIRECTIONS[1],
+                "congruent": harbour.DIRECTIONS[2],
+            },
+            "layouts": self._layouts(),
+            "people": {
+                "mean": HUMAN["chosen"]["score"],
+                "best": BEST_PERSON["score"],
+                "success": HUMAN["chosen"]["success"],
+                "best_success": BEST_PERSON["success"],
+                "success_by_block": HUMAN_SUCCESS_BY_BLOCK,
+            },
+            "agents": [
+                {
+                    "name": agent["name"],
+                    "title": agent["title"],
+                    "score": agent["score"],
+                    "controller": agent["env"].get("controller", "choose"),
+                    "keymap": agent["env"].get("keymap", 1),
+                    "agent": agent["agent"],
+                }
+                for agent in agents
+            ],
+        }
+
+    def check(self, episode: object) -> dict[str, Any]:
+        """Return an episode as it is to be stored; see `hpamdp.env.boatdock.play.episodes.check`."""
+        return episodes.check(episode).model_dump(mode="json")
+
+    def identity(self, episode: Mapping[str, Any]) -> str:
+        """Return the player and the episode's number."""
+        return f"{episode['player']}-{episode['index']}"
+
+    def _layouts(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the layouts of each mode: start, goal, people's choice, and each boat's best score and plan.
+
+        The keys of the plans are those under key map 1. Numbers are exact, as some plans barely touch the dock.
+        """
+        sizes = {"practice": _PRACTICE, "round": BLOCK * NUM_BLOCKS, "free": _FREE}
+        num = sum(sizes.values())
+        # The seeds of evaluations are small; so these layouts are not theirs.
+        layout = harbour.fixed_layouts(num, 2**31 + self.seed)
+        plans = planner.best_plans(layout, torch.ones(num, dtype=torch.int32))
+        bins = torch.bucketize(harbour.bearing_offset(layout), torch.tensor(OFFSET_EDGES[1:-1], dtype=torch.float32))
+        rows = [
+            {
+                "start": [layout.start_x[i].item(), layout.start_y[i].item()],
+                "goal": [layout.goal_x[i].item(), layout.goal_y[i].item()],
+                "people": HUMAN_CONGRUENT_BY_OFFSET[int(bins[i])],
+                "best": {
+                    name: {
+                        "score": plans.score[i, option].item(),
+                        "presses": [
+                            {
+                                "key": int(plans.keys[i, option, j]),
+                                "duration": plans.durations[i, option, j].item(),
+                            }
+                            for j in range(int(plans.num_presses[i, option]))
+                        ],
+                    }
+                    for option, name in enumerate(harbour.CONTROLLERS)
+                },
+            }
+            for i in range(num)
+        ]
+        modes, first = {}, 0
+        for mode, size in sizes.items():
+            modes[mode] = rows[first : first + size]
+            first += size
+        return modes
+
+
+def _check_agent(agent: Mapping[str, Any]) -> None:
+    """Check that an agent knows the boats of the page.
+
+    Raises:
+        EpisodeError: with the setting that differs.
+    """
+    settings = {**Rules()._asdict(), **agent["env"]}
+    for name, value in _PLAIN.items():
+        given = settings[name]
+        if given != value and given != [value, value] and given != (value, value):
+            raise EpisodeError(f"{agent['name']}: was trained with env.{name}={given}, but the page has {value}")

@@ -1,0 +1,136 @@
+"""The game as people have it: keys are held and released at any time, and a new press ends the one before.
+
+In the environment a press lasts until the boat is at rest again. In people's game the next key can be pressed while
+the boat still glides, or while another key is down: that ends the press before and its glide, and the boat starts again
+from rest where it is. A press that began and ended at the same reading of the clock is none.
+
+The page's script `page/physics.js` has the same functions; a test compares them. Positions are px from the harbour's
+centre, times are seconds since the boat was chosen, and everything is computed in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from hpamdp.env.boatdock import physics
+from hpamdp.env.boatdock.episode import MAX_PRESSES
+from hpamdp.env.boatdock.harbour import DIRECTIONS
+
+DOWN, UP, BLUR = "down", "up", "blur"
+# A press that is not over yet.
+HELD = float("inf")
+
+
+class Press(NamedTuple):
+    """A settled press: its key (0 to 2), when it began (s), and for how long the key was down (s)."""
+
+    key: int
+    start: float
+    duration: float
+
+
+class Replay(NamedTuple):
+    """What became of E episodes.
+
+    Attributes:
+        x, y: where each press began, `[E, T]`.
+        burnt: how long each press burnt fuel, until release, the end of the fuel or of the episode, s, `[E, T]`.
+        end_x, end_y: where the boat was last, `[E]`.
+        fuel: seconds of fuel left, `[E]`.
+        outcome: as in `physics`, int32 `[E]`; SAILING where the boat rests with fuel left.
+        ended: when the episode ended, s, or when the boat came to rest, `[E]`.
+        num_presses: presses up to the end of the episode, int64 `[E]`.
+    """
+
+    x: Tensor
+    y: Tensor
+    burnt: Tensor
+    end_x: Tensor
+    end_y: Tensor
+    fuel: Tensor
+    outcome: Tensor
+    ended: Tensor
+    num_presses: Tensor
+
+
+def settle(events: Iterable[tuple[float, str, int]]) -> list[Press]:
+    """Return the presses that raw key events come to: one key at a time, each ended by release, the next key or a blur.
+
+    Args:
+        events: time (s), DOWN, UP or BLUR, and the key, in ascending order of time; a BLUR's key is ignored.
+
+    Returns:
+        At most MAX_PRESSES presses; the last one lasts for HELD seconds if its key is still down.
+    """
+    presses: list[Press] = []
+    open_key, begun = -1, 0.0
+
+    def close(time: float) -> None:
+        if open_key >= 0 and time > begun:
+            presses.append(Press(open_key, begun, time - begun))
+
+    for time, kind, key in events:
+        if kind == DOWN:
+            close(time)
+            open_key, begun = key, time
+        elif kind == BLUR or key == open_key:
+            close(time)
+            open_key = -1
+    close(HELD)
+    return presses[:MAX_PRESSES]
+
+
+def replay(
+    start: Tensor,
+    goal: Tensor,
+    row: Tensor,
+    keys: Tensor,
+    starts: Tensor,
+    durations: Tensor,
+) -> Replay:
+    """Sail E episodes from their settled presses.
+
+    Args:
+        start, goal: float64 `[E, 2]`.
+        row: of DIRECTIONS: the keys of each boat, int64 `[E]`.
+        keys: int64 `[E, T]`.
+        starts: ascending, s, `[E, T]`; `inf` past an episode's last press.
+        durations: s, `[E, T]`.
+    """
+    (x, y), (goal_x, goal_y) = start.unbind(-1), goal.unbind(-1)
+    fuel = torch.full_like(x, physics.TANK)
+    outcome = torch.full_like(row, physics.SAILING, dtype=torch.int32)
+    ended = torch.zeros_like(x)
+    num_presses = torch.zeros_like(row)
+    table = torch.tensor(DIRECTIONS, dtype=torch.float64)
+    following = torch.cat([starts[:, 1:], torch.full_like(x, HELD).unsqueeze(-1)], 1)
+    columns: list[tuple[Tensor, Tensor, Tensor]] = []
+    for i in range(keys.shape[1]):
+        is_pressed = (outcome == physics.SAILING) & starts[:, i].isfinite()
+        dir_x, dir_y = table[row, keys[:, i]].unbind(-1)
+        duration = torch.minimum(durations[:, i], fuel)
+        whole = physics.press(x, y, fuel, goal_x, goal_y, dir_x, dir_y, duration)
+        length = (whole.x - x) * dir_x + (whole.y - y) * dir_y
+        seconds = physics.time_at(duration, length)
+        # The tank of a boat that runs dry is empty for the next press, too, so that nothing interrupts its last glide.
+        is_last = (whole.outcome == physics.OUT_OF_FUEL) | (i + 1 == MAX_PRESSES)
+        available = following[:, i] - starts[:, i]
+        is_cut = (available < seconds) & ~is_last
+        way = torch.where(is_cut, physics.distance_at(duration, available), length)
+        columns.append((x, y, torch.where(is_cut, duration, fuel - whole.fuel) * is_pressed))
+        out_of_time = (whole.outcome == physics.SAILING) & (i + 1 == MAX_PRESSES)
+        became = torch.where(out_of_time, physics.TIME_LIMIT, whole.outcome).to(torch.int32)
+        x = torch.where(is_pressed, torch.where(is_cut, x + way * dir_x, whole.x), x)
+        y = torch.where(is_pressed, torch.where(is_cut, y + way * dir_y, whole.y), y)
+        fuel = torch.where(is_pressed, torch.where(is_cut, fuel - duration, whole.fuel), fuel)
+        outcome = torch.where(is_pressed & ~is_cut, became, outcome)
+        ended = torch.where(is_pressed, starts[:, i] + torch.minimum(seconds, available), ended)
+        num_presses = num_presses + is_pressed
+    if not columns:
+        columns.append((x[:0], y[:0], x[:0]))
+    begun_x, begun_y, burnt = (torch.stack(column, -1) for column in zip(*columns, strict=True))
+    return Replay(begun_x, begun_y, burnt, x, y, fuel, outcome, ended, num_presses)

@@ -1,0 +1,49 @@
+"""What a problem that people can play in a browser hands over: a page, its data, and the check of what was played."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+
+class EpisodeError(ValueError):
+    """An episode that cannot have been played, or is none at all; the message is one line."""
+
+
+class Page(Protocol):
+    """A page in a browser on which people play a problem.
+
+    Attributes:
+        folder: of its static files.
+        files: their names, `index.html` first. The page also loads `data.js`, a script that sets
+            `window.HPAMDP_DATA` to what `data` returns.
+    """
+
+    folder: Path
+    files: Sequence[str]
+
+    def data(self, agents: Sequence[Mapping[str, Any]], *, has_server: bool) -> dict[str, Any]:
+        """Return the JSON values that the page's script starts with.
+
+        Args:
+            agents: to play beside people: `name`, `title`, `score`, `env` (the options of the problem's yaml), and
+                `agent`, what `HierarchicalAgent.portable` returns.
+            has_server: whether there is somebody to send episodes to.
+
+        Raises:
+            EpisodeError: an agent was trained on other rules than those of the page.
+        """
+
+    def check(self, episode: object) -> dict[str, Any]:
+        """Return an episode from the page as it is to be stored.
+
+        Args:
+            episode: decoded JSON, of any kind.
+
+        Raises:
+            EpisodeError: it is no episode, or nobody can have played it.
+        """
+
+    def identity(self, episode: Mapping[str, Any]) -> str:
+        """Return what tells a checked episode from all others, so that one that is sent twice is stored once."""

@@ -1,0 +1,551 @@
+"""PETS for parameterised actions: an ensemble learns the problem, every action is the first one of a plan in it.
+
+Members predict the next state, the reward and the end of an episode. A plan tries every sequence of discrete actions,
+each with Gaussians of its own for their parameters. To explore, an environment follows the plans of a single member
+until its episode ends; a greedy plan takes the mean of all members' returns. Meant for few steps: some hundreds.
+
+Sources: Chua, Calandra, McAllister and Levine 2018, *Deep Reinforcement Learning in a Handful of Trials using
+Probabilistic Dynamics Models*, arXiv 1805.12114: the ensemble, the probabilistic members, and a member for each
+imagined trajectory (TS-infinity). Posterior sampling: Osband, Russo and Van Roy 2013, arXiv 1306.0940. Reward and
+termination of parameterised actions: Zhang et al. 2024, arXiv 2404.03037. Symmetry: van der Pol et al. 2020, arXiv
+2006.16908.
+
+Differs from the sources:
+- the model has two stages: a small network predicts the change of the state in a step that does not terminate, and a
+  larger one, which sees where the step would lead by that prediction, whether it terminates and what it earns. An
+  end, such as at a wall or in a target, is a matter of where a step leads;
+- where the problem declares its geometry, states are turned until the discrete action points along +x before the
+  networks see them, with the lengths of all vectors among the inputs; of other declared symmetries, the mapped steps
+  are learned from as well (`augment`);
+- entries of the state whose changes depend linearly on those of others, such as a target's offset on one's own place,
+  are not predicted but derived from them;
+- members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
+- the parameters of each sequence of discrete actions are searched by themselves (`policies.shared.planning`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import ClassVar, Literal
+
+import torch
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from hpamdp import keys
+from hpamdp.policies.base import is_greedy
+from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.frame import CanonicalFrame
+from hpamdp.policies.shared.networks import EnsembleLinear
+from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, discounted_return
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.specs import PAMDPSpecs
+
+MEMBER = "member"  # which member an environment follows, int64 [*B]
+
+_CHUNK_ROWS = 8192  # states predicted at once when planning: fits the cache and bounds the memory
+_ALL = slice(None)
+_LOG_VARIANCE_LOW, _LOG_VARIANCE_HIGH = -10.0, 1.0  # of a scaled change
+_LARGEST_COPIES = 16  # of a stored step under the problem's symmetries
+
+
+class MemberNet(nn.Module):
+    """Independent networks with SiLU, one for each member, `[E, B, in]` -> `[E, B, out]`."""
+
+    def __init__(self, num_members: int, in_dim: int, hidden_dims: list[int], out_dim: int) -> None:
+        super().__init__()
+        dims = [in_dim, *hidden_dims, out_dim]
+        layers = [EnsembleLinear(num_members, size, next_size) for size, next_size in pairwise(dims)]
+        for layer in layers:
+            nn.init.normal_(layer.weight, 0.0, 0.7 * (2.0 / layer.weight.shape[1]) ** 0.5)
+            nn.init.zeros_(layer.bias)
+        self.layers = nn.ModuleList(layers)
+
+    def forward(self, x: Tensor, members: slice) -> Tensor:
+        """Apply the given members, each to its own slice of `x`."""
+        for place, layer in enumerate(self.layers):
+            assert isinstance(layer, EnsembleLinear)
+            x = torch.baddbmm(layer.bias[members], x, layer.weight[members])
+            if place < len(self.layers) - 1:
+                x = F.silu(x)
+        return x
+
+
+class PETSModel(nn.Module):
+    """`num_members` models of a step: the change of the state, then its end and its reward.
+
+    Args:
+        specs: of the problem.
+        num_members: how many.
+        transition_dims: hidden layers of the networks that predict the change.
+        outcome_dims: hidden layers of those that predict end and reward.
+        is_probabilistic: whether the change has a variance for each entry.
+        uses_geometry: whether to turn states and add lengths where the problem declares its geometry.
+    """
+
+    state_mean: Tensor
+    state_scale: Tensor
+    change_scale: Tensor
+    is_predicted: Tensor
+    is_changing: Tensor
+    derivation: Tensor
+    reward_mean: Tensor
+    reward_scale: Tensor
+    feature_mean: Tensor
+    feature_scale: Tensor
+    slot_kind: Tensor
+    slot_number: Tensor
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        num_members: int,
+        transition_dims: list[int],
+        outcome_dims: list[int],
+        *,
+        is_probabilistic: bool,
+        uses_geometry: bool,
+    ) -> None:
+        super().__init__()
+        dim = specs.observation_dim
+        self.num_members = num_members
+        self.is_probabilistic = is_probabilistic
+        self.frame = CanonicalFrame(specs, is_used=uses_geometry)
+        kinds = self.frame.kind.tolist()
+        of_kinds = zip(kinds, specs.parameter_dims, strict=True)
+        slots = sorted({(kind, slot) for kind, num_slots in of_kinds for slot in range(num_slots)})
+        places = torch.tensor(slots, dtype=torch.long).reshape(-1, 2)
+        self.register_buffer("slot_kind", places[:, 0], persistent=False)
+        self.register_buffer("slot_number", places[:, 1], persistent=False)
+        self.has_kinds = self.frame.num_kinds > 1
+        action_dim = 2 * len(slots) + (self.frame.num_kinds if self.has_kinds else 0)
+        num_vectors = self.frame.num_vectors
+        feature_dim = 4 * num_vectors if num_vectors else 2 * dim
+        in_dim = dim + action_dim
+        self.transition = MemberNet(num_members, in_dim, transition_dims, dim * (2 if is_probabilistic else 1))
+        self.outcome = MemberNet(num_members, in_dim + dim + feature_dim, outcome_dims, 3)
+        buffers = {
+            "state_mean": torch.zeros(dim),
+            "state_scale": torch.ones(dim),
+            "change_scale": torch.ones(dim),
+            "is_predicted": torch.ones(dim),
+            "is_changing": torch.ones(dim),
+            "derivation": torch.eye(dim),
+            "reward_mean": torch.zeros(2),
+            "reward_scale": torch.ones(2),
+            "feature_mean": torch.zeros(feature_dim),
+            "feature_scale": torch.ones(feature_dim),
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
+
+    def forward(self, state: Tensor, discrete: Tensor, own: Tensor, members: slice = _ALL) -> Prediction:
+        """Predict one step with some of the members, each from states of its own.
+
+        Args:
+            state: `[E, B, observation_dim]`.
+            discrete: `[E, B]`.
+            own: parameters of the discrete actions, `[E, B, D]` in [-1, 1].
+            members: which ones, E of them.
+        """
+        direction = self.frame.direction(state, discrete)
+        turned = self.frame.turn(state, direction)
+        action = self.action_inputs(self.frame.kind[discrete], own)
+        change, outcome = self.in_frame(turned, action, members)[1:]
+        logit, terminating, continuing = outcome.float().unbind(-1)
+        mean, scale = self.reward_mean, self.reward_scale
+        return Prediction(
+            self.frame.turn_back(turned + change, direction),
+            continuing * scale[0] + mean[0],
+            terminating * scale[1] + mean[1],
+            logit,
+        )
+
+    def action_inputs(self, kind: Tensor, own: Tensor) -> Tensor:
+        """Return what the networks see of actions of a kind `[*B]` with parameters `[*B, D]`.
+
+        That is the kind, and each kind's own parameters and their squares, 0 for the other kinds.
+        """
+        if not self.has_kinds:
+            return torch.cat([own, own.square()], -1)
+        value = own[..., self.slot_number] * (kind.unsqueeze(-1) == self.slot_kind)
+        return torch.cat([F.one_hot(kind, self.frame.num_kinds).to(own.dtype), value, value.square()], -1)
+
+    def in_frame(self, turned: Tensor, action: Tensor, members: slice = _ALL) -> tuple[Tensor, Tensor, Tensor]:
+        """Predict a step in the canonical frame.
+
+        Args:
+            turned: states `[E, B, observation_dim]`.
+            action: of `action_inputs`, `[E, B, *]`.
+            members: which ones, E of them.
+
+        Returns:
+            What the transition networks say, the change of the state `[E, B, observation_dim]` and what the outcome
+            networks say: logit, scaled reward if the step terminates, and if it does not.
+        """
+        x = torch.cat([(turned - self.state_mean) / self.state_scale, action], -1)
+        transition = self.transition(x, members).float()
+        scaled = transition.detach()
+        if self.is_probabilistic:
+            mean, log_variance = self.moments(scaled)
+            scaled = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
+        scaled = scaled * self.is_predicted
+        change = (scaled * self.change_scale) @ self.derivation
+        next_turned = turned + change
+        next_x = (next_turned - self.state_mean) / self.state_scale * self.is_changing
+        features = (self.features(turned, next_turned) - self.feature_mean) / self.feature_scale
+        return transition, change, self.outcome(torch.cat([x, next_x, features], -1), members)
+
+    def moments(self, transition: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and log-variance of the scaled change, from what the transition networks say."""
+        mean, raw = transition.chunk(2, -1)
+        return mean, _LOG_VARIANCE_LOW + (_LOG_VARIANCE_HIGH - _LOG_VARIANCE_LOW) * raw.sigmoid()
+
+    def features(self, turned: Tensor, next_turned: Tensor) -> Tensor:
+        """Return what helps to tell where a step ends, of states before and after it in the canonical frame.
+
+        With vectors of the plane, their lengths before and after the step, the smallest length on the straight way
+        between the two, and how far off the x axis they were, `[*B, 4 V]`; else the squares of all entries, of which
+        lengths are made, `[*B, 2 observation_dim]`.
+        """
+        if not self.frame.num_vectors:
+            both = [(state - self.state_mean) / self.state_scale for state in (turned, next_turned)]
+            return torch.cat([both[0], both[1] * self.is_changing], -1).square()
+        x, y = self.frame.vectors(turned)
+        next_x, next_y = self.frame.vectors(next_turned)
+        way_x, way_y = next_x - x, next_y - y
+        along = -(x * way_x + y * way_y) / (way_x.square() + way_y.square()).clamp(min=1e-12)
+        along = along.clamp(0.0, 1.0)
+        lengths = [torch.hypot(x + share * way_x, y + share * way_y) for share in (0.0, 1.0, along)]
+        return torch.cat([*lengths, y.abs()], -1)
+
+    @torch.no_grad()
+    def fit_scales(self, turned: Tensor, next_turned: Tensor, reward: Tensor, terminated: Tensor) -> None:
+        """Set the scales of inputs and targets, and which changes are derived from others.
+
+        Args:
+            turned, next_turned: states `[B, observation_dim]` in the canonical frame.
+            reward: `[B]`.
+            terminated: bool `[B]`.
+        """
+        self.state_mean.copy_(turned.mean(0))
+        self.state_scale.copy_(_scale_of(turned))
+        change = (next_turned - turned)[~terminated]
+        if len(change) > 1:
+            self.change_scale.copy_(_scale_of(change))
+            self.is_changing.copy_((change.abs().amax(0) > 1e-6).float())
+            self._derive(change / self.change_scale)
+        for place, rows in enumerate((reward[~terminated], reward[terminated])):
+            if len(rows) > 1:
+                self.reward_mean[place] = rows.mean()
+                self.reward_scale[place] = _scale_of(rows)
+        features = self.features(turned, next_turned)
+        self.feature_mean.copy_(features.mean(0))
+        self.feature_scale.copy_(_scale_of(features))
+
+    def _derive(self, change: Tensor) -> None:
+        """Find the entries whose scaled changes `[B, observation_dim]` are linear in those of entries before them."""
+        dim = change.shape[-1]
+        is_predicted = [False] * dim
+        derivation = torch.zeros(dim, dim, dtype=torch.float64, device=change.device)
+        columns = change.double()
+        if len(columns) < 4 * dim:
+            return  # too few to tell
+        for entry in range(dim):
+            if self.is_changing[entry] == 0.0:
+                continue
+            column = columns[:, entry]
+            basis = [place for place in range(dim) if is_predicted[place]]
+            if basis:
+                solved = torch.linalg.lstsq(columns[:, basis], column.unsqueeze(-1), driver="gelsd")
+                weight = solved.solution.squeeze(-1)
+                if (columns[:, basis] @ weight - column).abs().amax() < 1e-3:
+                    derivation[basis, entry] = weight
+                    continue
+            is_predicted[entry] = True
+            derivation[entry, entry] = 1.0
+        scale = self.change_scale.double()
+        self.derivation.copy_(derivation * scale / scale.unsqueeze(-1))
+        self.is_predicted.copy_(torch.tensor(is_predicted, device=change.device).float())
+
+
+def _scale_of(rows: Tensor) -> Tensor:
+    # The lower bound keeps entries that never change from dividing by 0.
+    return rows.std(0).clamp(min=1e-2)
+
+
+class PETSPolicy(TensorDictModuleBase):
+    """The first action of a plan; exploring, of one with the member that the environment follows in this episode.
+
+    Acts uniformly at random until the model has been trained on different rewards. Nothing is planned for finished
+    episodes: their action is random, too, and is ignored.
+    """
+
+    is_trained: Tensor
+
+    def __init__(
+        self,
+        model: PETSModel,
+        search: SequenceSearch,
+        specs: PAMDPSpecs,
+        entries: list[int],
+        *,
+        gamma: float,
+        noise: float,
+        precision: str,
+    ) -> None:
+        super().__init__()
+        self.in_keys = [keys.OBSERVATION, keys.DONE, keys.IS_DECISION, MEMBER]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, MEMBER]
+        self.entries = entries
+        self.model = model
+        self.search = search
+        self.specs = specs
+        self.gamma = gamma
+        self.noise = noise
+        self.precision: torch.dtype = getattr(torch, precision)
+        self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
+        self.register_buffer("slots", specs.parameter_slots, persistent=False)
+
+    @torch.no_grad()
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write the discrete action, the member `[*B]` and the parameters `[*B, num_parameters]`."""
+        state = td.get(keys.OBSERVATION)[..., self.entries].flatten(0, -2)
+        num, device = len(state), state.device
+        member = self._members(td, num, device)
+        discrete = torch.randint(self.specs.num_discrete, (num,), device=device)
+        unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device) - 1.0
+        is_planned = self.is_trained.expand(num)
+        done = td.get(keys.DONE, None)
+        if done is not None:
+            is_planned = is_planned & ~done.flatten()
+        if is_planned.any():
+            found = self.plan(state[is_planned], None if is_greedy() else member[is_planned])
+            own = found.own
+            if not is_greedy():
+                own = (own + self.noise * torch.randn_like(own)).clamp(-1.0, 1.0)
+            discrete[is_planned] = found.discrete
+            unit[is_planned] = unit[is_planned].scatter(-1, self.slots[found.discrete], own)
+        shape = td.batch_size
+        parameters = self.specs.from_unit(unit).reshape(*shape, self.specs.num_parameters)
+        td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": parameters}})
+        return td.set(MEMBER, member.reshape(shape))
+
+    def _members(self, td: TensorDictBase, num: int, device: torch.device) -> Tensor:
+        """Return the members that environments follow: a random one where an episode or an option begins."""
+        fresh = torch.randint(self.model.num_members, (num,), device=device)
+        held, begins = td.get(MEMBER, None), td.get(keys.IS_DECISION, None)
+        if held is None:
+            return fresh
+        if begins is None:
+            return held.flatten()
+        return torch.where(begins.flatten(), fresh, held.flatten())
+
+    def plan(self, state: Tensor, member: Tensor | None = None) -> Found:
+        """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all."""
+        if member is None:
+            return self._plan(state, _ALL)
+        order = member.argsort(stable=True)
+        parts = [self._plan(state[member == each], slice(each, each + 1)) for each in member.unique().tolist()]
+        found = [torch.cat(part) for part in zip(*parts, strict=True)]
+        place = torch.empty_like(order)
+        place[order] = torch.arange(len(order), device=order.device)
+        return Found(*(part[place] for part in found))
+
+    def _plan(self, state: Tensor, members: slice) -> Found:
+        rows = self.search.num_sequences * self.search.num_samples
+        pieces = state.split(max(1, _CHUNK_ROWS // rows))
+        found = [self.search(self._returns(piece, members), len(piece), state.device) for piece in pieces]
+        return Found(*(torch.cat(part) for part in zip(*found, strict=True)))
+
+    def _returns(self, state: Tensor, members: slice) -> Returns:
+        num_members = self.model.num_members if members == _ALL else 1
+
+        def returns(discrete: Tensor, unit: Tensor) -> Tensor:
+            shape = unit.shape[:3]
+            rows = state[:, None, None].expand(*shape, -1).reshape(-1, state.shape[-1])
+            rows = rows.expand(num_members, *rows.shape)
+
+            def steps() -> Iterator[Prediction]:
+                nonlocal rows
+                for h in range(self.search.horizon):
+                    action = discrete[:, :, None, h].expand(shape).reshape(-1).expand(num_members, -1)
+                    own = unit[..., h, :].reshape(-1, unit.shape[-1]).expand(num_members, -1, -1)
+                    with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
+                        predicted = self.model(rows, action, own, members)
+                    rows = predicted.next_state
+                    yield predicted
+
+            return discounted_return(steps(), self.gamma).mean(0).reshape(shape)
+
+        return returns
+
+
+class PETS(ReplayLearner):
+    """A PETSModel trained on all steps so far, and a SequenceSearch that plans in it."""
+
+    modes: ClassVar[tuple[str, ...]] = ("train",)
+    stores_own_parameters = True
+
+    policy: PETSPolicy
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device,
+        *,
+        augment: Literal["auto"] | bool,
+        num_members: PositiveInt,
+        transition_dims: list[PositiveInt],
+        outcome_dims: list[PositiveInt],
+        probabilistic: bool,
+        lr: LearningRate,
+        weight_decay: NonNegativeFloat,
+        transition_weight: PositiveFloat,
+        warmup_frames: PositiveInt,
+        updates_per_frame: PositiveFloat,
+        batch_size: PositiveInt,
+        buffer_size: PositiveInt,
+        parameter_noise: NonNegativeFloat,
+        gamma: PositiveFraction,
+        horizon: PositiveInt,
+        max_sequences: PositiveInt,
+        num_kept: PositiveInt,
+        num_samples: PositiveInt,
+        num_elites: PositiveInt,
+        num_iterations: PositiveInt,
+        temperature: PositiveFloat,
+        min_deviation: NonNegativeFloat,
+        planning_precision: Literal["float32", "bfloat16"],
+    ) -> None:
+        uses_geometry = augment is not False
+        self.entries = list(range(specs.observation_dim))
+        if uses_geometry:
+            self.entries, specs = specs.telling_entries, specs.with_telling_entries()
+        super().__init__(
+            specs,
+            device,
+            gamma=gamma,
+            warmup_frames=warmup_frames,
+            buffer_size=buffer_size,
+            batch_size=batch_size,
+            updates_per_frame=updates_per_frame,
+            augment=specs.symmetries is not None if augment == "auto" else augment,
+        )
+        self.transition_weight = transition_weight
+        self.model = PETSModel(
+            specs,
+            num_members,
+            transition_dims,
+            outcome_dims,
+            is_probabilistic=probabilistic,
+            uses_geometry=uses_geometry,
+        )
+        search = SequenceSearch(
+            specs.parameter_dims,
+            horizon=horizon,
+            max_sequences=max_sequences,
+            num_kept=num_kept,
+            num_samples=num_samples,
+            num_elites=num_elites,
+            num_iterations=num_iterations,
+            temperature=temperature,
+            min_deviation=min_deviation,
+        )
+        self.policy = PETSPolicy(
+            self.model, search, specs, self.entries, gamma=gamma, noise=parameter_noise, precision=planning_precision
+        )
+        self.to(device)
+        self.optimizers = {
+            "model": torch.optim.AdamW(self.model.parameters(), lr=lr, weight_decay=weight_decay, fused=True)
+        }
+
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated."""
+        rows = super().transitions(batch).exclude("discount")
+        for name in ("state", "next_state"):
+            rows.set(name, rows[name][..., self.entries])
+        return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
+
+    def explore(self, frames: int) -> None:
+        """Let the policy plan, as soon as there are different rewards to plan for."""
+        reward = self.buffer[:]["reward"]
+        self.policy.is_trained.fill_(bool((reward != reward[0]).any()))
+
+    def updates_due(self, before: int, frames: int) -> int:
+        """Return how many updates to make; the first ones make up for the warm-up."""
+        return super().updates_due(before if before >= self.warmup_frames else 0, frames)
+
+    def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
+        """Yield samples `[num_members, batch_size]` of all stored steps, each with all its mirror images or maps."""
+        rows = self.prepared()
+        shape = num_batches, self.model.num_members, self.batch_size
+        for places in torch.randint(len(rows), shape, device=rows.device):
+            yield rows[places]
+
+    def prepared(self) -> TensorDict:
+        """Fit the model's scales to all stored steps; return these in the canonical frame, as the model sees them."""
+        stored = self.buffer[:]
+        frame = self.model.frame
+        if self.symmetry is not None and not frame.turns:
+            stored = self._with_all_maps(stored)
+        direction = frame.direction(stored["state"], stored["discrete"])
+        turned = [frame.turn(stored[name], direction) for name in ("state", "next_state")]
+        kind, own = frame.kind[stored["discrete"]], stored["unit"] * self.policy.search.has_slot[stored["discrete"]]
+        reward, terminated = stored["reward"], stored["terminated"]
+        if frame.turns and frame.geometry is not None and frame.geometry.has_mirror:
+            turned = [torch.cat([state, frame.mirror(state)]) for state in turned]
+            kind, own, reward, terminated = (torch.cat([part, part]) for part in (kind, own, reward, terminated))
+        self.model.fit_scales(turned[0], turned[1], reward, terminated)
+        mean, scale = self.model.reward_mean, self.model.reward_scale
+        which = terminated.long()
+        return TensorDict(
+            {
+                "turned": turned[0],
+                "action": self.model.action_inputs(kind, own),
+                "change": (turned[1] - turned[0]) / self.model.change_scale,
+                "reward": (reward - mean[which]) / scale[which],
+                "terminated": terminated.float(),
+            },
+            batch_size=len(reward),
+        )
+
+    def _with_all_maps(self, stored: TensorDictBase) -> TensorDictBase:
+        """Return stored steps under all symmetries, or of many of them each under some."""
+        assert self.symmetry is not None
+        num_maps = len(self.symmetry.maps)
+        copies = min(num_maps, _LARGEST_COPIES)
+        number = torch.arange(copies, device=stored.device).repeat_interleave(len(stored))
+        if copies < num_maps:
+            number = torch.randint(num_maps, number.shape, device=stored.device)
+        rows = stored.repeat(copies)
+        rows = rows.set("unit", self._all_parameters(rows["discrete"], rows["unit"]))
+        rows = self.symmetry.mapped(number, rows)
+        return rows.set("unit", rows["unit"].gather(-1, self.slots[rows["discrete"]]))
+
+    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update every member from its own minibatch of a sample `[num_members, batch_size]`."""
+        ends = sample["terminated"]
+        transition, _, outcome = self.model.in_frame(sample["turned"], sample["action"])
+        change = sample["change"]
+        if self.model.is_probabilistic:
+            mean, log_variance = self.model.moments(transition)
+            error = 0.5 * ((mean - change).square() * (-log_variance).exp() + log_variance)
+        else:
+            error = (transition - change).square()
+        is_predicted = self.model.is_predicted
+        error = (error * is_predicted).sum(-1) / is_predicted.sum().clamp(min=1.0)
+        logit, terminating, continuing = outcome.unbind(-1)
+        reward = torch.where(ends > 0.0, terminating, continuing)
+        parts = {
+            "change": (error * (1.0 - ends)).mean(),
+            "termination": F.binary_cross_entropy_with_logits(logit, ends),
+            "reward": (reward - sample["reward"]).square().mean(),
+        }
+        loss = self.transition_weight * parts["change"] + parts["termination"] + parts["reward"]
+        self.optimizer_step("model", loss * self.model.num_members)
+        return parts

@@ -1,0 +1,265 @@
+"""The server of a problem's page: a handful of files, and one place to send episodes to.
+
+It is made of the standard library: five files and one POST need no framework, and so the page works after every
+installation. It is meant for one's own computer and listens on the loopback address unless told otherwise.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Mapping
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from filelock import FileLock
+
+from hpamdp.env.page import EpisodeError, Page
+from hpamdp.messages import one_line
+
+DATA_NAME = "data.js"
+EPISODES = "/episodes"
+_MAX_BODY = 1 << 20  # bytes
+_PATIENCE = 10.0  # s that a connection may keep silent
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+}
+_LOOPBACK = {"127.0.0.1", "localhost", "[::1]", "::1"}
+_HEADERS = {
+    # Nothing from elsewhere, and nobody else's frame; alone in its process the page has a finer clock.
+    "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Embedder-Policy": "require-corp",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+
+def as_script(data: Mapping[str, Any]) -> bytes:
+    """Return `data.js`: a script, because a page that is opened from a file may load no other data."""
+    text = json.dumps(data, separators=(",", ":"), allow_nan=False)
+    return f"window.HPAMDP_DATA = {text};\n".encode()
+
+
+class EpisodeFile:
+    """A file of episodes, one JSON object a line, to which several threads and processes may add.
+
+    Args:
+        path: the file, made at the first episode.
+        page: knows which episodes are the same.
+
+    Raises:
+        EpisodeError: the file is not one of episodes, or its folder is missing.
+    """
+
+    def __init__(self, path: Path, page: Page) -> None:
+        self.path = path
+        self.page = page
+        self.num_added = 0
+        self._lock = threading.Lock()
+        self._file_lock = FileLock(path.with_name(f".{path.name}.lock"))
+        if not path.parent.is_dir():
+            raise EpisodeError(f"{path}: there is no folder {path.parent}")
+        self._known = self._identities()
+
+    def add(self, episode: Mapping[str, Any]) -> bool:
+        """Add a checked episode and return whether it is new; on return it is on the disk.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        identity = self.page.identity(episode)
+        line = json.dumps(episode, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        with self._lock:
+            if identity in self._known:
+                return False
+            with self._file_lock, self.path.open("a+b") as file:
+                size = file.seek(0, os.SEEK_END)
+                if size:
+                    file.seek(size - 1)
+                    if file.read(1) != b"\n":  # a line that was cut short stays a line of its own
+                        line = b"\n" + line
+                file.write(line)
+                file.flush()
+                os.fsync(file.fileno())
+            self._known.add(identity)
+            self.num_added += 1
+        return True
+
+    def _identities(self) -> set[str]:
+        """Return the identities of the episodes that the file has."""
+        known: set[str] = set()
+        if not self.path.exists():
+            return known
+        try:
+            lines = self.path.read_bytes().splitlines()
+        except OSError as error:
+            raise EpisodeError(f"{self.path}: {error.strerror or error}") from error
+        for number, line in enumerate(lines, 1):
+            try:
+                known.add(self.page.identity(json.loads(line)))
+            except (ValueError, TypeError, KeyError, RecursionError) as error:
+                if number < len(lines) and line.strip():
+                    raise EpisodeError(f"{self.path}, line {number}: no episode; take another file") from error
+        return known
+
+
+class PageServer(ThreadingHTTPServer):
+    """Serves a page and takes its episodes.
+
+    Args:
+        address: host and port; port 0: any that is free.
+        page: with its files and the check of episodes.
+        data: what its script starts with.
+        episodes: where checked episodes go.
+
+    Attributes:
+        address: of the page.
+
+    Raises:
+        OSError: the address cannot be listened on.
+    """
+
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, address: tuple[str, int], page: Page, data: Mapping[str, Any], episodes: EpisodeFile) -> None:
+        self.page = page
+        self.episodes = episodes
+        self.contents = {f"/{name}": (page.folder / name).read_bytes() for name in page.files}
+        self.contents["/"] = self.contents[f"/{page.files[0]}"]
+        self.contents[f"/{DATA_NAME}"] = as_script(data)
+        super().__init__(address, _Handler)
+        host, port = str(self.server_address[0]), self.server_port
+        self.is_local = host in _LOOPBACK
+        self.address = f"http://{host}:{port}/"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing of a connection that broke: the others are served on."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One connection."""
+
+    server: PageServer
+    timeout = _PATIENCE
+    protocol_version = "HTTP/1.1"
+    server_version = "hpamdp"
+    sys_version = ""
+
+    def do_GET(self) -> None:
+        """Send a file of the page."""
+        self._send_file(with_body=True)
+
+    def do_HEAD(self) -> None:
+        """Send the headers of a file of the page."""
+        self._send_file(with_body=False)
+
+    def do_POST(self) -> None:
+        """Check an episode and store it."""
+        self.close_connection = True  # whatever is left of a body that is refused
+        refusal = self._refusal()
+        if refusal is not None:
+            self._answer(*refusal)
+            return
+        length = int(self.headers["Content-Length"])
+        try:
+            body = self.rfile.read(length)
+        except OSError:
+            return  # the client is gone, or silent
+        if len(body) < length:
+            self._answer(HTTPStatus.BAD_REQUEST, "the body is shorter than its Content-Length")
+            return
+        try:
+            episode = self.server.page.check(json.loads(body))
+        except EpisodeError as error:
+            self._answer(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
+            return
+        except (ValueError, RecursionError):  # of json
+            self._answer(HTTPStatus.BAD_REQUEST, "the body is no JSON")
+            return
+        try:
+            is_new = self.server.episodes.add(episode)
+        except OSError as error:
+            self._answer(HTTPStatus.INSUFFICIENT_STORAGE, f"the episode was not stored: {error.strerror}")
+            return
+        self._answer(HTTPStatus.CREATED if is_new else HTTPStatus.OK, "stored")
+
+    def _refusal(self) -> tuple[HTTPStatus, str] | None:
+        """Return why a POST is refused before its body is read, if it is."""
+        length = self.headers.get("Content-Length", "")
+        if not self._is_from_here():
+            return HTTPStatus.FORBIDDEN, "only the page itself may send episodes"
+        if self.path != EPISODES:
+            return HTTPStatus.NOT_FOUND, f"nothing takes a POST but {EPISODES}"
+        if self.headers.get("Transfer-Encoding") is not None or not (length.isascii() and length.isdecimal()):
+            return HTTPStatus.LENGTH_REQUIRED, "a Content-Length is required"
+        if len(length) > 10 or int(length) > _MAX_BODY:
+            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"an episode has at most {_MAX_BODY} bytes"
+        if self.headers.get_content_type() != "application/json":
+            return HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "an episode is application/json"
+        return None
+
+    def _is_from_here(self) -> bool:
+        """Return whether the request is from the page itself, and not from another site that the browser shows.
+
+        Another site's request has its Origin; one that made its own name stand for this address has that name as Host.
+        """
+        host = self.headers.get("Host", "")
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        if self.server.is_local and name not in _LOOPBACK:
+            return False
+        origin = self.headers.get("Origin")
+        return origin is None or origin == f"http://{host}"
+
+    def _send_file(self, *, with_body: bool) -> None:
+        if not self._is_from_here():
+            self._answer(HTTPStatus.FORBIDDEN, "ask for this page by its own address")
+            return
+        # Only what is in the dictionary is sent: no path is ever looked up on the disk.
+        name = self.path.partition("?")[0]
+        content = self.server.contents.get(name)
+        if content is None:
+            is_post = name == EPISODES
+            status = HTTPStatus.METHOD_NOT_ALLOWED if is_post else HTTPStatus.NOT_FOUND
+            self._answer(status, "episodes are sent here, not read" if is_post else "there is no such page")
+            return
+        self._respond(HTTPStatus.OK, _TYPES[Path(name).suffix or ".html"], content, with_body=with_body)
+
+    def _answer(self, status: HTTPStatus, line: str) -> None:
+        self._respond(status, "text/plain; charset=utf-8", f"{one_line(line)[:400]}\n".encode())
+
+    def _respond(self, status: HTTPStatus, content_type: str, content: bytes, *, with_body: bool = True) -> None:
+        try:
+            self.send_response(status)
+            self.send_header("Content-Type", content_type)
+            self.send_header("Content-Length", str(len(content)))
+            for name, value in _HEADERS.items():
+                self.send_header(name, value)
+            if self.close_connection:
+                self.send_header("Connection", "close")
+            self.end_headers()
+            if with_body and self.command != "HEAD":
+                self.wfile.write(content)
+        except OSError:  # the client is gone
+            self.close_connection = True
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Refuse in one line what the base class refuses with a page: other methods, and requests that are none."""
+        self.close_connection = True
+        status = HTTPStatus.METHOD_NOT_ALLOWED if code == HTTPStatus.NOT_IMPLEMENTED else HTTPStatus(code)
+        self._answer(status, message or status.phrase)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Log nothing: the terminal shows what the user should see."""

@@ -1,0 +1,180 @@
+"""`hpamdp play`: people at a problem, in a page that is served on this computer or written as files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import threading
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
+from hpamdp.env.page import EpisodeError, Page
+from hpamdp.messages import first_line, say, warn
+from hpamdp.run.assemble import check_classes, make_env
+from hpamdp.run.folder import POLICY_NAME, SUMMARY_NAME
+from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
+from hpamdp.run.players import Player, load_player, split_words
+
+_DESCRIPTION = """\
+Play a problem yourself, beside agents.
+
+  hpamdp play                                      beside the agents that come with the code
+  hpamdp play --agent outputs/2025-01-31/12-00-00  beside the agent of a run; --agent can be given several times
+  hpamdp play --export site                        the page as files that need no server
+"""
+_LOOPBACK = "127.0.0.1"
+_ONE_EPISODE = ("eval.layouts=1", "film=false")
+
+
+def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
+    """Serve the page until Ctrl-C, or write it to a folder; return the exit code.
+
+    Raises:
+        ConfigError: a wrong word, no such agent, or a problem that has no page.
+    """
+    parser.description = _DESCRIPTION
+    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="of the problem, such as env=NAME")
+    parser.add_argument(
+        "--agent", action="append", metavar="FOLDER", help="an agent to play beside you; none: no agent"
+    )
+    parser.add_argument("--to", type=Path, default=Path("played.jsonl"), help="file that episodes are added to")
+    parser.add_argument("--seed", type=_seed, default=0, help="of the episodes that people get")
+    parser.add_argument("--host", default=_LOOPBACK, help=f"address to listen on ({_LOOPBACK}: this computer alone)")
+    parser.add_argument("--port", type=_port, default=8750, help="0: any that is free (8750)")
+    parser.add_argument("--no-browser", action="store_true", help="do not open the browser")
+    parser.add_argument("--export", type=Path, metavar="FOLDER", help="write the page as files and serve nothing")
+    options = parser.parse_intermixed_args(words)
+    path, settings = split_words(options.settings)
+    if path is not None:
+        raise ConfigError(f"{path}: not KEY=VALUE; give an agent as --agent {path}")
+    config = read(compose_words(settings))
+    page = _page(config, options.seed)
+    agents = own_agents(config) if options.agent is None else given_agents(options.agent)
+    try:
+        data = page.data(agents, has_server=options.export is None)
+    except EpisodeError as error:
+        raise ConfigError(f"--agent {error}") from error
+    if options.export is not None:
+        export(page, data, options.export)
+        say(f"{options.export / page.files[0]}: open it in a browser, or put the folder on any web server")
+        return 0
+    return serve(page, data, options)
+
+
+def _page(config: Config, seed: int) -> Page:
+    check_classes(config)
+    env = make_env(config, 1, config.run.resolve_device(), 0)
+    page = env.page(seed)
+    if page is None:
+        raise ConfigError(f"{config.env}: there is no page to play it on")
+    return page
+
+
+def own_agents(config: Config) -> list[dict[str, Any]]:
+    """Return those of the agents that come with the code that a page can take, for the problem at hand."""
+    folder = package_dir("agents")
+    if folder is None:
+        return []
+    folders = sorted(file.parent for file in folder.glob(f"*/{POLICY_NAME}"))
+    players = {path: load_player(str(path), _ONE_EPISODE) for path in folders}
+    agents = [_agent(path, player) for path, player in players.items() if player.config.env.name == config.env.name]
+    return [agent for agent in agents if agent is not None]
+
+
+def given_agents(names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the agents in these folders as a page takes them.
+
+    Raises:
+        ConfigError: no such agent, or one that a page cannot take.
+    """
+    agents = []
+    for name in names:
+        if name == "none":
+            continue
+        player = load_player(name, _ONE_EPISODE)
+        agent = _agent(Path(name), player)
+        if agent is None:
+            config = player.config
+            raise ConfigError(f"--agent {name}: {config.high} over {config.low} cannot be taken into a page")
+        agents.append(agent)
+    return agents
+
+
+def _agent(path: Path, player: Player) -> dict[str, Any] | None:
+    form = player.agent.portable()
+    if form is None:
+        return None
+    config = player.config
+    name = path.name if path.is_dir() else path.parent.name
+    title = config.low.name if config.high.cls is None else f"{config.high.name} + {config.low.name}"
+    summary = (path if path.is_dir() else path.parent) / SUMMARY_NAME
+    try:
+        score = json.loads(summary.read_text())["score"]
+    except (OSError, ValueError, KeyError):
+        score = None
+    options = json.loads(json.dumps(dict(config.env.options)))
+    return {
+        "name": name,
+        "title": title,
+        "score": score,
+        "env": options,
+        "agent": form,
+    }
+
+
+def export(page: Page, data: dict[str, Any], folder: Path) -> None:
+    """Write the page to a folder, which need not be empty.
+
+    Raises:
+        ConfigError: it cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in page.files:
+            shutil.copyfile(page.folder / name, folder / name)
+        (folder / DATA_NAME).write_bytes(as_script(data))
+    except OSError as error:
+        raise ConfigError(f"--export {folder}: {error.strerror or error}") from error
+
+
+def serve(page: Page, data: dict[str, Any], options: argparse.Namespace) -> int:
+    """Serve the page until Ctrl-C."""
+    try:
+        episodes = EpisodeFile(options.to, page)
+    except EpisodeError as error:
+        raise ConfigError(f"--to {error}") from error
+    try:
+        server = PageServer((options.host, options.port), page, data, episodes)
+    except OSError as error:
+        raise ConfigError(
+            f"--host {options.host} --port {options.port}: {error.strerror or first_line(error)}"
+        ) from error
+    if options.host != _LOOPBACK:
+        warn(f"--host {options.host}: others who reach this address can play and add episodes to {options.to}")
+    say(f"{server.address}: episodes go to {options.to}; Ctrl-C ends it")
+    if not options.no_browser:
+        threading.Timer(0.2, webbrowser.open, [server.address]).start()
+    with server:
+        try:
+            server.serve_forever(poll_interval=0.2)
+        except KeyboardInterrupt:
+            say(f"{options.to}: {episodes.num_added} episodes added")
+    return 0
+
+
+def _whole(text: str, largest: int) -> int:
+    if not text.isdecimal() or int(text) > largest:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 0 to {largest}")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    return _whole(text, 2**31 - 1)
+
+
+def _port(text: str) -> int:
+    return _whole(text, 65535)

@@ -1,0 +1,78 @@
+"""Who plays: a saved agent, or a player that a command line describes, such as `low=planner high=oracle`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from hpamdp.config import Config, ConfigError, compose_words, read
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.run import checkpoint
+from hpamdp.run.assemble import check_choice, check_classes, make_agent, make_env, make_evaluation
+from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.resume import resolve, saved_choices
+from hpamdp.specs import PAMDPSpecs
+
+
+@dataclass(frozen=True)
+class Player:
+    """An agent and the episodes that it can be watched on.
+
+    Attributes:
+        config: of the agent and its problem.
+        agent: with the weights of its checkpoint, if there is one.
+        evaluation: of `eval.layouts` episodes, all of them filmed.
+    """
+
+    config: Config
+    agent: HierarchicalAgent
+    evaluation: Evaluation
+
+
+def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Return the path among a command line's words, if there is one, and the settings.
+
+    Raises:
+        ConfigError: several paths.
+    """
+    paths = [word for word in words if "=" not in word or Path(word).exists()]
+    if len(paths) > 1:
+        raise ConfigError(f"{' '.join(paths)}: several agents; give one, and settings as KEY=VALUE")
+    return (paths[0] if paths else None), [word for word in words if word not in paths]
+
+
+def load_player(path: str | None, settings: Sequence[str]) -> Player:
+    """Build a player.
+
+    Args:
+        path: the agent's folder, or a checkpoint or `policy.pt`; None: the player that the settings describe.
+        settings: words of a command line, such as `env=goal` or `eval.layouts=6`.
+
+    Raises:
+        ConfigError: no such agent, or a wrong setting.
+    """
+    config, source = _config(path, list(settings))
+    torch.set_num_threads(config.run.threads)
+    torch.manual_seed(config.run.seed)
+    check_classes(config)
+    device = config.run.resolve_device()
+    env = make_env(config, 1, device, config.run.seed)
+    check_choice(config, env)
+    agent = make_agent(config, PAMDPSpecs.from_env(env), device)
+    if source is not None:
+        saved = checkpoint.load(source, agent, device, with_training=False)
+        env.set_statistics(saved.states["collection"].get("env", {}))
+    return Player(config, agent, make_evaluation(config, env, num_filmed=config.run.eval.layouts))
+
+
+def _config(path: str | None, settings: list[str]) -> tuple[Config, Path | None]:
+    if path is None:
+        return read(compose_words(settings)), None
+    chosen = saved_choices(path, "checkpoint", settings)
+    given = {word.partition("=")[0] for word in settings}
+    cfg = compose_words([*(f"{group}={name}" for group, name in chosen.items() if group not in given), *settings])
+    cfg.mode, cfg.checkpoint = "eval", path
+    return resolve(cfg, settings)

@@ -1,0 +1,67 @@
+"""`hpamdp watch`: an agent, or a random or planned player, at its problem, as a film."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from torch import Tensor
+
+from hpamdp.analysis import film
+from hpamdp.config import ConfigError
+from hpamdp.messages import say
+from hpamdp.run.players import load_player, split_words
+
+_DESCRIPTION = """\
+Film an agent at its problem.
+
+  hpamdp watch outputs/2025-01-31/12-00-00                 a run's agent
+  hpamdp watch agents/whole --to whole.mp4 --episodes 9    one that comes with the code; .mp4 needs hpamdp[video]
+  hpamdp watch low=planner high=oracle                     the best plan
+  hpamdp watch low=random high=none env=platform           random actions on another problem
+"""
+
+
+def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
+    """Write the film and say what is in it; return the exit code.
+
+    Raises:
+        ConfigError: a wrong word, no such agent, or a problem without pictures.
+    """
+    parser.description = _DESCRIPTION
+    parser.add_argument("player", nargs="*", metavar="AGENT or GROUP=CHOICE", help="who plays, and at what")
+    parser.add_argument("--to", type=Path, default=Path("episodes.gif"), help="file to write, .gif or .mp4")
+    parser.add_argument("--episodes", type=_positive, default=6, help="how many, side by side (6)")
+    parser.add_argument("--seed", type=int, default=0, help="of the episodes; those of evaluations have seed 0")
+    parser.add_argument("--fps", type=_positive, default=25, help="pictures a second (25)")
+    parser.add_argument("--size", type=_positive, default=320, help="px of an episode, from edge to edge (320)")
+    options = parser.parse_intermixed_args(words)
+    if options.to.suffix not in film.SUFFIXES:
+        raise ConfigError(f"--to {options.to}: must end in {' or '.join(film.SUFFIXES)}")
+    path, settings = split_words(options.player)
+    if path is None and not settings:
+        raise ConfigError("watch: nobody to watch; give a run's folder, or a player such as low=planner high=oracle")
+    episodes = [f"eval.layouts={options.episodes}", f"eval.seed={options.seed}", "film=true"]
+    player = load_player(path, [*settings, *episodes])
+    evaluation = player.evaluation
+    states: list[dict[str, Tensor]] = []
+    played = evaluation.run(player.agent.policy, states)
+    pictures = film.film(evaluation.problem, film.tracks_of(states), float(options.fps), options.size)
+    if not pictures:
+        raise ConfigError(f"{player.config.env}: has no pictures to film")
+    try:
+        film.write(options.to, pictures, float(options.fps))
+    except film.FilmError as error:
+        raise ConfigError(f"--to {error}") from error
+    except OSError as error:
+        raise ConfigError(f"--to {options.to}: {error.strerror or error}") from error
+    scores = ", ".join(f"{score:.2f}" for score in played["score"])
+    say(f"{options.to}: {len(played['score'])} episodes, scores {scores}")
+    return 0
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 10_000:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 1 to 10000")
+    return int(text)

@@ -1,0 +1,149 @@
+"""Films: boats move in closed form between presses, files hold what was drawn, `hpamdp watch` tells mistakes."""
+
+import itertools
+import sys
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_config
+from PIL import Image
+
+from hpamdp.analysis import film
+from hpamdp.cli import main
+from hpamdp.env.boatdock import film as boat_film
+from hpamdp.env.boatdock import physics
+from hpamdp.run.players import load_player, split_words
+
+SECONDS = torch.linspace(0.0, 2.0, 41, dtype=torch.float64)
+
+
+def test_the_way_of_a_press_is_the_integral_of_its_speed():
+    for duration in (0.05, 0.4, 1.3):
+        press = torch.tensor(duration, dtype=torch.float64)
+        time = torch.linspace(0.0, 1.95 * duration, 20_001, dtype=torch.float64)
+        virtual = torch.where(time <= duration, time, duration - (time - duration) / physics.GLIDE)
+        way = torch.cumulative_trapezoid(physics.speed(virtual.clamp(min=0.0)), time)
+        np.testing.assert_allclose(physics.distance_at(press, time)[1:], way, atol=1e-5)
+        assert physics.distance_at(press, time)[-1] == pytest.approx(physics.total_distance(press).item())
+
+
+def test_the_time_of_a_distance_is_the_inverse_of_the_distance_at_a_time():
+    for duration in (0.05, 0.4, 1.3):
+        press = torch.tensor(duration, dtype=torch.float64)
+        time = torch.linspace(0.01, 1.94, 50, dtype=torch.float64) * duration
+        np.testing.assert_allclose(physics.time_at(press, physics.distance_at(press, time)), time, atol=1e-6)
+
+
+def test_a_boat_rests_where_its_press_ends_and_stays_there():
+    press = torch.tensor(0.7, dtype=torch.float64)
+    total = physics.total_distance(press).item()
+    assert physics.distance_at(press, torch.tensor(9.0)).item() == pytest.approx(total, abs=1e-12)
+    at_rest = physics.time_at(press, physics.total_distance(press))
+    assert at_rest.item() == pytest.approx(1.95 * 0.7, abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def played():
+    player = load_player(None, ["high=uniform", "low=random", "eval.layouts=8", "film=true"])
+    states = []
+    return player, player.evaluation.run(player.agent.policy, states), film.tracks_of(states)
+
+
+def test_boats_move_smoothly_from_their_start_to_their_end(played, monkeypatch):
+    _, results, tracks = played
+    scenes = []
+    monkeypatch.setattr("hpamdp.env.boatdock.rendering.draw", lambda scene, size: scenes.append(scene) or np.zeros(1))
+    fastest = physics.speed(torch.tensor(2.0)).item()
+    for row, track in enumerate(tracks):
+        scenes.clear()
+        list(boat_film.film(track, fps=50.0, size=8))
+        way = np.array([scene.boat for scene in scenes])
+        assert np.linalg.norm(np.diff(way, axis=0), axis=1).max() <= fastest / 50.0 + 1e-4
+        assert len({tuple(point) for point in way.round(4)}) > 4
+        last = results["path"][row][np.isfinite(results["path"][row]).all(1)][-1]
+        np.testing.assert_allclose(way[-1], last, atol=1e-3)
+        assert (np.diff([scene.fuel for scene in scenes]) <= 1e-9).all()
+        assert scenes[-1].outcome == physics.OUTCOMES[results["outcome"][row]]
+        assert scenes[-1].score == pytest.approx(results["score"][row])
+
+
+def test_the_film_of_an_evaluation_ends_with_the_picture_of_every_end(played):
+    player, _, tracks = played
+    pictures = film.film(player.evaluation.problem, tracks[:4], 10.0, 40)
+    assert pictures[0].shape == (80, 120, 3)  # three side by side, the fourth below
+    np.testing.assert_array_equal(pictures[-1], pictures[-10])  # the pause
+    assert any((one != other).any() for one, other in itertools.pairwise(pictures))
+
+
+def test_other_problems_are_filmed_by_their_own_pictures():
+    player = load_player(None, ["env=sliding", "high=none", "low=random", "eval.layouts=1", "film=true"])
+    states = []
+    player.evaluation.run(player.agent.policy, states)
+    (track,) = film.tracks_of(states, num_steps=3)
+    pictures = list(player.evaluation.problem.film(track, 8.0, 60))
+    assert len(pictures) == 2 * len(track) and pictures[0].shape == (60, 60, 3)
+
+
+def test_a_gif_holds_the_pictures_for_as_long_as_asked(tmp_path):
+    pictures = [np.full((8, 8, 3), value, np.uint8) for value in (0, 120, 255)]
+    film.write(tmp_path / "a.gif", pictures, 10.0)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 3 and image.info["duration"] == 100 and image.info["loop"] == 0
+
+
+def test_a_film_without_pictures_or_of_another_ending_is_refused(tmp_path):
+    with pytest.raises(film.FilmError, match="no picture"):
+        film.write(tmp_path / "a.gif", [], 10.0)
+    with pytest.raises(film.FilmError, match=r"must end in \.gif or \.mp4"):
+        film.write(tmp_path / "a.avi", [np.zeros((2, 2, 3), np.uint8)], 10.0)
+
+
+def test_an_mp4_without_imageio_names_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio.v2", None)
+    with pytest.raises(film.FilmError, match=r"pip install 'hpamdp\[video\]'"):
+        film.write(tmp_path / "a.mp4", [np.zeros((2, 2, 3), np.uint8)], 10.0)
+
+
+def test_nothing_is_filmed_where_it_is_turned_off(played):
+    config = make_config(["high=uniform", "low=random", "film=false"])
+    assert not config.run.film and make_config(["film=true"]).run.film
+
+
+def test_a_path_is_told_from_settings(tmp_path):
+    assert split_words(["low=random", "outputs/x"]) == ("outputs/x", ["low=random"])
+    assert split_words([str(tmp_path)]) == (str(tmp_path), [])
+
+
+def watch(monkeypatch, capsys, *words):
+    monkeypatch.setattr("sys.argv", ["hpamdp", "watch", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    return stopped.value.code, capsys.readouterr()
+
+
+def test_watch_writes_a_film(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "a.gif"
+    words = ["high=uniform", "low=random", "--to", str(file), "--episodes", "2", "--size", "60", "--fps", "5"]
+    code, printed = watch(monkeypatch, capsys, *words)
+    assert code == 0 and "2 episodes, scores" in printed.out
+    with Image.open(file) as image:
+        assert image.size == (120, 60)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "nobody to watch"),
+        (["nowhere"], "no checkpoint there"),
+        (["a", "b"], "several agents"),
+        (["low=planner", "--to", "film.avi"], r"must end in .gif or .mp4"),
+        (["low=planner", "--episodes", "0"], "must be a whole number"),
+        (["low=planner", "--colour", "red"], "--help"),
+        (["low=nobody"], "nobody"),
+        (["low=random", "high=none"], "needs a selector"),
+    ],
+)
+def test_watch_tells_a_mistake_in_one_line(monkeypatch, capsys, words, said):
+    code, printed = watch(monkeypatch, capsys, *words)
+    assert code == 2 and said in printed.err and printed.err.count("\n") == 1 and not printed.out

@@ -1,0 +1,288 @@
+"""The server of a page: what it serves, what it stores, and all that it refuses."""
+
+import http.client
+import json
+import random
+import socket
+import threading
+from contextlib import contextmanager
+
+import pytest
+from play_players import docked
+
+from hpamdp.cli import main
+from hpamdp.env.boatdock.play.boat_page import BoatPage
+from hpamdp.env.page import EpisodeError
+from hpamdp.run import page_server
+from hpamdp.run.page_server import EpisodeFile, PageServer
+
+EPISODES = docked(6)
+JSON = {"Content-Type": "application/json"}
+
+
+@contextmanager
+def serving(path, patience=2.0):
+    page = BoatPage(seed=0)
+    server = PageServer(("127.0.0.1", 0), page, {"answer": 42}, EpisodeFile(path, page))
+    server.RequestHandlerClass.timeout = patience
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    with serving(tmp_path_factory.mktemp("played") / "played.jsonl") as running:
+        yield running
+
+
+def ask(server, method, path, body=None, headers=None):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    try:
+        connection.request(method, path, body, headers or {})
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode(), answer
+    finally:
+        connection.close()
+
+
+def send(server, episode, **headers):
+    return ask(server, "POST", "/episodes", json.dumps(episode), {**JSON, **headers})
+
+
+def raw(server, text, *, shut=True):
+    """Send bytes and return what comes back."""
+    with socket.create_connection(("127.0.0.1", server.server_port), timeout=10) as connection:
+        connection.sendall(text)
+        if shut:
+            connection.shutdown(socket.SHUT_WR)
+        answer = b""
+        try:
+            while part := connection.recv(65536):
+                answer += part
+        except ConnectionResetError:
+            pass
+        return answer.decode(errors="replace")
+
+
+def test_the_page_and_its_data_are_served_and_nothing_from_elsewhere_is_allowed(server):
+    status, text, answer = ask(server, "GET", "/")
+    assert status == 200 and "<canvas" in text and "default-src 'self'" in answer.headers["Content-Security-Policy"]
+    assert ask(server, "GET", "/data.js")[1] == 'window.HPAMDP_DATA = {"answer":42};\n'
+    for name in BoatPage.files:
+        assert ask(server, "GET", f"/{name}?version=1")[0] == 200
+    assert ask(server, "HEAD", "/game.js")[:2] == (200, "")
+
+
+def test_the_page_names_no_other_site():
+    for name in BoatPage.files:
+        text = (BoatPage.folder / name).read_text()
+        assert "https://" not in text and "//cdn" not in text
+        assert [line for line in text.splitlines() if "http://" in line and "www.w3.org" not in line] == []
+
+
+def test_an_episode_is_stored_once_however_often_it_is_sent(tmp_path):
+    with serving(tmp_path / "a.jsonl") as server:
+        assert [send(server, episode)[0] for episode in EPISODES[:2]] == [201, 201]
+        assert send(server, EPISODES[0])[0] == 200
+    with serving(tmp_path / "a.jsonl") as server:  # and after a new start
+        assert send(server, EPISODES[1])[0] == 200 and send(server, EPISODES[2])[0] == 201
+    lines = (tmp_path / "a.jsonl").read_text().splitlines()
+    assert [json.loads(line) for line in lines] == EPISODES[:3]
+
+
+def test_two_pages_at_once_lose_nothing(tmp_path):
+    first, second = docked(30, player="a" * 16), docked(30, player="b" * 16)
+    with serving(tmp_path / "a.jsonl") as one, serving(tmp_path / "a.jsonl") as other:
+        jobs = [
+            threading.Thread(target=lambda page=page, server=server: [send(server, episode) for episode in page])
+            for page, server in ((first, one), (second, other))
+        ]
+        for job in jobs:
+            job.start()
+        for job in jobs:
+            job.join()
+    stored = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    found = {(episode["player"], episode["index"]) for episode in stored}
+    assert len(stored) == 60 and found == {(player * 16, index) for player in "ab" for index in range(30)}
+
+
+def test_a_line_that_was_cut_short_stays_one_line(tmp_path):
+    path = tmp_path / "a.jsonl"
+    path.write_text(json.dumps(EPISODES[0]) + "\n" + json.dumps(EPISODES[1])[:50])
+    with serving(path) as server:
+        assert send(server, EPISODES[1])[0] == 201
+    lines = path.read_text().splitlines()
+    assert [json.loads(lines[0]), json.loads(lines[2])] == EPISODES[:2] and len(lines) == 3
+
+
+def test_a_file_of_something_else_is_refused(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("dear diary\nnothing happened\n")
+    with pytest.raises(EpisodeError, match="line 1: no episode"):
+        EpisodeFile(path, BoatPage(seed=0))
+    with pytest.raises(EpisodeError, match="there is no folder"):
+        EpisodeFile(tmp_path / "nowhere" / "a.jsonl", BoatPage(seed=0))
+
+
+def forged(rng, number):
+    """Return a way to spoil an episode, and the body that comes of it."""
+    episode = json.loads(json.dumps(EPISODES[number % len(EPISODES)]))
+    episode["index"] = 10_000 + number
+    names = list(episode)
+    kind = number % 8
+    if kind == 0:  # a figure that the presses do not come to
+        name = rng.choice(["score", "fuel"])
+        episode[name] = episode[name] * rng.uniform(0.1, 0.9)
+    elif kind == 1:  # a press of another time
+        press = rng.choice(episode["presses"])
+        press["duration"] += rng.choice([-1, 1]) * rng.uniform(1e-5, 0.1)
+    elif kind == 2:  # another end
+        episode["end"] = [episode["end"][0] + rng.uniform(0.01, 5.0), episode["end"][1]]
+    elif kind == 3:  # a field that is missing or has another type
+        name = rng.choice(names)
+        if rng.random() < 0.5:
+            del episode[name]
+        else:
+            episode[name] = rng.choice([None, [], {}, "x" * 100, -7, 1e300, [[[]]], {"a": {"b": 1}}])
+    elif kind == 4:  # a field that does not exist
+        episode[rng.choice(["name", "address", "__proto__", "x" * 200])] = rng.choice(["Ada", 1, None])
+    elif kind == 5:  # other events
+        episode["events"] = episode["events"][: rng.randrange(len(episode["events"]) - 1)]
+    elif kind == 6:  # cut
+        text = json.dumps(episode)
+        return text[: rng.randrange(1, len(text) - 1)].encode()
+    else:  # something else altogether
+        values = [[episode], {**episode, "index": 10**400}, {**episode, "fuel": 10**400}, None, [], 17, "text"]
+        texts = ["", "{" * 50_000, "[" * 50_000, '{"a":NaN}', "\0" * 99, '{"format":1e999}', "<xml/>", "\ud800"]
+        texts += map(json.dumps, values)
+        return rng.choice([*(text.encode(errors="surrogatepass") for text in texts), b"\xff\xfe\x00"])
+    return json.dumps(episode).encode()
+
+
+def test_five_hundred_forged_cut_and_foreign_episodes_are_refused_in_a_line_and_leave_no_trace(tmp_path):
+    rng = random.Random(1)
+    with serving(tmp_path / "a.jsonl") as server:
+        for number in range(500):
+            body = forged(rng, number)
+            status, text, _ = ask(server, "POST", "/episodes", body, JSON)
+            assert status in (400, 411, 422), (number, status, text)
+            assert text.count("\n") == 1 and len(text) < 500 and "Traceback" not in text, text
+        assert not (tmp_path / "a.jsonl").exists()
+        assert send(server, EPISODES[0])[0] == 201  # it still serves
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        *(
+            "/../../etc/passwd",
+            "/..%2f..%2fetc%2fpasswd",
+            "//etc/passwd",
+            "/page/../../boat_page.py",
+            "/%2e%2e/game.js",
+        ),
+        *("/game.js/", "/index.html%00.png", "/.", "/..", "/boat_page.py", "/" + "a" * 5000, "/played.jsonl"),
+    ],
+)
+def test_nothing_but_the_files_of_the_page_is_sent(server, path):
+    status, text, _ = ask(server, "GET", path)
+    assert status in (404, 414) and text.count("\n") == 1 and "import" not in text
+
+
+@pytest.mark.parametrize("method", ["PUT", "DELETE", "PATCH", "OPTIONS", "TRACE", "CONNECT", "BREW"])
+def test_other_methods_are_refused(server, method):
+    status, text, _ = ask(server, method, "/episodes")
+    assert status == 405 and text.count("\n") == 1
+
+
+def test_episodes_cannot_be_read_and_pages_not_posted_to(server):
+    assert ask(server, "GET", "/episodes")[0] == 405
+    assert ask(server, "POST", "/", "{}", JSON)[0] == 404
+
+
+def test_other_sites_may_neither_send_nor_read(server):
+    port = server.server_port
+    assert send(server, EPISODES[0], Origin="http://evil.example")[0] == 403
+    assert send(server, EPISODES[0], Origin="null")[0] == 403
+    assert send(server, EPISODES[0], Host="evil.example")[0] == 403  # a name that was made to mean this address
+    assert ask(server, "GET", "/", headers={"Host": "evil.example"})[0] == 403
+    assert ask(server, "GET", "/", headers={"Host": f"localhost:{port}"})[0] == 200
+    assert ask(server, "POST", "/episodes", "{}", {"Content-Type": "text/plain"})[0] == 415  # as a form could send
+
+
+def test_an_oversized_episode_is_refused_before_it_is_read(server):
+    head = f"POST /episodes HTTP/1.1\r\nHost: localhost:{server.server_port}\r\nContent-Type: application/json\r\n"
+    assert " 413 " in raw(server, f"{head}Content-Length: 99999999\r\n\r\n".encode())
+    assert " 413 " in raw(server, f"{head}Content-Length: {'9' * 400}\r\n\r\n".encode())
+    for length in ("-1", "1e3", "ten", "\u0663"):
+        assert " 411 " in raw(server, f"{head}Content-Length: {length}\r\n\r\n".encode())
+    assert " 411 " in raw(server, f"{head}Transfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n0\r\n\r\n".encode())
+
+
+def test_a_body_that_is_shorter_than_it_says_is_refused_and_a_silent_client_keeps_nobody_waiting(tmp_path):
+    with serving(tmp_path / "a.jsonl", patience=0.5) as server:
+        head = f"POST /episodes HTTP/1.1\r\nHost: localhost:{server.server_port}\r\nContent-Type: application/json\r\n"
+        assert " 400 " in raw(server, f"{head}Content-Length: 500\r\n\r\n{{}}".encode())
+        silent = [socket.create_connection(("127.0.0.1", server.server_port)) for _ in range(20)]
+        assert send(server, EPISODES[0])[0] == 201
+        assert raw(server, f"{head}Content-Length: 500\r\n\r\n{{}}".encode(), shut=False) == ""
+        for connection in silent:
+            connection.close()
+        assert send(server, EPISODES[1])[0] == 201
+
+
+@pytest.mark.parametrize(
+    "text", [b"", b"\r\n\r\n", b"GET\r\n\r\n", b"\x16\x03\x01\x02", b"GET / HTTP/9.9\r\n\r\n", b"A" * 70_000]
+)
+def test_requests_that_are_none_break_nothing(server, text):
+    raw(server, text)
+    assert ask(server, "GET", "/")[0] == 200
+
+
+def test_a_disk_that_is_full_is_told_and_the_episode_can_be_sent_again(tmp_path, monkeypatch):
+    with serving(tmp_path / "a.jsonl") as server:
+        with monkeypatch.context() as patch:
+            patch.setattr(page_server.os, "fsync", lambda number: (_ for _ in ()).throw(OSError(28, "No space left")))
+            status, text, _ = send(server, EPISODES[0])
+        assert status == 507 and "No space left" in text
+        assert send(server, EPISODES[0])[0] == 201
+
+
+def play(monkeypatch, capsys, *words):
+    monkeypatch.setattr("sys.argv", ["hpamdp", "play", *words])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    return stopped.value.code, capsys.readouterr()
+
+
+def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 1)
+    code, printed = play(monkeypatch, capsys, "--export", str(tmp_path / "site"), "--agent", "none")
+    assert code == 0 and "index.html" in printed.out
+    assert {file.name for file in (tmp_path / "site").iterdir()} == {*BoatPage.files, "data.js"}
+    script = (tmp_path / "site" / "data.js").read_text()
+    data = json.loads(script.removeprefix("window.HPAMDP_DATA = ").rstrip(";\n"))
+    assert data["has_server"] is False and len(data["layouts"]["round"]) == 60
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["env=platform"], "there is no page"),
+        (["--agent", "nowhere"], "no checkpoint there"),
+        (["somewhere"], "--agent somewhere"),
+        (["--port", "99999"], "whole number"),
+        (["--to", "nowhere/a.jsonl", "--agent", "none"], "there is no folder nowhere"),
+        (["--agent", "none", "--host", "256.1.1.1"], "--host 256.1.1.1"),
+    ],
+)
+def test_play_tells_a_mistake_in_one_line(monkeypatch, capsys, words, said):
+    monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
+    code, printed = play(monkeypatch, capsys, *words)
+    assert code == 2 and said in printed.err and printed.err.count("\n") == 1

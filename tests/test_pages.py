@@ -1,0 +1,144 @@
+"""The pages of the site: one for each learner, selector and domain, made of the repository's own files."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import TRAINED, choices, forked, make_config
+
+from hpamdp import cli
+from hpamdp.run.metrics import read_rows
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+FOLDERS = {"low": "learners", "high": "selectors", "env": "domains"}
+# Those that share a page.
+SHARED = {"pdqn_published": "pdqn", "sliding": "moving"}
+ALL = [(group, name) for group in FOLDERS for name in choices(group)]
+
+
+@pytest.fixture
+def hooks(monkeypatch):
+    """The module docs/hooks.py, which mkdocs loads."""
+    spec = importlib.util.spec_from_file_location("site_hooks", DOCS / "hooks.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def page(group: str, name: str) -> Path:
+    return DOCS / FOLDERS[group] / f"{SHARED.get(name, name)}.md"
+
+
+@pytest.mark.parametrize(("group", "name"), ALL)
+def test_every_choice_has_a_page_that_names_it_and_shows_its_settings(group, name, hooks):
+    file = page(group, name)
+    text = file.read_text()
+    assert f"{group}={name}" in text
+    assert f"- {file.relative_to(DOCS).as_posix()}\n" in (ROOT / "mkdocs.yml").read_text()
+    source = f"conf/{group}/{name}.yaml"
+    values = yaml.safe_load((ROOT / source).read_text())
+    del values["_target_"]
+    if not values:
+        return
+    assert source in text
+    table = hooks.settings_of(source)
+    for key, value in values.items():
+        for setting in [f"{key}.{inner}" for inner in value] if isinstance(value, dict) else [key]:
+            assert f"| `{setting}` |" in table
+
+
+@pytest.mark.parametrize("name", sorted({*choices("env")} - {"gymnasium", "boatdock_released", "hard_goal"}))
+def test_a_domains_page_names_its_actions_outcomes_and_observations(name):
+    text = page("env", name).read_text()
+    env = make_config([f"env={name}"]).env.cls(1)
+    named = [each for each in getattr(env, "observation_names", ()) if not re.fullmatch(r"[xy]_\d+", each)]
+    named += [*env.outcomes] if hasattr(env, "outcomes") else []
+    named += [] if name == "hard_move" else [*getattr(env, "discrete_names", ())]
+    assert not [each for each in named if f"`{each}`" not in text]
+
+
+def test_no_link_and_no_directive_of_the_site_leads_nowhere(hooks):
+    site = hooks.Site()
+    assert not site.problems
+    assert {"index.md", "studies/table1.md", "changelog.md", "api/hpamdp/env/base.md"} <= site.pages.keys()
+
+
+def test_directives_are_filled_in_and_wrong_ones_are_told(hooks, tmp_path, monkeypatch):
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "hpamdp").mkdir()
+    (tmp_path / "a.yaml").write_text("# What it is.\n_target_: x.Y\n\n# The size | of it.\nsize: 3\nrate: 0.5\n")
+    (tmp_path / "a.csv").write_text("domain,method,score\nx,m,1\ny,n,2\n")
+    (tmp_path / "b.md").write_text("| a | b |\n|---|---|\n| x | 1 |\n| y | 2 |\n")
+    (tmp_path / "m.py").write_text('"""One.\n\nSource: me,\narXiv 1234.56789.\n\nDiffers:\n- a\n"""\n')
+    lines = ["settings of a.yaml", "csv a.csv: domain=x", "rows of b.md, table 1: y", "docstring of m.py: Source"]
+    wrong = ["settings of gone.yaml", "csv a.csv: domain=z", "rows of b.md, table 2: y", "docstring of m.py: Sauce"]
+    (tmp_path / "docs/page.md").write_text("".join(f"<!-- {line} -->\n\n" for line in lines + wrong) + "[a](gone.md)\n")
+    monkeypatch.setattr(hooks, "ROOT", tmp_path)
+    site = hooks.Site()
+    text = site.pages["page.md"]
+    assert "| `size` | `3` | The size \\| of it. |\n| `rate` | `0.5` |  |" in text
+    assert "| m | 1 |" in text and "| n | 2 |" not in text
+    assert "| y | 2 |" in text and "| x | 1 |" not in text
+    assert "arXiv [1234.56789](https://arxiv.org/abs/1234.56789)." in text
+    assert len(site.problems) == len(wrong) + 1
+
+
+def test_links_to_code_lead_to_pages_that_show_it(hooks, tmp_path, monkeypatch):
+    (tmp_path / "docs/sub").mkdir(parents=True)
+    (tmp_path / "hpamdp").mkdir()
+    (tmp_path / "hpamdp/part.py").write_text('"""A module."""\n')
+    (tmp_path / "run.py").write_text("print(1)\n")
+    (tmp_path / "docs/sub/page.md").write_text("[a](../../run.py) [b](../../hpamdp/part.py)\n```\n[c](gone.py)\n```\n")
+    monkeypatch.setattr(hooks, "ROOT", tmp_path)
+    site = hooks.Site()
+    assert not site.problems
+    assert site.pages["sub/page.md"].startswith("[a](../source/run.py.md) [b](../api/hpamdp/part.md)\n")
+    assert "```python\nprint(1)\n```" in site.pages["source/run.py.md"]
+
+
+# What makes each one learn within a few steps, and seldom.
+FEW = {"warmup_frames": 128, "updates_per_frame": 0.1}
+QUICK = {
+    "hppo": ["low.minibatch_size=16"],
+    "qpamdp": [
+        *(f"low.{name}=8" for name in ("initial_episodes", "relearning_episodes", "rollouts", "patience")),
+        *(f"low.{name}=1" for name in ("phi_order", "psi_order", "parameter_updates")),
+    ],
+    "hyar": ["low.codec_pretrain_updates=1", "low.codec_every=1"],
+    "pets": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
+    "dlpa": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
+    "actor": ["high.minibatch_size=16"],
+    "meta_critic": ["high.warmup_decisions=16", "high.updates_per_decision=0.1"],
+    "option_critic": ["high.warmup_steps=64"],
+}
+SELECTORS = ["ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson", "option_critic", "actor"]
+SELECTORS += ["meta_critic"]
+
+
+def run(words: list[str]) -> None:
+    sys.argv = ["hpamdp", *words]
+    cli.main()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("low", sorted({*TRAINED} - {"planner", "random"}))
+def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
+    high = SELECTORS[sorted(TRAINED).index(low) % len(SELECTORS)]
+    words = [f"low={low}", f"high={high}", "num_envs=16", "steps_per_batch=4", "total_frames=1024", "log_every=64"]
+    words += ["eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}", "agent.uniform_option_frames=1024"]
+    words += ["env=rooms", "agent.option_length=learned"] if high == "option_critic" else []
+    settings = yaml.safe_load((ROOT / f"conf/low/{low}.yaml").read_text())
+    words += [f"low.{name}={value}" for name, value in FEW.items() if name in settings]
+    assert forked(run, [*words, *QUICK.get(low, []), *QUICK.get(high, [])]) == 0
+    columns = {name for row in read_rows(tmp_path / "metrics.csv") for name in row}
+    logged = {name for name in columns if name.startswith(("low/", "high/"))}
+    assert {name.split("/")[0] for name in logged} == {"low", "high"}
+    for column in logged:
+        level, *_, name = column.split("/")
+        name = re.sub("_(incongruent|congruent)$", "_NAME", name)
+        text = page(level, low if level == "low" else high).read_text()
+        assert f"`{name}`" in text, column

@@ -1,0 +1,377 @@
+"""PETS: the search over sequences, what the model is told, its members, and problems that it solves."""
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import keys
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.low_level.pets import MEMBER, PETS
+from hpamdp.policies.shared.planning import Prediction, SequenceSearch, discounted_return, elite_weights
+from hpamdp.specs import PAMDPSpecs
+
+CPU = torch.device("cpu")
+SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
+BOAT = PAMDPSpecs.from_env(BoatDockEnv(1, controller="congruent"))
+
+SEARCH = dict(
+    horizon=2, max_sequences=16, num_kept=3, num_samples=16, num_elites=4, num_iterations=3, temperature=0.1,
+    min_deviation=0.02,
+)  # fmt: skip
+OPTIONS = dict(
+    augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False, lr=2e-3,
+    weight_decay=0.1, transition_weight=2.0, warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
+    parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
+)  # fmt: skip
+
+
+def make(specs: PAMDPSpecs = SPECS, **changes) -> PETS:
+    torch.manual_seed(0)
+    return PETS(specs, CPU, **{**OPTIONS, **changes})
+
+
+def batch_of(state, discrete, unit, reward, next_state, terminated, truncated=None, specs=SPECS) -> TensorDict:
+    truncated = torch.zeros_like(terminated) if truncated is None else truncated
+    flags = {keys.TERMINATED: terminated, keys.TRUNCATED: truncated, keys.DONE: terminated | truncated}
+    after = {keys.OBSERVATION: next_state, keys.REWARD: reward.unsqueeze(-1)}
+    after |= {name: flag.unsqueeze(-1) for name, flag in flags.items()}
+    action = {"discrete": discrete, "parameters": specs.from_unit(unit)}
+    flat = TensorDict({keys.OBSERVATION: state, keys.ACTION: action, "next": after}, [len(state)])
+    return flat.unsqueeze(-1)
+
+
+def random_batch(num: int, **changes) -> TensorDict:
+    parts = {
+        "state": torch.randn(num, 4),
+        "discrete": torch.randint(3, (num,)),
+        "unit": torch.rand(num, 3) * 2 - 1,
+        "reward": torch.randn(num),
+        "next_state": torch.randn(num, 4),
+        "terminated": torch.rand(num) < 0.3,
+    }
+    return batch_of(**{**parts, **changes})
+
+
+def learn(learner: PETS, batch: TensorDict) -> dict[str, float]:
+    return learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
+
+
+# The search.
+
+
+def test_all_sequences_are_tried_where_there_are_few():
+    search = SequenceSearch(SPECS.parameter_dims, **SEARCH)
+    sequences = search.sequences(2, CPU)
+    assert sequences.shape == (2, 9, 2)
+    assert sequences[0].tolist() == [[first, second] for first in range(3) for second in range(3)]
+    assert torch.equal(sequences[0], sequences[1])
+
+
+def test_of_many_sequences_random_ones_are_tried_in_which_first_actions_occur_equally_often():
+    search = SequenceSearch((1,) * 8, **{**SEARCH, "horizon": 5, "max_sequences": 32})
+    sequences = search.sequences(50, CPU)
+    assert sequences.shape == (50, 32, 5)
+    for state in sequences[..., 0]:
+        assert state.bincount(minlength=8).tolist() == [4] * 8
+    assert len(sequences[:, :, 1:].flatten(0, 1).unique(dim=0)) > 1000
+
+
+def test_more_actions_than_sequences_get_their_turn():
+    search = SequenceSearch((1,) * 100, **SEARCH)
+    assert len(search.sequences(200, CPU)[..., 0].unique()) == 100
+
+
+@pytest.mark.parametrize("max_sequences", [2, 64])
+def test_the_search_finds_the_best_sequence_and_its_parameters(max_sequences):
+    # Worth most: action 1 with (.5, -.3), then action 0 with .2; of two random sequences one has the right beginning.
+    def returns(discrete, unit):
+        error = (unit[..., 0, 0] - 0.5).square() + (unit[..., 0, 1] + 0.3).square() + (unit[..., 1, 0] - 0.2).square()
+        is_best = (discrete[..., 0] == 1) & ((discrete[..., 1] == 0) | (max_sequences == 2))
+        return is_best.float().unsqueeze(-1) - error
+
+    torch.manual_seed(0)
+    options = {**SEARCH, "max_sequences": max_sequences, "num_samples": 64, "num_elites": 8, "num_iterations": 6}
+    found = SequenceSearch((1, 2), **options)(returns, 20, CPU)
+    assert (found.discrete == 1).all()
+    torch.testing.assert_close(found.own, torch.tensor([0.5, -0.3]).expand(20, 2), atol=0.06, rtol=0.0)
+
+
+def test_what_an_action_has_no_parameter_for_is_0_in_every_sample():
+    seen = []
+
+    def returns(discrete, unit):
+        seen.append((discrete, unit))
+        return torch.rand(unit.shape[:3])
+
+    SequenceSearch(SPECS.parameter_dims, **SEARCH)(returns, 5, CPU)
+    dims = torch.tensor(SPECS.parameter_dims)
+    for discrete, unit in seen:
+        has_none = torch.arange(2) >= dims[discrete].unsqueeze(-1)
+        assert (unit.abs().amax(2)[has_none] == 0).all() and (unit.abs().amax(2)[~has_none] > 0).all()
+    assert [discrete.shape[1] for discrete, _ in seen] == [9, 3, 3]
+
+
+def test_actions_without_any_parameters_can_be_searched():
+    found = SequenceSearch((0, 0), **SEARCH)(
+        lambda discrete, unit: discrete.sum(-1, keepdim=True).float().expand(unit.shape[:3]), 4, CPU
+    )
+    assert found.own.shape == (4, 0) and (found.discrete == 1).all()
+
+
+def test_a_return_weights_rewards_by_the_end_of_the_episode():
+    one = torch.ones(2, 5)
+    step = Prediction(one, 2.0 * one, torch.stack([3.0 * one[0], 5.0 * one[0]]), torch.zeros(2, 5))
+    expected = torch.tensor([2.5, 3.5])[:, None] * (1.0 + 0.5 * 0.5)
+    torch.testing.assert_close(discounted_return([step, step], 0.5), expected.expand(2, 5))
+
+
+def test_elites_are_the_best_weighted_by_their_returns():
+    place, weight = elite_weights(torch.tensor([[0.1, 3.0, 2.0, -1.0]]), 2, 0.5)
+    assert place.tolist() == [[1, 2]]
+    torch.testing.assert_close(weight[0, 0] / weight[0, 1], torch.tensor(2.0).exp())
+
+
+# The model.
+
+
+def test_a_truncated_step_is_not_an_end():
+    learner = make()
+    ends = torch.zeros(64, dtype=torch.bool)
+    learn(learner, random_batch(64, terminated=ends, truncated=~ends))
+    assert not learner.buffer[:]["terminated"].any()
+    with torch.no_grad():
+        assert (learner.prepared()["terminated"] == 0).all()
+
+
+def test_the_model_learns_where_steps_lead_when_they_end_and_what_ends_earn():
+    """Entry 0 moves by the parameter of action 0 or 1; past 1 the episode ends, which earns 10 with action 1."""
+    torch.manual_seed(0)
+    num = 512
+    state, unit = torch.rand(num, 4) * 2 - 1, torch.rand(num, 3) * 2 - 1
+    discrete = torch.randint(3, (num,))
+    way = torch.where(discrete == 0, unit[:, 0], torch.where(discrete == 1, unit[:, 1] * unit[:, 2], 0.0))
+    after = state.clone()
+    after[:, 0] += way
+    ends = after[:, 0].abs() > 1
+    reward = torch.where(ends, 10.0 * (discrete == 1), way)
+    # Where an episode ends, the observation says nothing.
+    after[ends] = 0.0
+    learner = make(updates_per_frame=1.2, lr=5e-3)
+    learn(learner, batch_of(state, discrete, unit, reward, after, ends))
+    slots = SPECS.parameter_slots
+    own = unit.gather(-1, slots[discrete]) * learner.policy.search.has_slot[discrete]
+    each = [part.expand(3, *part.shape) for part in (state, discrete, own)]
+    with torch.no_grad():
+        predicted = learner.model(*each)
+    assert (predicted.next_state - after).square().mean((0, 2))[~ends].mean().sqrt() < 0.08
+    assert ((predicted.logit > 0) == ends).float().mean() > 0.95
+    assert (predicted.terminating - reward)[:, ends].square().mean().sqrt() < 1.5
+    assert (predicted.continuing - reward)[:, ~ends].square().mean().sqrt() < 0.2
+
+
+def test_changes_that_follow_from_others_are_derived_from_them():
+    learner = make()
+    state, change = torch.randn(100, 4), torch.randn(100, 4)
+    change[:, 2] = 0.0
+    change[:, 3] = 2.0 * change[:, 0] - change[:, 1]
+    batch = random_batch(100, state=state, next_state=state + change, terminated=torch.zeros(100, dtype=torch.bool))
+    learn(learner, batch)
+    assert learner.model.is_predicted.tolist() == [1.0, 1.0, 0.0, 0.0]
+    with torch.no_grad():
+        each = [part.expand(3, *part.shape) for part in (state, batch[keys.DISCRETE][:, 0], torch.zeros(100, 2))]
+        moved = learner.model(*each).next_state - state
+    assert (moved[..., 2] == 0).all()
+    torch.testing.assert_close(moved[..., 3], 2.0 * moved[..., 0] - moved[..., 1], atol=1e-4, rtol=1e-4)
+
+
+def test_a_probabilistic_model_learns_how_noisy_a_step_is():
+    torch.manual_seed(0)
+    state = torch.rand(1000, 4)
+    deviation = torch.where(state[:, :1] > 0.5, 1.0, 0.05)
+    after = state + deviation * torch.randn(1000, 4)
+    learner = make(probabilistic=True, updates_per_frame=0.5)
+    learn(learner, random_batch(1000, state=state, next_state=after, terminated=torch.zeros(1000, dtype=torch.bool)))
+    each = [part.expand(3, *part.shape) for part in (state, torch.zeros(1000, dtype=torch.long), torch.zeros(1000, 2))]
+    with torch.no_grad():
+        moves = torch.stack([learner.model(*each).next_state - state for _ in range(20)])
+    is_noisy = state[:, 0] > 0.5
+    assert 0.7 < moves[:, :, is_noisy].std() < 1.3
+    assert moves[:, :, ~is_noisy].std() < 0.3
+
+
+def rotated(state: torch.Tensor, number: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return boats' observations under one of their symmetries, and what each key becomes."""
+    maps = BOAT.symmetries
+    return maps.map_observation(torch.full((len(state),), number), state), maps.discrete[number, 0]
+
+
+@pytest.mark.parametrize("number", range(3))  # the turns
+def test_the_model_predicts_for_a_turned_state_the_turned_next_state(number):
+    learner = make(BOAT)
+    state = BoatDockEnv(30, controller="congruent").reset()[keys.OBSERVATION]
+    turned, becomes = rotated(state, number)
+    entries = learner.entries
+    discrete, own = torch.randint(3, (30,)), torch.rand(30, 1) * 2 - 1
+    ahead, turned_ahead = (
+        learner.model(seen[:, entries].expand(3, -1, -1), key.expand(3, -1), own.expand(3, -1, -1))
+        for seen, key in ((state, discrete), (turned, becomes[discrete]))
+    )
+    for name in ("continuing", "terminating", "logit"):
+        torch.testing.assert_close(getattr(ahead, name), getattr(turned_ahead, name), atol=1e-4, rtol=1e-4)
+    maps = BOAT.symmetries.with_entries(entries)
+    expected = maps.map_observation(torch.full((3, 30), number), ahead.next_state)
+    torch.testing.assert_close(turned_ahead.next_state, expected, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("number", range(3))
+def test_the_plan_of_a_turned_state_is_the_turned_plan(number):
+    learner = make(BOAT, max_sequences=9, num_kept=9)
+    state = BoatDockEnv(20, controller="congruent").reset()[keys.OBSERVATION]
+    turned, becomes = rotated(state, number)
+    entries = learner.entries
+    search = learner.policy.search
+    plain = search.sequences
+
+    def plan(seen, order):
+        # Random numbers belong to places in the list of sequences: list the turned sequences in the same order.
+        search.sequences = lambda num, device: order[plain(num, device)]
+        torch.manual_seed(1)
+        return learner.policy.plan(seen[:, entries])
+
+    found, turned_found = plan(state, torch.arange(3)), plan(turned, becomes)
+    assert torch.equal(becomes[found.discrete], turned_found.discrete)
+    torch.testing.assert_close(found.own, turned_found.own, atol=1e-3, rtol=0.0)
+
+
+def test_with_a_frame_mirror_images_are_learned_from_and_without_one_all_maps():
+    from hpamdp.env.catch_point.environment import CatchPointEnv
+
+    assert make(BOAT).symmetry is not None
+    for env, factor in ((BoatDockEnv(4, controller="congruent"), 2), (CatchPointEnv(4), 16)):
+        learner = make(PAMDPSpecs.from_env(env), warmup_frames=10_000)
+        rolled = with_decisions(env).rollout(8, learner.policy, break_when_any_done=False)
+        learn(learner, rolled)
+        assert len(learner.prepared()) == 32 * factor
+        unaugmented = make(PAMDPSpecs.from_env(env), warmup_frames=10_000, augment=False)
+        learn(unaugmented, rolled)
+        assert len(unaugmented.prepared()) == 32
+
+
+def test_augmentation_is_refused_where_nothing_is_declared():
+    with pytest.raises(ValueError, match="augment=true: the problem declares no symmetries; use augment=false"):
+        make(augment=True)
+    assert make(augment="auto").symmetry is None
+
+
+# The policy.
+
+
+def acting(learner: PETS, td: TensorDict) -> TensorDict:
+    learner.policy.is_trained.fill_(True)
+    return learner.policy(td)
+
+
+def test_an_environment_follows_one_member_until_its_episode_ends():
+    env = with_decisions(BoatDockEnv(40, controller="congruent"))
+    learner = make(BOAT, num_members=5)
+    rolled = env.rollout(12, learner.policy, break_when_any_done=False)
+    member, done = rolled[MEMBER], rolled["next", keys.DONE].squeeze(-1)
+    changes = member[:, 1:] != member[:, :-1]
+    assert not changes[~done[:, :-1]].any()
+    assert 0.5 < changes[done[:, :-1]].float().mean() < 1.0
+    assert member[:, 0].bincount(minlength=5).min() > 0
+
+
+def test_exploring_plans_with_the_environments_own_member_and_greedy_ones_with_all():
+    learner = make(num_members=3, parameter_noise=0.0)
+    asked = []
+    search = learner.policy._plan
+    learner.policy._plan = lambda state, members: asked.append((len(state), members)) or search(state, members)
+    td = TensorDict(
+        {
+            keys.OBSERVATION: torch.randn(6, 4),
+            MEMBER: torch.tensor([2, 0, 2, 2, 0, 0]),
+            keys.IS_DECISION: torch.zeros(6, 1, dtype=torch.bool),
+            keys.DONE: torch.zeros(6, 1, dtype=torch.bool),
+        },
+        [6],
+    )
+    acting(learner, td.clone())
+    assert asked == [(3, slice(0, 1)), (3, slice(2, 3))]
+    asked.clear()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        acting(learner, td.clone())
+    assert asked == [(6, slice(None))]
+
+
+def test_plans_with_own_members_come_back_in_the_order_of_the_states():
+    learner = make(num_members=3, num_samples=64, num_elites=8, num_iterations=6)
+    state, member = torch.randn(9, 4), torch.tensor([2, 0, 1, 2, 0, 1, 1, 2, 0])
+    together = learner.policy.plan(state, member)
+    for row in range(9):
+        alone = learner.policy.plan(state[row : row + 1], member[row : row + 1])
+        assert (alone.value[0] - together.value[row]).abs() < 0.2 * together.value.std() + 0.05
+
+
+def test_nothing_is_planned_before_the_first_update_or_for_finished_episodes(monkeypatch):
+    learner = make()
+    asked = []
+    plan = learner.policy.plan
+    monkeypatch.setattr(
+        learner.policy, "plan", lambda state, member=None: asked.append(len(state)) or plan(state, member)
+    )
+    td = TensorDict({keys.OBSERVATION: torch.randn(8, 4), keys.DONE: (torch.arange(8) < 3).unsqueeze(-1)}, [8])
+    learner.policy(td.clone())
+    assert asked == []
+    acting(learner, td.clone())
+    assert asked == [5]
+
+
+def test_actions_are_random_as_long_as_all_rewards_are_the_same():
+    learner = make()
+    for reward, is_trained in ((torch.zeros(64), False), (torch.arange(64.0), True)):
+        learn(learner, random_batch(64, reward=reward))
+        assert bool(learner.policy.is_trained) == is_trained
+
+
+def test_actions_lie_in_their_bounds():
+    td = acting(make(parameter_noise=1.0), TensorDict({keys.OBSERVATION: 3 * torch.randn(50, 4)}, [50]))
+    low, high = torch.tensor(SPECS.parameter_low), torch.tensor(SPECS.parameter_high)
+    assert ((td[keys.PARAMETERS] >= low) & (td[keys.PARAMETERS] <= high)).all()
+
+
+def test_more_elites_than_samples_are_refused():
+    with pytest.raises(ValueError, match="num_elites=20, but must be at most num_samples=16"):
+        make(num_elites=20)
+
+
+def test_it_learns_a_two_step_problem_within_some_hundred_steps():
+    """Action 1 opens a door if its parameters meet the state; through the open door, action 0 earns 1 and ends."""
+    torch.manual_seed(0)
+    learner = make(warmup_frames=100, updates_per_frame=1.5, lr=5e-3, num_samples=32, num_elites=6, num_iterations=4)
+
+    def play(state):
+        td = learner.policy(TensorDict({keys.OBSERVATION: state}, [len(state)]))
+        unit, discrete = SPECS.to_unit(td[keys.PARAMETERS]), td[keys.DISCRETE]
+        is_open = state[:, 3] > 0
+        opens = (discrete == 1) & ((unit[:, 1] - state[:, 0]).abs() < 0.5)
+        after = state.clone()
+        after[:, 3] = torch.where(opens, 1.0, state[:, 3])
+        ends = is_open & (discrete == 0)
+        reward = torch.where(ends, 1.0, -0.05)
+        return batch_of(state, discrete, unit, reward, after, ends), after, ends
+
+    def fresh(num):
+        return torch.cat([torch.rand(num, 3) * 2 - 1, torch.full((num, 1), -1.0)], -1)
+
+    state = fresh(20)
+    for _ in range(20):
+        batch, after, ends = play(state)
+        learn(learner, batch)
+        state = torch.where(ends.unsqueeze(-1), fresh(20), after)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        _, after, _ = play(fresh(100))
+        _, _, ends = play(after)
+    assert ends.float().mean() > 0.8, "random agents end within two steps in 2 of 100"

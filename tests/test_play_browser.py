@@ -1,0 +1,370 @@
+"""The page in a real browser, by its own key, touch and focus events; skipped where there is no Chromium
+(Debian: `apt-get install chromium`) or no Playwright (`hpamdp[browser]`)."""
+
+import json
+import os
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import compose_config
+from play_players import docked
+
+from hpamdp.env.boatdock import physics
+from hpamdp.env.boatdock.play import episodes
+from hpamdp.env.boatdock.play.boat_page import BoatPage
+from hpamdp.run.page_server import EpisodeFile, PageServer
+from hpamdp.run.play import export
+from hpamdp.run.train import run
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
+sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
+
+KEYS = "jkl"
+DOWN_THE_MIDDLE = {"start": [0, 60], "goal": [0, -60]}  # key 2 of the congruent boat (K) goes there
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield launched
+        launched.close()
+
+
+@pytest.fixture(scope="module")
+def page_data():
+    return BoatPage(seed=0).data([], has_server=True)
+
+
+@contextmanager
+def serving(path, data):
+    page = BoatPage(seed=0)
+    server = PageServer(("127.0.0.1", 0), page, data, EpisodeFile(path, page))
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield server.address
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class Player:
+    """Somebody at the page."""
+
+    def __init__(self, context, address, *, consents=True, mode="free"):
+        self.page = context.new_page()
+        self.errors = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(address)
+        if consents:
+            self.page.check("#consent")
+        self.page.click(f"[data-mode={mode}]")
+
+    def get(self, expression):
+        return self.page.evaluate(f"hpamdpGame.{expression}")
+
+    def until(self, expression, seconds=8.0):
+        """Wait; the page's policy forbids what Playwright waits with."""
+        deadline = time.monotonic() + seconds
+        while not self.get(expression):
+            assert time.monotonic() < deadline, (expression, self.get("screen"), self.page.inner_text("#notice"))
+            time.sleep(0.02)
+
+    def board(self, boat="congruent", layout=None):
+        """Choose a boat, and put the episode on another layout before."""
+        self.until("screen === 'choose'")
+        if layout is not None:
+            self.page.evaluate("(layout) => Object.assign(hpamdpGame.layout, layout)", layout)
+        self.page.click(f"[data-boat={boat}]")
+
+    def hold(self, key, seconds):
+        """Hold a key and return for how long, by this process's clock."""
+        begun = time.perf_counter()
+        self.page.keyboard.down(key)
+        middle = time.perf_counter()
+        time.sleep(max(0.0, seconds - (middle - begun) / 2))
+        before = time.perf_counter()
+        self.page.keyboard.up(key)
+        return (before + time.perf_counter()) / 2 - (begun + middle) / 2
+
+    def ends(self):
+        self.until("screen === 'result'")
+        return self.get("results.free.at(-1)") if self.get("mode") == "free" else self.get("results.round.at(-1)")
+
+
+@pytest.fixture
+def player(browser, page_data, tmp_path):
+    with serving(tmp_path / "played.jsonl", page_data) as address:
+        context = browser.new_context(viewport={"width": 1100, "height": 900})
+        one = Player(context, address)
+        one.file = tmp_path / "played.jsonl"
+        yield one
+        assert one.errors == []
+        context.close()
+
+
+def stored(player, num):
+    deadline = time.monotonic() + 5.0
+    while time.monotonic() < deadline:
+        lines = player.file.read_text().splitlines() if player.file.exists() else []
+        if len(lines) >= num:
+            return [json.loads(line) for line in lines]
+        time.sleep(0.02)
+    raise AssertionError(f"{len(lines)} episodes instead of {num}: {player.page.inner_text('#notice')}")
+
+
+def test_the_boat_moves_while_a_key_is_down_glides_when_it_is_released_and_docks(player):
+    player.board(layout=DOWN_THE_MIDDLE)
+    player.page.keyboard.down("k")
+    places = []
+    begun = time.perf_counter()
+    while time.perf_counter() - begun < 0.8:
+        places.append(player.get("state && hpamdpGame.state.y"))
+        time.sleep(0.02)
+    moving = [y for y in places if y is not None]
+    assert len(set(moving)) > 5 and moving == sorted(moving, reverse=True) and moving[-1] < moving[0] - 5.0
+    assert player.get("state.isPressed")
+    time.sleep(max(0.0, 1.23 - (time.perf_counter() - begun)))
+    player.page.keyboard.up("k")
+    released = player.get("state.y")
+    result = player.ends()
+    assert result["outcome"] == "success" and result["score"] > 3.5
+    assert player.get("state.y") < released - 10.0  # it glided
+    (episode,) = stored(player, 1)
+    assert episodes.check(episode).outcome == "success"
+
+
+def test_the_wall_the_speed_limit_and_the_empty_tank_end_an_episode(player):
+    for layout, outcome in ((DOWN_THE_MIDDLE, "too_fast"), ({"start": [60, 60], "goal": [0, -60]}, "out_of_bounds")):
+        player.board(layout=layout)
+        player.hold("k", 1.75)
+        assert player.ends()["outcome"] == outcome
+        player.page.keyboard.press("Enter")
+    player.board(layout={"start": [0, 40], "goal": [80, 40]})
+    # Round and round: three keys of equal length come back to where they began.
+    for turn in range(21):
+        player.hold(KEYS[(0, 1, 2)[turn % 3]], 0.32)
+        time.sleep(0.02)
+        if player.get("screen") == "result":
+            break
+    assert player.ends()["outcome"] == "out_of_fuel" and player.get("state.fuel") == 0
+    assert [episodes.check(each).outcome for each in stored(player, 3)] == ["too_fast", "out_of_bounds", "out_of_fuel"]
+
+
+def test_durations_are_those_of_the_keys_within_five_milliseconds_however_late_the_page_hears_of_them(player):
+    keyboard = player.page.context.new_cdp_session(player.page)
+    wanted = [0.05, 0.12, 0.2, 0.3, 0.08, 0.25] * 4
+    player.board(layout=DOWN_THE_MIDDLE)
+    for turn, seconds in enumerate(wanted):
+        event = {"code": f"Digit{turn % 3 + 1}", "key": str(turn % 3 + 1), "windowsVirtualKeyCode": 49 + turn % 3}
+        begun = time.time()
+        # The browser gives the page these times, at which the system saw the keys, with events that come later.
+        keyboard.send("Input.dispatchKeyEvent", {"type": "keyDown", "timestamp": begun, **event})
+        time.sleep(max(0.0, begun + seconds + 0.02 - time.time()))
+        keyboard.send("Input.dispatchKeyEvent", {"type": "keyUp", "timestamp": begun + seconds, **event})
+        time.sleep(0.03)
+    found = [press["duration"] for press in player.page.evaluate("hpamdpGame.state.presses")]
+    num = len(found) - 1  # the last one may have run the tank dry
+    errors = [abs(one - other) for one, other in zip(found[:num], wanted[:num], strict=True)]
+    assert num > 15 and statistics.median(errors) < 0.005, sorted(errors)
+
+
+def test_a_new_press_ends_the_one_before_and_a_lost_focus_ends_it_too(player):
+    player.board(layout=DOWN_THE_MIDDLE)
+    player.page.keyboard.down("j")
+    time.sleep(0.2)
+    player.page.keyboard.down("l")  # while the other is down
+    time.sleep(0.2)
+    player.page.keyboard.up("j")
+    time.sleep(0.1)
+    player.page.evaluate("window.dispatchEvent(new Event('blur'))")
+    time.sleep(0.3)
+    player.page.keyboard.up("l")
+    time.sleep(0.4)
+    first, second = player.page.evaluate("hpamdpGame.state.presses")
+    assert (first["key"], second["key"]) == (0, 2)
+    assert second["start"] == pytest.approx(first["start"] + first["duration"], abs=1e-6)
+    assert second["duration"] == pytest.approx(0.3, abs=0.06)
+    assert player.get("events.map((event) => event.type)") == ["down", "down", "up", "blur", "up"]
+
+
+def test_auto_repeat_is_no_press(player):
+    player.board(layout=DOWN_THE_MIDDLE)
+    for _ in range(5):
+        player.page.keyboard.down("k")  # from the second on the browser calls it a repeat
+        time.sleep(0.05)
+    player.page.keyboard.up("k")
+    assert player.get("events.length") == 2
+
+
+def test_nothing_is_stored_without_consent(browser, page_data, tmp_path):
+    with serving(tmp_path / "played.jsonl", page_data) as address:
+        context = browser.new_context()
+        player = Player(context, address, consents=False)
+        player.board(layout=DOWN_THE_MIDDLE)
+        player.hold("k", 1.8)
+        player.ends()
+        time.sleep(0.3)
+        assert player.get("stored.length") == 0 and not (tmp_path / "played.jsonl").exists()
+        context.close()
+
+
+def test_fingers_steer_on_a_narrow_screen_on_which_everything_fits(browser, page_data, tmp_path):
+    with serving(tmp_path / "played.jsonl", page_data) as address:
+        context = browser.new_context(viewport={"width": 390, "height": 740}, has_touch=True, is_mobile=True)
+        player = Player(context, address)
+        player.board(layout=DOWN_THE_MIDDLE)
+        assert player.page.evaluate("document.documentElement.scrollWidth") <= 390
+        box = player.page.locator(".key[data-key='1']").bounding_box()
+        assert box["y"] + box["height"] <= 740 and box["width"] > 90
+        touch = context.new_cdp_session(player.page)
+        point = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+        touch.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": [point]})
+        time.sleep(1.22)
+        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+        assert player.ends()["outcome"] == "success"
+        assert player.get("stored[0].events.map((event) => event.code)") == ["pointer", "pointer"]
+        context.close()
+
+
+def test_episodes_wait_for_a_server_that_is_gone_and_two_pages_lose_none(browser, page_data, tmp_path):
+    path = tmp_path / "played.jsonl"
+    with serving(path, page_data) as address:
+        context = browser.new_context()
+        players = [Player(context, address) for _ in range(2)]
+        context.set_offline(True)
+        for player in players:
+            player.page.bring_to_front()
+            player.board(layout=DOWN_THE_MIDDLE)
+            player.hold("k", 1.8)
+            player.ends()
+        time.sleep(0.2)
+        assert [player.get("unsent.length") for player in players] == [1, 1] and not path.exists()
+        context.set_offline(False)
+        for player in players:
+            player.until("sent === 1")
+        assert len({json.loads(line)["player"] for line in path.read_text().splitlines()}) == 2
+        context.close()
+
+
+def test_the_exported_page_plays_from_files_and_gives_its_episodes_as_a_file(browser, tmp_path):
+    page = BoatPage(seed=0)
+    export(page, page.data([], has_server=False), tmp_path / "site")
+    context = browser.new_context(accept_downloads=True)
+    player = Player(context, (tmp_path / "site" / "index.html").as_uri())
+    player.board(layout=DOWN_THE_MIDDLE)
+    player.hold("k", 1.8)
+    player.ends()
+    player.page.click("#finish")
+    with player.page.expect_download() as download:
+        player.page.click("#download")
+    download.value.save_as(tmp_path / "mine.jsonl")
+    (episode,) = episodes.read(tmp_path / "mine.jsonl")
+    assert episodes.check(episode.model_dump(mode="json")).outcome == "too_fast" and player.errors == []
+    context.close()
+
+
+def play_plan(player, boat):
+    """Play the best plan of a boat from rest to rest, as well as a process can that sleeps between."""
+    player.until("screen === 'choose'")
+    plan = player.get(f"layout.best.{boat}.presses")
+    player.board(boat)
+    for press in plan:
+        player.hold(KEYS[press["key"]], press["duration"] + 0.006)
+        time.sleep((1.0 + physics.GLIDE) * press["duration"] * 0.49 + 0.15)
+    for _ in range(6):  # if it fell short
+        time.sleep(0.25)
+        if player.get("screen") != "sail":
+            break
+        player.hold("k", 1.6)
+    return player.ends()
+
+
+def test_what_was_played_by_keys_trains_learners_beside_an_agents_track(player, tmp_path):
+    for turn in range(4):
+        boat = ("congruent", "incongruent")[turn % 2]
+        result = play_plan(player, boat)
+        assert result["controller"] == boat
+        player.page.keyboard.press("Enter")
+    assert len(stored(player, 4)) == 4
+    data = ["data=recorded", f"data.path={player.file}", "mode=offline", "offline.updates=5", "eval.layouts=8"]
+    for low in ("bc", "td3_bc"):
+        words = [f"low={low}", "high=linucb", *data, f"env.recording={player.file}"]
+        assert run(compose_config(words), tmp_path / low, words) == 0
+        summary = json.loads((tmp_path / low / "summary.json").read_text())
+        assert "you" in summary["references"] and "human" not in summary["references"]
+
+
+def test_a_block_ends_with_the_curve(player):
+    player.page.evaluate("hpamdpGame.screen")
+    player.page.click("#finish")
+    assert player.get("screen") == "start"  # nothing was played yet
+    player.page.click("[data-mode=round]")
+    for turn in range(3):
+        player.board(layout=DOWN_THE_MIDDLE)
+        player.hold("k", 1.6)
+        player.ends()
+        if turn < 2:
+            player.page.keyboard.press("Space")
+    player.page.click("#finish")
+    assert player.get("screen") == "end" and "3 episodes" in player.page.inner_text("#end-text")
+    rows = player.page.locator("#end-table tr").count()
+    assert rows == 5  # head, you, people, best person, ceiling
+    player.page.click("#go-on")
+    assert player.page.inner_text("#status").endswith("episode 4 of 60")
+
+
+def test_the_command_serves_the_page_and_ends_on_ctrl_c(browser, tmp_path):
+    words = ["play", "--no-browser", "--port", "0", "--agent", "none", "--to", str(tmp_path / "a.jsonl")]
+    root = Path(__file__).resolve().parent.parent
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hpamdp.cli", *words], cwd=tmp_path, text=True, stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(root)},
+    )  # fmt: skip
+    try:
+        address = process.stdout.readline().split()[0].rstrip(":")
+        context = browser.new_context()
+        player = Player(context, address)
+        player.board(layout=DOWN_THE_MIDDLE)
+        player.hold("k", 1.8)
+        player.ends()
+        player.until("sent === 1")
+        context.close()
+    finally:
+        process.send_signal(signal.SIGINT)
+        code = process.wait(20)
+    assert code == 0 and "1 episodes added" in process.stdout.read()
+    assert len(episodes.read(tmp_path / "a.jsonl")) == 1
+
+
+def test_the_page_of_the_browser_and_python_know_the_same_episode(browser, page_data, tmp_path):
+    (made,) = docked(1)
+    with serving(tmp_path / "a.jsonl", page_data) as address:
+        context = browser.new_context()
+        page = context.new_page()
+        page.goto(address)
+        found = page.evaluate(
+            """(episode) => {
+                const physics = makePhysics(window.HPAMDP_DATA.rules);
+                const name = episode.controller === "congruent" ? "congruent" : `incongruent_${episode.keymap}`;
+                const directions = window.HPAMDP_DATA.directions[name];
+                return physics.sail(episode, directions, physics.settle(episode.events), Infinity);
+            }""",
+            made,
+        )
+        context.close()
+    assert found["outcome"] == made["outcome"] == "success"
+    assert found["fuel"] / physics.TANK == pytest.approx(made["fuel"], abs=1e-12)
+    torch.testing.assert_close(torch.tensor([found["x"], found["y"]]), torch.tensor(made["end"]), atol=1e-6, rtol=0.0)
