@@ -1,0 +1,253 @@
+"""Tabulate the learners on the field's domains beside the published scores, and draw their curves.
+
+python experiments/domains/study.py FOLDER...    adds the finished runs in these folders to results.csv and curves.csv,
+                                                 in the place of earlier ones of the same learner, domain, steps and
+                                                 seed; then draws and tabulates
+python experiments/domains/study.py              draws and tabulates the stored csv files
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from hpamdp.analysis.study import (
+    MIN_SEEDS,
+    Rows,
+    Run,
+    curve,
+    difference,
+    finished,
+    groups,
+    interquartile_mean,
+    read_csv,
+    spread,
+    write_tables,
+)
+
+HERE = Path(__file__).resolve().parent
+# The domains, with the published number of steps and what is scored: the mean return or the share of successes. No
+# scores were published on Moving and Sliding; a hand-written player scores 1.867 and 1.856.
+DOMAINS = {
+    "platform": (200_000, "score"),
+    "goal": (300_000, "success"),
+    "hard_goal": (300_000, "success"),
+    "catch_point": (1_000_000, "success"),
+    "hard_move_4": (1_000_000, "success"),
+    "hard_move_6": (1_000_000, "success"),
+    "hard_move_8": (1_000_000, "success"),
+    "hard_move_10": (1_000_000, "success"),
+    "moving": (1_000_000, "score"),
+    "sliding": (1_000_000, "score"),
+}
+BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
+CPU_LIMIT = 600.0  # seconds, of the second table
+COLOURS = {
+    "hppo": "#0072B2",
+    "hsac": "#D55E00",
+    "pdqn": "#009E73",
+    "hyar": "#CC79A7",
+    "qpamdp": "#E69F00",
+    "dlpa": "#56B4E9",
+    "paddpg": "#6b6b00",
+    "patd3": "#332288",
+    "mpdqn_published": "#882255",
+    "pdqn_published": "#117733",
+}
+KEY = ("domain", "learner", "frames", "seed")
+
+
+def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
+    """Return a row for each run and a row for each of its evaluations."""
+    results: Rows = []
+    curves: Rows = []
+    for run in runs:
+        summary = run.summary
+        name = {"domain": domain(run), "learner": learner(run), "frames": summary["frames"], "seed": summary["seed"]}
+        results.append(
+            name
+            | {"score": round(summary["score"], 4), "success": round(summary["success"], 4)}
+            | {"cpu_s": round(summary["cpu_s"], 1), "wall_s": round(summary["wall_s"], 1)}
+        )
+        for row in run.evaluations():
+            at = {"at_frames": row["frames"], "at_wall_s": round(row["wall_s"], 1)}
+            curves.append(name | at | {what: round(row[f"eval/{what}"], 4) for what in ("score", "success")})
+    return results, curves
+
+
+def domain(run: Run) -> str:
+    """Return the domain's name; Hard Move's has its number of actuators."""
+    name = str(run.summary["env"])
+    return f"{name}_{run.config.env.n}" if name == "hard_move" else name
+
+
+def learner(run: Run) -> str:
+    """Return the learner's name; the forms of P-DQN and PADDPG that have names of their own go by those."""
+    name = str(run.summary["low"])
+    low = run.config.low
+    if name == "paddpg" and low.twin:
+        return "patd3"
+    if name == "pdqn_published" and low.multipass:
+        return "mpdqn_published"
+    return name
+
+
+def merged(stored: Rows, new: Rows) -> Rows:
+    """Return the stored rows without those of runs that were made anew, and the new rows, by domain and learner."""
+    made_anew = {tuple(str(row[name]) for name in KEY) for row in new}
+    kept = [row for row in stored if tuple(_text(row[name]) for name in KEY) not in made_anew]
+    rows = kept + new
+    order = {name: number for number, name in enumerate(DOMAINS)}
+    return sorted(
+        rows, key=lambda row: (order[row["domain"]], row["learner"], float(row["frames"]), float(row["seed"]))
+    )
+
+
+def _text(value: Any) -> str:
+    return f"{value:.0f}" if isinstance(value, float) else str(value)
+
+
+def at_published_steps(results: Rows) -> Rows:
+    """Return the runs that took no more than the published number of steps."""
+    return [row for row in results if row["frames"] <= DOMAINS[row["domain"]][0] * (1.0 + BATCH_TOLERANCE)]
+
+
+def within_cpu_limit(results: Rows) -> Rows:
+    """Return, of each learner on each domain, the runs with most steps whose mean CPU time is within the limit."""
+    chosen: Rows = []
+    for cell in groups(results, "domain", "learner").values():
+        affordable = [
+            rows for rows in groups(cell, "frames").values() if np.mean([row["cpu_s"] for row in rows]) <= CPU_LIMIT
+        ]
+        chosen += max(affordable, key=lambda rows: rows[0]["frames"], default=[])
+    return chosen
+
+
+def table(results: Rows, published: Rows) -> str:
+    """Return a line for each learner, a column for each domain: its scores over seeds; then the published scores."""
+    learners = [name for name in COLOURS if any(row["learner"] == name for row in results)]
+    lines = [
+        "| | " + " | ".join(DOMAINS) + " |",
+        "|---|" + "---|" * len(DOMAINS),
+    ]
+    cells = groups(results, "domain", "learner")
+    for name in learners:
+        values = [_cell(_values(cells.get((column, name), []))) for column in DOMAINS]
+        lines.append(f"| **{name}** | " + " | ".join(values) + " |")
+    for method, rows in groups(published, "method", "source").items():
+        scores = {row["domain"]: f"{row['score']:g}" for row in rows}
+        lines.append(f"| {method[0]} ({method[1]}) | " + " | ".join(scores.get(name, "") for name in DOMAINS) + " |")
+    return "\n".join(lines)
+
+
+def _values(rows: Rows) -> list[float]:
+    return [row[DOMAINS[row["domain"]][1]] for row in rows]
+
+
+def _cell(values: list[float]) -> str:
+    """Return the interquartile mean and its interval from `MIN_SEEDS` seeds on, else mean ± deviation; the seeds."""
+    if not values:
+        return ""
+    if len(values) < MIN_SEEDS:
+        return f"{spread(values)} ({len(values)})"
+    middle, low, high = interquartile_mean(values)
+    return f"{middle:.3f} [{low:.3f}, {high:.3f}] ({len(values)})"
+
+
+def best_table(results: Rows, published: Rows) -> str:
+    """Return a line for each domain: our best learner, how sure it is above our next best, the best published score."""
+    lines = [
+        "| domain | best | score | next best | probability of improvement | best published | CPU of a run |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, (_, what) in DOMAINS.items():
+        cells = groups([row for row in results if row["domain"] == name], "learner")
+        ranked = sorted(cells.items(), key=lambda cell: -np.mean(_values(cell[1])))
+        if not ranked:
+            continue
+        (best,), rows = ranked[0]
+        second, improvement = "", ""
+        if len(ranked) > 1:
+            second = ranked[1][0][0]
+            improvement = f"{difference(_values(rows), _values(ranked[1][1])).improvement:.2f}"
+        others = [row for row in published if row["domain"] == name]
+        top = max(others, key=lambda row: row["score"], default=None)
+        beside = f"{top['score']:g} ({top['method']})" if top else ""
+        unit = "return" if what == "score" else "success"
+        cpu = f"{np.mean([row['cpu_s'] for row in rows]):.0f} s"
+        lines.append(
+            f"| {name} | {best} | {_cell(_values(rows))} {unit} | {second} | {improvement} | {beside} | {cpu} |"
+        )
+    return "\n".join(lines)
+
+
+def cost_table(results: Rows) -> str:
+    """Return a line for each learner and domain: steps, CPU and wall time of a run."""
+    lines = ["| domain | learner | seeds | steps | CPU | wall |", "|---|---|---|---|---|---|"]
+    for (name, low, frames), rows in groups(results, "domain", "learner", "frames").items():
+        cpu_s, wall_s = (np.mean([row[column] for row in rows]) for column in ("cpu_s", "wall_s"))
+        lines.append(f"| {name} | {low} | {len(rows)} | {frames:,.0f} | {cpu_s:.0f} s | {wall_s:.0f} s |")
+    return "\n".join(lines)
+
+
+def draw(curves: Rows, published: Rows, path: Path) -> None:
+    """Draw a panel for each domain: the mean over seeds and one standard deviation, and the best published score."""
+    shown = [name for name in DOMAINS if any(row["domain"] == name for row in curves)]
+    columns = min(len(shown), 3)
+    num_rows = -(-len(shown) // columns)
+    figure = Figure(figsize=(4.6 * columns, 3.4 * num_rows), layout="constrained")
+    panels: Iterable[Axes] = figure.subplots(num_rows, columns, squeeze=False).flat
+    for axes, name in zip(panels, shown, strict=False):
+        _draw_domain(axes, name, at_published_steps([row for row in curves if row["domain"] == name]), published)
+    for axes in list(figure.axes)[len(shown) :]:
+        axes.set_axis_off()
+    figure.savefig(path, dpi=130)
+
+
+def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
+    what = DOMAINS[name][1]
+    for (low,), rows in groups(curves, "learner").items():
+        longest = max(row["frames"] for row in rows)
+        at, mean, deviation = curve([row for row in rows if row["frames"] == longest], "at_frames", what)
+        axes.plot(at, mean, color=COLOURS[low], linewidth=1.6, label=low)
+        axes.fill_between(at, mean - deviation, mean + deviation, color=COLOURS[low], alpha=0.18, lw=0)
+    scores = [row["score"] for row in published if row["domain"] == name]
+    if scores:
+        axes.axhline(max(scores), color="#2b2b2b", linestyle="--", linewidth=1.0, label="best published")
+    axes.set_title(name, loc="left", fontweight="bold", fontsize=10)
+    axes.set_xlabel("steps")
+    axes.set_ylabel("mean return, greedy" if what == "score" else "share of successes, greedy")
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=7, frameon=False)
+
+
+def main(folders: Sequence[str]) -> None:
+    """Gather, draw, tabulate."""
+    if folders:
+        results, curves = gather(finished(folders))
+        tables = {"results": results, "curves": curves}
+        stored = {name: read_csv(HERE / f"{name}.csv") if (HERE / f"{name}.csv").exists() else [] for name in tables}
+        write_tables(HERE, {name: merged(stored[name], rows) for name, rows in tables.items()})
+    results = read_csv(HERE / "results.csv")
+    curves = read_csv(HERE / "curves.csv")
+    published = read_csv(HERE / "published.csv")
+    draw(curves, published, HERE / "curves.png")
+    print(
+        best_table(at_published_steps(results), published),
+        table(at_published_steps(results), published),
+        table(within_cpu_limit(results), published),
+        cost_table(results),
+        sep="\n\n",
+    )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
