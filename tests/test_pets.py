@@ -270,7 +270,7 @@ def test_the_plan_of_a_turned_state_is_the_turned_plan(number):
 
     def plan(seen, order):
         # Random numbers belong to places in the list of sequences: list the turned sequences in the same order.
-        search.sequences = lambda num, device: [order[part] for part in plain(num, device)]
+        search.sequences = lambda num, device, allowed: [order[part] for part in plain(num, device)]
         torch.manual_seed(1)
         return learner.policy.plan(seen[:, entries])
 
@@ -338,7 +338,7 @@ def test_exploring_plans_with_the_environments_own_member_and_greedy_ones_with_a
     torch.testing.assert_close(together, two_steps * torch.full((6,), 3.0), atol=1e-3, rtol=0.0)
     asked = []
     plan = learner.policy.plan
-    learner.policy.plan = lambda state, member=None: asked.append(member) or plan(state, member)
+    learner.policy.plan = lambda state, member=None, allowed=None: asked.append(member) or plan(state, member)
     td = TensorDict({keys.OBSERVATION: state, MEMBER: member, keys.IS_DECISION: torch.zeros(6, 1).bool()}, [6])
     acting(learner, td.clone())
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -360,7 +360,7 @@ def test_nothing_is_planned_before_the_first_update_or_for_finished_episodes(mon
     asked = []
     plan = learner.policy.plan
     monkeypatch.setattr(
-        learner.policy, "plan", lambda state, member=None: asked.append(len(state)) or plan(state, member)
+        learner.policy, "plan", lambda state, member=None, allowed=None: asked.append(len(state)) or plan(state, member)
     )
     td = TensorDict({keys.OBSERVATION: torch.randn(8, 4), keys.DONE: (torch.arange(8) < 3).unsqueeze(-1)}, [8])
     learner.policy(td.clone())
