@@ -17,7 +17,7 @@ MISTAKES = [
     (["high=foo"], "high=foo: no such choice; conf/high has actor, "),
     (["high=3"], "high=3: no such choice; conf/high has actor, "),
     (["low=null"], "low=null: no such choice; conf/low has "),
-    (["experiment=foo"], "experiment=foo: no such choice; conf/experiment has hierarchy, "),
+    (["experiment=foo"], "experiment=foo: no such choice; conf/experiment has few_steps, hierarchy, "),
     (["hihg=ucb"], "hihg: no such group or value of the run (conf/config.yaml); did you mean high? It has "),
     (["~low"], "low: nothing chosen; set low=NAME"),
     # A key that isn't there.

@@ -284,7 +284,9 @@ def test_a_greedy_action_is_determined_by_the_seed_and_lies_in_bounds(trained):
 def test_nothing_is_planned_for_finished_episodes_or_before_the_first_update(trained, monkeypatch):
     planned = []
     plan = trained.policy.planner.plan
-    monkeypatch.setattr(trained.policy.planner, "plan", lambda state: planned.append(len(state)) or plan(state))
+    monkeypatch.setattr(
+        trained.policy.planner, "plan", lambda state, *mask: planned.append(len(state)) or plan(state, *mask)
+    )
     done = (torch.arange(50) < 20).unsqueeze(-1)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         trained.policy(TensorDict({keys.OBSERVATION: torch.randn(50, 4), keys.DONE: done}, [50]))

@@ -75,11 +75,14 @@ def assert_it_updated(given: list[str], folder: Path) -> None:
     assert any(before[name].shape != value.shape or not before[name].equal(value) for name, value in after.items())
 
 
+# `high=value` is refused with these, which have no value to compare.
+WITHOUT_VALUE = ("bc", "dlpa", "planner", "random")
 # Quick: each selector over two learners, each learner under two selectors.
 QUICK = {*itertools.product(choices("high"), ("random", "hppo")), *itertools.product(("none", "uniform"), TRAINED)}
 PAIRS = [
     pytest.param(*pair, marks=[] if pair in QUICK else [pytest.mark.slow])
     for pair in itertools.product(choices("high"), TRAINED)
+    if pair[0] != "value" or pair[1] not in WITHOUT_VALUE
 ]
 
 
@@ -120,7 +123,11 @@ def test_learners_work_for_each_option_and_shared(sharing, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("high", "low"), [*((high, "random") for high in choices("high")), *(("uniform", low) for low in TRAINED)]
+    ("high", "low"),
+    [
+        *((high, "hppo" if high == "value" else "random") for high in choices("high")),
+        *(("uniform", low) for low in TRAINED),
+    ],
 )
 def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(high, low, tmp_path):
     parts = make(high, low, tmp_path)

@@ -96,7 +96,7 @@ def test_the_actor_loss_equals_one_computed_by_hand_and_leaves_the_critics_alone
     expected = -soft_value_by_hand(learner, learner.critics, state)
     before = {name: value.clone() for name, value in learner.state_dict().items()}
     torch.manual_seed(4)
-    loss = learner._update_actor(state)["actor"]
+    loss = learner._update_actor(state, None)["actor"]
     assert loss.item() == pytest.approx(expected, rel=1e-4, abs=1e-5)
     moved = {name for name, value in learner.state_dict().items() if not torch.equal(value, before[name])}
     assert moved and all(name.startswith(("actor.", "policy.actor.")) for name in moved)

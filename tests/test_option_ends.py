@@ -152,7 +152,7 @@ def test_a_deliberation_cost_makes_options_last():
     agent = train(make_critic(deliberation_cost=0.02, termination_lr=1e-2), 25)
     assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
     place = torch.eye(SPECS.observation_dim)[[4, 20]]
-    beta = agent.selector._beta(place, torch.tensor([0, 1]))
+    beta = agent.selector._beta(place, torch.tensor([0, 1]), None)
     assert beta.max() < 0.2
 
 
@@ -177,7 +177,7 @@ def test_the_targets_of_the_option_critic_equal_those_by_hand(decides):
     critic.decides_ends = decides
     rows = step_rows(critic)
     q = critic.target_critic(rows["next_state"])[0]
-    beta = critic._beta(rows["next_state"], rows["option"])[0] if decides else 1.0
+    beta = critic._beta(rows["next_state"], rows["option"], None)[0] if decides else 1.0
     expected = 1.0 + GAMMA * ((1.0 - beta) * q[0] + beta * q.max())
     assert critic._target(rows).tolist() == pytest.approx([expected.item(), 2.0, 3.0])
 

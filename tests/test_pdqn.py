@@ -69,7 +69,7 @@ def test_the_value_of_a_given_action_is_that_of_the_full_pass(multipass):
 def test_the_actor_update_leaves_the_critics_alone():
     learner = make()
     before = {name: value.clone() for name, value in learner.state_dict().items()}
-    learner._update_actor(torch.randn(32, 4))
+    learner._update_actor(torch.randn(32, 4), None)
     moved = {name for name, value in learner.state_dict().items() if not torch.equal(value, before[name])}
     assert moved and all(name.startswith(("actor.", "policy.actor.")) for name in moved)
     assert all(p.grad is None and p.requires_grad for p in learner.critics.parameters())
@@ -243,7 +243,7 @@ def test_parameters_start_at_the_problems_initial_ones_and_can_move(bounding):
     expected = torch.stack([0.1 + 0.5 * state[:, 0], torch.full((50,), 0.8), torch.full((50,), -0.6)], -1)
     before = learner.actor(state)
     torch.testing.assert_close(before, expected, atol=0.02, rtol=0.0)
-    learner._update_actor(state)
+    learner._update_actor(state, None)
     assert (learner.actor(state) != before).any()
 
 

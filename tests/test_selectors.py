@@ -241,7 +241,8 @@ def test_the_random_agent_has_no_selector_where_there_are_no_options():
     "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
 )
 def test_exploring_choices_are_uniform_for_uniform_option_frames_and_greedy_ones_never(high, tmp_path):
-    words = [f"high={high}", "low=random", "num_envs=400", "eval.layouts=4", "agent.uniform_option_frames=800"]
+    low = "hppo" if high == "value" else "random"
+    words = [f"high={high}", f"low={low}", "num_envs=400", "eval.layouts=4", "agent.uniform_option_frames=800"]
     words += ["high.warmup_decisions=0"] if high == "meta_critic" else []
     parts = assemble(make_config(words), tmp_path)
     torch.manual_seed(0)

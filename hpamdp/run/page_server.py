@@ -17,6 +17,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from filelock import FileLock
+from pydantic_core import from_json
 
 from hpamdp.env.page import EpisodeError, Page
 from hpamdp.messages import one_line
@@ -105,8 +106,8 @@ class EpisodeFile:
             raise EpisodeError(f"{self.path}: {error.strerror or error}") from error
         for number, line in enumerate(lines, 1):
             try:
-                known.add(self.page.identity(json.loads(line)))
-            except (ValueError, TypeError, KeyError, RecursionError) as error:
+                known.add(self.page.identity(from_json(line)))
+            except (ValueError, TypeError, KeyError) as error:
                 if number < len(lines) and line.strip():
                     raise EpisodeError(f"{self.path}, line {number}: no episode; take another file") from error
         return known
@@ -179,11 +180,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.BAD_REQUEST, "the body is shorter than its Content-Length")
             return
         try:
-            episode = self.server.page.check(json.loads(body))
+            episode = self.server.page.check(from_json(body))
         except EpisodeError as error:
             self._answer(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
             return
-        except (ValueError, RecursionError):  # of json
+        except ValueError:  # of from_json
             self._answer(HTTPStatus.BAD_REQUEST, "the body is no JSON")
             return
         try:

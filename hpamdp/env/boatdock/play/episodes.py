@@ -14,6 +14,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import from_json  # refuses deep nesting by itself, where json runs into Python's recursion limit
 from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
@@ -151,8 +152,8 @@ def read(path: Path) -> list[Episode]:
         if not line.strip():
             continue
         try:
-            episodes.append(_parse(json.loads(line)))
-        except (ValueError, RecursionError) as error:
+            episodes.append(_parse(from_json(line)))
+        except ValueError as error:
             what = error if isinstance(error, EpisodeError) else "no JSON"
             raise EpisodeError(f"{path}, line {number}: {what}") from error
     return episodes
@@ -160,8 +161,8 @@ def read(path: Path) -> list[Episode]:
 
 def _is_json(text: str) -> bool:
     try:
-        json.loads(text)
-    except (ValueError, RecursionError):
+        from_json(text)
+    except ValueError:
         return False
     return True
 
@@ -174,7 +175,7 @@ def _parse(value: object) -> Episode:
         wrong = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, wrong["loc"])) or "episode"
         raise EpisodeError(f"{where[:80]}: {wrong['msg']}") from error
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError) as error:
         raise EpisodeError("episode: no JSON object") from error
 
 
