@@ -106,6 +106,17 @@ def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
     assert collection.cpu_s > 0.0
 
 
+def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
+    listed = subprocess.run(["ps", "-eo", "pid=,ppid=,ni="], capture_output=True, text=True, check=True).stdout
+    rows = [tuple(map(int, line.split())) for line in listed.splitlines() if line.split()[2] != "-"]
+    niceness, family = set(), {os.getpid()}
+    for _ in range(3):  # actors are grandchildren
+        found = [(pid, nice) for pid, parent, nice in rows if parent in family]
+        family |= {pid for pid, _ in found}
+        niceness |= {nice for _, nice in found}
+    assert niceness == {os.getpriority(os.PRIO_PROCESS, 0)}
+
+
 @pytest.mark.parametrize("low", TRAINED)
 def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
     warmup = ["low.warmup_frames=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
