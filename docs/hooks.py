@@ -1,6 +1,6 @@
 """What mkdocs needs to make the site of the repository's own files, so that nothing is written twice.
 
-- Pages outside docs/ become pages of the site: the README, the changelog, the studies.
+- Pages outside docs/ become pages of the site: the README, the changelog, the agents, the studies.
 - Relative links are turned from files into pages. Code that a page links to gets a page of its own. A link that leads
   nowhere is a warning, and so an error.
 - Directives, which are HTML comments on lines of their own, are filled in:
@@ -31,6 +31,7 @@ DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv) (.+?) -->$
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
 PICTURES = {".png", ".gif", ".svg"}
+PAGES = ("*.md", "agents/README.md", "experiments/*/README.md", "docs/**/*.md")
 
 
 class SiteError(Exception):
@@ -43,7 +44,14 @@ def page_of(path: str) -> str | None:
     Args:
         path: relative to the repository, as `experiments/table1/README.md`.
     """
-    fixed = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+    fixed = {
+        "README.md": "index.md",
+        "CHANGELOG.md": "changelog.md",
+        "CONTRIBUTING.md": "contributing.md",
+        "agents/README.md": "agents.md",
+        "agents": "agents.md",
+        "experiments": "results.md",
+    }
     if path in fixed:
         return fixed[path]
     study = re.fullmatch(r"experiments/(\w+)/README\.md", path)
@@ -51,8 +59,6 @@ def page_of(path: str) -> str | None:
         return f"studies/{study[1]}.md"
     if path.startswith(DOCS) and path.endswith(".md"):
         return path.removeprefix(DOCS)
-    if path == "experiments":
-        return "results.md"
     if path.startswith("hpamdp/") and path.endswith(".py"):
         return api_page(path)
     return None
@@ -60,7 +66,7 @@ def page_of(path: str) -> str | None:
 
 def pages() -> list[str]:
     """Return all Markdown files of the repository that are pages."""
-    files = [*ROOT.glob("*.md"), *ROOT.glob("experiments/*/README.md"), *ROOT.glob("docs/**/*.md")]
+    files = [file for pattern in PAGES for file in ROOT.glob(pattern)]
     paths = (file.relative_to(ROOT).as_posix() for file in sorted(files))
     return [path for path in paths if page_of(path) is not None]
 

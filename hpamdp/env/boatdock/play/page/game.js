@@ -27,7 +27,7 @@
   const harbour = $("#harbour");
   const game = {
     screen: "loading", mode: null, keymap: 1, number: 0, layout: null, controller: null, origin: 0, events: [],
-    state: null, results: { practice: [], round: [], free: [] }, stored: [], unsent: [], sent: 0, refused: 0,
+    state: null, results: { practice: [], round: [], free: [] }, stored: [], unsent: [], sent: 0, refused: 0, downloaded: 0,
     player: null, resolution: 0,
   };
   window.hpamdpGame = game;
@@ -117,6 +117,7 @@
     } else if (game.screen === "choose" && !event.repeat && (event.code === "KeyC" || event.code === "KeyI")) {
       sail(event.code === "KeyC" ? "congruent" : "incongruent", event.timeStamp);
     } else if (game.screen === "result" && !event.repeat && (event.code === "Enter" || event.code === "Space")) {
+      if (event.target.closest("button:not(#next)")) return; // that button does what it says
       event.preventDefault();
       next();
     }
@@ -240,6 +241,7 @@
   }
 
   let isSending = false;
+  let isWaiting = false; // and the notice says so
   async function send() {
     if (isSending) return;
     isSending = true;
@@ -255,9 +257,12 @@
         }
         game.unsent.shift();
       }
-      if (!game.refused) notice("");
+      if (isWaiting) notice("");
+      isWaiting = false;
     } catch (error) {
-      notice(`${game.unsent.length} episodes wait for the server (${error.message}); you can go on playing`);
+      const num = game.unsent.length;
+      notice(`${num} ${num === 1 ? "episode waits" : "episodes wait"} for the server (${error.message}); you can go on playing`);
+      isWaiting = true;
       setTimeout(send, 3000);
     } finally {
       isSending = false;
@@ -270,8 +275,14 @@
     link.href = URL.createObjectURL(new Blob([text], { type: "application/x-ndjson" }));
     link.download = `episodes-${game.player}.jsonl`;
     link.click();
-    URL.revokeObjectURL(link.href);
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000); // some browsers begin to read it later
+    game.downloaded = game.stored.length;
   }
+
+  // Episodes that are nowhere else go with the page.
+  window.addEventListener("beforeunload", (event) => {
+    if (data.has_server ? game.unsent.length : game.downloaded < game.stored.length) event.preventDefault();
+  });
 
   const notice = (text) => { $("#notice").textContent = text; };
 
@@ -507,7 +518,9 @@
     "ended, under a random number that is drawn anew each time the page is loaded. " +
     (data.has_server ? "They are stored in a file on the computer that serves this page." :
       "They stay in this page until you download them as a file.") + " Without this, nothing is kept.";
-  window.addEventListener("resize", () => game.layout && game.screen !== "start" && game.screen !== "end" &&
-    draw(game.screen === "result" ? game.results[game.mode].at(-1) : undefined));
+  window.addEventListener("resize", () => {
+    if (game.screen === "end") drawCurve(game.results[game.mode]);
+    else if (game.screen !== "start") draw(game.screen === "result" ? game.results[game.mode].at(-1) : undefined);
+  });
   show("start");
 })();
