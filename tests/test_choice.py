@@ -163,7 +163,7 @@ def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
     for batch in collector:
         buffer.extend(batch.reshape(-1))
         explore.step(len(batch))
-        for _ in range(40):
+        for _ in range(25):
             optimizer.zero_grad()
             loss(buffer.sample())["loss"].backward()
             optimizer.step()

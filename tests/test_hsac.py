@@ -49,7 +49,7 @@ def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Ten
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters():
     torch.manual_seed(0)
     learner = make()
-    for _ in range(40):
+    for _ in range(28):
         learner.learn(one_step_rows(learner, 200), torch.ones(200, 1, dtype=torch.bool))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)

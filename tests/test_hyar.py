@@ -52,7 +52,7 @@ def learn(learner: HyAR, num_batches: int, size: int = 200) -> dict[str, float]:
 def trained(request) -> HyAR:
     torch.manual_seed(0)
     learner = make(discrete=request.param)
-    learn(learner, 50)
+    learn(learner, 32)
     return learner
 
 

@@ -12,8 +12,8 @@ from toy_masks import NUM_DISCRETE, Forbidden
 
 from hpamdp import keys
 from hpamdp.env.base import ProblemError
-from hpamdp.env.decisions import with_decisions
-from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.env.decisions import DecisionEnv, with_decisions
+from hpamdp.policies.agent import HierarchicalAgent, OptionValues
 from hpamdp.policies.base import Selector
 from hpamdp.policies.low_level.random import Random
 from hpamdp.specs import PAMDPSpecs
@@ -62,21 +62,27 @@ def make_learner(name: str, specs: PAMDPSpecs):
     return make_config([f"low={low}", "high=none", "env=platform", *words, *rate]).low.build(specs=specs, device=CPU)
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_a_forbidden_action_is_never_taken(name):
-    env = with_decisions(Forbidden(16), 1.0)
-    specs = PAMDPSpecs.from_env(env)
-    assert specs.has_action_mask and not specs.has_option_mask
-    learner = make_learner(name, specs)
-    agent = HierarchicalAgent(None, [learner], specs)
+def play_and_learn(env: DecisionEnv, agent: HierarchicalAgent, num_batches: int) -> None:
+    """Collect and learn, exploring; the selector's first choices are uniform. Then play greedily."""
     td = env.reset()
-    for _ in range(6):
+    for i in range(num_batches):
+        if agent.selector is not None:
+            agent.selector.is_uniform.fill_(i == 0)
         with torch.no_grad():
             batch = env.rollout(12, agent.policy, break_when_any_done=False, auto_reset=False, tensordict=td)
         td = env.step_mdp(batch[:, -1])
         agent.learn(batch)
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         env.rollout(8, agent.policy, break_when_any_done=False)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_forbidden_action_is_never_taken(name):
+    env = with_decisions(Forbidden(16), 1.0)
+    specs = PAMDPSpecs.from_env(env)
+    assert specs.has_action_mask and not specs.has_option_mask
+    learner = make_learner(name, specs)
+    play_and_learn(env, HierarchicalAgent(None, [learner], specs), 6)
     assert env.base_env.violations == 0
     parameters = [part for part in learner.state_dict().values() if torch.is_tensor(part) and part.is_floating_point()]
     assert not any(part.isnan().any() for part in parameters)
@@ -174,6 +180,7 @@ SELECTORS = {
     "meta_critic": ["high.warmup_decisions=32", "high.batch_size=16", "high.epsilon_decisions=50"],
     "option_critic": ["high.warmup_steps=64", "high.batch_size=16", "high.epsilon_steps=100"],
     "actor": ["high.minibatch_size=32"],
+    "value": ["high.epsilon=0.2"],
 }
 
 
@@ -185,17 +192,66 @@ def test_a_forbidden_option_is_never_chosen(high):
     torch.manual_seed(0)
     config = make_config([f"high={high}", "low=random", *SELECTORS[high]])
     selector: Selector = config.high.build(specs=specs, device=CPU)
-    agent = HierarchicalAgent(selector, [Random(specs)], specs)
-    td = env.reset()
-    for i in range(8):
-        selector.is_uniform.fill_(i == 0)
-        with torch.no_grad():
-            batch = env.rollout(9, agent.policy, break_when_any_done=False, auto_reset=False, tensordict=td)
-        td = env.step_mdp(batch[:, -1])
-        agent.learn(batch)
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        env.rollout(8, agent.policy, break_when_any_done=False)
+    learner = make_learner("pdqn", specs) if selector.asks_learners else Random(specs)
+    learners = [learner] * specs.num_options if selector.asks_learners else [learner]
+    play_and_learn(env, HierarchicalAgent(selector, learners, specs), 8)
     assert env.base_env.violations == 0
+
+
+class BestAction(Random):
+    """Its value of a state is the highest number of an allowed action."""
+
+    def value(self, observation, action_mask=None):
+        allowed = self.specs.allowed(observation, action_mask)
+        return torch.where(allowed, torch.arange(float(NUM_DISCRETE)), -torch.inf).amax(-1)
+
+
+def test_what_learners_expect_of_an_option_counts_allowed_actions_alone():
+    problem = Forbidden(3)
+    problem.option_names = ()
+    problem.group_actions({"low": [0, 1], "high": [1, 2], "ends": [0, 2]})
+    specs = PAMDPSpecs.from_env(with_decisions(problem, 1.0, 2))
+    values = OptionValues([BestAction(specs.of_option(i)) for i in range(3)], 3)
+    action_mask = torch.tensor([[True, True, True], [True, True, False], [False, False, True]])
+    expected = [[1.0, 2.0, 2.0], [1.0, 1.0, 0.0], [-torch.inf, 2.0, 2.0]]
+    assert values(torch.zeros(3, NUM_DISCRETE), action_mask).tolist() == expected
+
+
+def problem_with_single_actions() -> Forbidden:
+    """Return a problem in which forbidding an action forbids the option `last`, even while it is held."""
+    problem = Forbidden(8)
+    problem.option_names = ()
+    problem.group_actions({"low": [0, 1], "high": [1, 2], "last": [2]})
+    return problem
+
+
+@pytest.mark.parametrize("high", ["uniform", "meta_critic", "option_critic", "actor", "value"])
+def test_an_option_ends_where_none_of_its_actions_is_allowed_any_more(high):
+    problem = problem_with_single_actions()
+    env = with_decisions(problem, 1.0, 3)
+    specs = PAMDPSpecs.from_env(env)
+    assert specs.has_option_mask
+    torch.manual_seed(0)
+    words = [f"high={high}", "low=random", *SELECTORS[high]]
+    selector: Selector = make_config(words).high.build(specs=specs, device=CPU)
+    learners = [make_learner("pdqn", specs.of_option(i)) for i in range(3)]
+    play_and_learn(env, HierarchicalAgent(selector, learners, specs), 4)
+    assert problem.violations == 0
+    with torch.no_grad():
+        batch = env.rollout(30, HierarchicalAgent(selector, learners, specs).policy, break_when_any_done=False)
+    after = batch["next"]
+    is_stuck = (batch[keys.OPTION] == 2) & ~after[keys.ACTION_MASK][..., 2] & ~after[keys.DONE].squeeze(-1)
+    assert is_stuck.any()
+    assert after[keys.OPTION_ENDED].squeeze(-1)[is_stuck].all()
+
+
+def test_an_option_that_can_neither_go_on_nor_end_is_told_in_one_line():
+    env = with_decisions(problem_with_single_actions())
+    held = torch.full((8,), 2)
+    td = env.reset().update({keys.OPTION: held, keys.DISCRETE: held, keys.PARAMETERS: torch.zeros(8, 3)})
+    expected = r"^environment \d: option 2 has no allowed action left, and .*; use agent.termination=steps"
+    with pytest.raises(ProblemError, match=expected):
+        env.step(td)
 
 
 def test_a_mask_that_allows_nothing_is_told_in_one_line_that_names_the_environment():

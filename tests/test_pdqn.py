@@ -19,7 +19,7 @@ OPTIONS = dict(
     n_step=1, bounding="tanh", hidden_dims=[64, 64], warmup_frames=1000, buffer_size=20_000, batch_size=64,
     updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
     max_grad_norm=None, parameter_noise=0.1, epsilon_final=0.1, epsilon_frames=3000,
-    epsilon_episodes=None, reward_scale=1.0, initial_parameters="none",
+    epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0, lr_frames=1000,
 )  # fmt: skip
 PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
 
@@ -253,6 +253,15 @@ def test_epsilon_can_fall_with_the_episodes():
     assert learner.policy.epsilon == pytest.approx(1.0 - 0.8 * 0.5)
     learn(learner, 2, size=50)
     assert learner.policy.epsilon == pytest.approx(0.2)
+
+
+def test_the_learning_rates_fall_to_their_final_fraction():
+    learner = make(lr_final=0.1, lr_frames=1000, actor_lr=1e-3, critic_lr=3e-3)
+    rates = []
+    for frames in (0, 500, 1000, 5000):
+        learner.explore(frames)
+        rates.append([learner.optimizers[name].param_groups[0]["lr"] for name in ("actor", "critics")])
+    assert rates == [pytest.approx([f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]
 
 
 def test_rewards_are_stored_scaled():

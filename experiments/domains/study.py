@@ -31,6 +31,7 @@ from hpamdp.analysis.study import (
     spread,
     write_tables,
 )
+from hpamdp.analysis.style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
 # The domains, with the published number of steps and what is scored: the mean return or the share of successes. No
@@ -50,18 +51,6 @@ DOMAINS = {
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_COMPARED = 3  # of both learners, for a probability of improvement
 CPU_LIMIT = 600.0  # seconds, of the second table
-COLOURS = {
-    "hppo": "#0072B2",
-    "hsac": "#D55E00",
-    "pdqn": "#009E73",
-    "hyar": "#CC79A7",
-    "qpamdp": "#E69F00",
-    "dlpa": "#56B4E9",
-    "paddpg": "#6b6b00",
-    "patd3": "#332288",
-    "mpdqn_published": "#882255",
-    "pdqn_published": "#117733",
-}
 KEY = ("domain", "learner", "frames", "seed")
 
 
@@ -133,7 +122,7 @@ def within_cpu_limit(results: Rows) -> Rows:
 
 def table(results: Rows, published: Rows) -> str:
     """Return a line for each learner, a column for each domain: its scores over seeds; then the published scores."""
-    learners = [name for name in COLOURS if any(row["learner"] == name for row in results)]
+    learners = [name for name in LEARNER_COLOURS if any(row["learner"] == name for row in results)]
     lines = [
         "| | " + " | ".join(DOMAINS) + " |",
         "|---|" + "---|" * len(DOMAINS),
@@ -218,8 +207,8 @@ def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
     for (low,), rows in groups(curves, "learner").items():
         longest = max(row["frames"] for row in rows)
         at, mean, deviation = curve([row for row in rows if row["frames"] == longest], "at_frames", what)
-        axes.plot(at, mean, color=COLOURS[low], linewidth=1.6, label=low)
-        axes.fill_between(at, mean - deviation, mean + deviation, color=COLOURS[low], alpha=0.18, lw=0)
+        axes.plot(at, mean, color=LEARNER_COLOURS[low], linewidth=1.6, label=low)
+        axes.fill_between(at, mean - deviation, mean + deviation, color=LEARNER_COLOURS[low], alpha=0.18, lw=0)
     scores = [row["score"] for row in published if row["domain"] == name]
     if scores:
         axes.axhline(max(scores), color="#2b2b2b", linestyle="--", linewidth=1.0, label="best published")

@@ -18,19 +18,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.style import LEARNER_COLOURS
 from hpamdp.env.boatdock.reference import HUMAN
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
 COLOURS = {
-    "hppo": "#0072B2",
-    "hsac": "#D55E00",
-    "pdqn": "#009E73",
-    "hyar": "#CC79A7",
-    "qpamdp": "#E69F00",
-    "dlpa": "#56B4E9",
-    "pdqn as MP-DQN": "#6b6b00",
-    "pdqn as P-DQN": "#332288",
+    **LEARNER_COLOURS,
+    "pdqn as MP-DQN": LEARNER_COLOURS["mpdqn_published"],
+    "pdqn as P-DQN": LEARNER_COLOURS["pdqn_published"],
 }
 CURVE_COLUMNS = ("frames", "wall_s", "eval/score", "eval/success")
 

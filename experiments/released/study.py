@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, write_tables
+from hpamdp.analysis.style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")
-COLOURS = {"hppo": "#0072B2", "pdqn": "#009E73", "hyar": "#CC79A7", "qpamdp": "#E69F00", "dlpa": "#56B4E9"}
 SHARES = ("success", "wall", "out_of_fuel", "time_limit")
 EVALUATION_COLUMNS = ("frames", "eval/score", "eval/success")
 IDLING_RETURN = 1_979  # of 980 idle presses and then docking: claims.py
@@ -50,7 +50,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 
 def _order(row: dict[str, Any]) -> tuple[int, str]:
-    return list(COLOURS).index(row["low"]), row["boat"]
+    return list(LEARNER_COLOURS).index(row["low"]), row["boat"]
 
 
 def table(rows: Rows) -> str:
@@ -104,9 +104,9 @@ def _draw_learners(axes: Axes, rows: Rows, column: str) -> None:
         for run in groups(of_learner, "seed").values():
             x = [row["frames"] for row in run]
             y = [row[column] for row in run]
-            axes.plot(x, y, color=COLOURS[low], linewidth=0.7, alpha=0.5)
+            axes.plot(x, y, color=LEARNER_COLOURS[low], linewidth=0.7, alpha=0.5)
         x, mean, _ = curve(of_learner, "frames", column)
-        axes.plot(x, mean, color=COLOURS[low], linewidth=1.8, label=low)
+        axes.plot(x, mean, color=LEARNER_COLOURS[low], linewidth=1.8, label=low)
 
 
 def main(folders: Sequence[str]) -> None:

@@ -30,6 +30,7 @@ from hpamdp.analysis.study import (
     spread,
     write_tables,
 )
+from hpamdp.analysis.style import LEARNER_COLOURS
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised
 
@@ -41,7 +42,6 @@ BOATS = ("congruent", "incongruent")
 REWARDS = ("shaped", "sparse")
 SEEDS = (0, 1, 2)
 LEARNERS = ("hppo", "pdqn", "hyar", "qpamdp", "dlpa")
-COLOURS = {"hppo": "#0072B2", "pdqn": "#009E73", "hyar": "#CC79A7", "qpamdp": "#E69F00", "dlpa": "#56B4E9"}
 HUMAN_COLOUR, INK, FAINT = "#D98200", "#2b2b2b", "#8c8c8c"
 
 # The paper's Table 1: mean and standard deviation, congruent and incongruent.
@@ -304,9 +304,9 @@ def _draw_learners(axes: Axes, curves: Rows, boat: str, metric: str) -> None:
         late = x > 0  # the axis is logarithmic
         x, mean, deviation = x[late], mean[late], deviation[late]
         marker = "o" if len(x) < 5 else None
-        axes.plot(x, mean, color=COLOURS[low], linewidth=1.8, label=low, marker=marker, markersize=4)
+        axes.plot(x, mean, color=LEARNER_COLOURS[low], linewidth=1.8, label=low, marker=marker, markersize=4)
         upper = mean + deviation if metric == "score" else np.minimum(mean + deviation, 1.0)
-        axes.fill_between(x, mean - deviation, upper, color=COLOURS[low], alpha=0.18, linewidth=0)
+        axes.fill_between(x, mean - deviation, upper, color=LEARNER_COLOURS[low], alpha=0.18, linewidth=0)
     label, bottom, top = PANELS[metric]
     axes.set(xscale="log", xlabel="presses", ylabel=label, ylim=(bottom, top))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -337,7 +337,7 @@ def draw_efficiency(efficiency: Rows, path: Path) -> None:
         for low in LEARNERS:
             runs = groups(_of(efficiency, low, boat), "seed").values()
             for number, rows in enumerate(runs):
-                _draw_run(axes, rows, COLOURS[low], low if number == 0 else None)
+                _draw_run(axes, rows, LEARNER_COLOURS[low], low if number == 0 else None)
         x, y = human_by_block(boat)
         axes.plot(x, y, "s--", color=HUMAN_COLOUR, markersize=4, label="a person, 60 episodes a square")
         axes.set(xscale="log", xlabel="presses", xlim=(80, 1e7), ylim=(-1.1, 2.6))

@@ -9,6 +9,21 @@ from matplotlib.axes import Axes
 # Colours of Okabe and Ito and of Tol that the colour-blind tell apart, each with one meaning in all figures.
 AGENT, INK, FAINT = "#0072B2", "#2b2b2b", "#8c8c8c"
 
+# Of each learner, in the order of legends and tables.
+LEARNER_COLOURS = {
+    "hppo": "#0072B2",
+    "hsac": "#D55E00",
+    "pdqn": "#009E73",
+    "hyar": "#CC79A7",
+    "qpamdp": "#E69F00",
+    "dlpa": "#56B4E9",
+    "paddpg": "#6b6b00",
+    "patd3": "#332288",
+    "mpdqn_published": "#882255",
+    "pdqn_published": "#117733",
+    "pets": "#AA4499",
+}
+
 # Label, colour and line style of each reference.
 REFERENCES = {
     "random": ("random", "#8c8c8c", ":"),

@@ -11,7 +11,7 @@ from torchrl.data import Binary, Composite, Unbounded
 from torchrl.envs import Transform, TransformedEnv
 
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import PAMDPEnv, ProblemError
 
 
 class DecisionTracker(Transform):
@@ -26,6 +26,8 @@ class DecisionTracker(Transform):
     - `decision_observation` `[*B, observation_dim]`: the observation at which the option was chosen.
     - `option_ended`, bool, only with an `option_length`: under `next`, the option ended with this step by itself, not
       only because its episode did.
+    - `option_mask`, bool `[*B, num_options]`, only with `option_actions`: which options have an allowed action. Where
+      the held option has none, it ends.
     - `episode_return` and `episode_steps`: undiscounted sum of rewards and number of steps since the episode began.
 
     The rows where `("next", "is_decision")` is True are the transitions of the semi-MDP. All state travels in the
@@ -37,12 +39,17 @@ class DecisionTracker(Transform):
         gamma: discount of an environment step within the option.
         option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode;
             `math.inf`: the selector ends it, by setting `is_decision` in the root of the step that it chooses anew at.
+        option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
+            actions and some may be forbidden; else None.
     """
 
-    def __init__(self, gamma: float = 1.0, option_length: float | None = None) -> None:
+    def __init__(
+        self, gamma: float = 1.0, option_length: float | None = None, option_actions: Tensor | None = None
+    ) -> None:
         super().__init__()
         self.gamma = gamma
         self.option_length = option_length
+        self.option_actions = option_actions
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Declare the keys that the tracker writes."""
@@ -56,6 +63,10 @@ class DecisionTracker(Transform):
         for name in (keys.OPTION_STEPS, keys.EPISODE_STEPS):
             observation_spec[name] = Unbounded(shape=shape, dtype=torch.long, device=device)
         observation_spec[keys.DECISION_OBSERVATION] = observation_spec[keys.OBSERVATION].clone()
+        if self.option_actions is not None:
+            num_options = len(self.option_actions)
+            mask_shape = (*observation_spec.shape, num_options)
+            observation_spec[keys.OPTION_MASK] = Binary(num_options, shape=mask_shape, dtype=torch.bool, device=device)
         return observation_spec
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -65,6 +76,8 @@ class DecisionTracker(Transform):
         zeros = torch.zeros(is_decision.shape, device=observation.device)
         if self.option_length is not None:
             tensordict_reset.set(keys.OPTION_ENDED, torch.zeros_like(is_decision))
+        if self.option_actions is not None:
+            tensordict_reset.set(keys.OPTION_MASK, self._possible_options(tensordict_reset, self.option_actions))
         return tensordict_reset.update(
             {
                 keys.IS_DECISION: is_decision,
@@ -83,6 +96,7 @@ class DecisionTracker(Transform):
         option_return = tensordict.get(keys.OPTION_RETURN)
         option_steps = tensordict.get(keys.OPTION_STEPS)
         decision_observation = tensordict.get(keys.DECISION_OBSERVATION)
+        is_stuck = self._set_option_mask(tensordict, next_tensordict)
         if self.option_length is None:
             is_decision = done.clone()
             decision_observation = decision_observation.clone()
@@ -93,6 +107,8 @@ class DecisionTracker(Transform):
             option_steps = _zero_where(is_first, option_steps)
             decision_observation = torch.where(is_first, tensordict.get(keys.OBSERVATION), decision_observation)
             option_ended = option_steps + 1 >= self.option_length
+            if is_stuck is not None:
+                option_ended = option_ended | is_stuck
             is_decision = done | option_ended
             next_tensordict.set(keys.OPTION_ENDED, option_ended)
         next_tensordict.set(keys.IS_DECISION, is_decision)
@@ -102,6 +118,32 @@ class DecisionTracker(Transform):
         next_tensordict.set(keys.EPISODE_RETURN, tensordict.get(keys.EPISODE_RETURN) + reward)
         next_tensordict.set(keys.EPISODE_STEPS, tensordict.get(keys.EPISODE_STEPS) + 1)
         return next_tensordict
+
+    def _set_option_mask(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> Tensor | None:
+        """Write which options are possible next; return where the held one is not, `[*B, 1]`, if any may be forbidden.
+
+        Raises:
+            ProblemError: the held option has no allowed action left, and should last as long as its episode.
+        """
+        if self.option_actions is None:
+            return None
+        possible = self._possible_options(next_tensordict, self.option_actions)
+        next_tensordict.set(keys.OPTION_MASK, possible)
+        option = tensordict.get(keys.OPTION)
+        is_stuck = ~possible.gather(-1, option.unsqueeze(-1))
+        if self.option_length is None and is_stuck.any():
+            row = int(is_stuck.flatten().nonzero()[0])
+            raise ProblemError(
+                f"environment {row}: option {option.flatten()[row].item()} has no allowed action left, and options "
+                "last as long as their episodes; use agent.termination=steps or learned"
+            )
+        return is_stuck
+
+    @staticmethod
+    def _possible_options(tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
+        """Return which options have an allowed action, bool `[*B, num_options]`; all where an episode is over."""
+        allowed = option_actions & tensordict.get(keys.ACTION_MASK).unsqueeze(-2)
+        return allowed.any(-1) | tensordict.get(keys.DONE)
 
 
 def _zero_where(mask: Tensor, values: Tensor) -> Tensor:
@@ -131,4 +173,7 @@ class DecisionEnv(TransformedEnv):
 
 def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionEnv:
     """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
-    return DecisionEnv(env, DecisionTracker(gamma, option_length))
+    option_actions = None
+    if env.option_actions is not None and keys.ACTION_MASK in env.observation_spec.keys():
+        option_actions = torch.tensor(env.option_actions, device=env.device)
+    return DecisionEnv(env, DecisionTracker(gamma, option_length, option_actions))

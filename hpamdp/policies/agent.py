@@ -114,14 +114,21 @@ class OptionValues(nn.Module):
         self.num_options = num_options
 
     @torch.no_grad()
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return the values `[N, num_options]` of observations `[N, observation_dim]`."""
+    def forward(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the values `[N, num_options]` of observations `[N, observation_dim]`.
+
+        Args:
+            observation: of the states.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+        """
+        masks = () if action_mask is None else (action_mask,)
         if len(self.learners) == self.num_options:
-            values = [learner.value(observation) for learner in self._learners()]
-        else:
-            (learner,) = self._learners()
-            one_hot = torch.eye(self.num_options, device=observation.device)
-            values = [learner.value(torch.cat([observation, row.expand(len(observation), -1)], -1)) for row in one_hot]
+            return torch.stack([learner.value(observation, *masks) for learner in self._learners()], -1)
+        (learner,) = self._learners()
+        values = []
+        for one_hot in torch.eye(self.num_options, device=observation.device):
+            seen = torch.cat([observation, one_hot.expand(len(observation), -1)], -1)
+            values.append(learner.value(seen, *masks))
         return torch.stack(values, -1)
 
     def _learners(self) -> Iterator[Learner]:

@@ -112,8 +112,8 @@ class Selector(TensorDictModuleBase):
             keys of `hpamdp.keys`), with `human` the probabilities of the human choices (`HUMAN_OPTION`). Append the
             keys that `select` reads to `in_keys`. Environments without such an argument are refused.
         asks_learners: whether the selector wants `option_values`.
-        option_values: maps observations `[N, observation_dim]` to what the learners themselves expect of each option,
-            `[N, num_options]`; the agent sets it, if `asks_learners`.
+        option_values: maps observations `[N, observation_dim]` and the states' action masks, or None, to what the
+            learners themselves expect of each option, `[N, num_options]`; the agent sets it, if `asks_learners`.
         gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
             it, and so is the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.

@@ -18,6 +18,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.fractions import Fraction
+from hpamdp.policies.shared.masks import masked_values, random_choice
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -34,19 +35,27 @@ class Value(Selector):
 
     def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:
         super().__init__(specs)
+        if specs.has_action_mask:
+            self.in_keys.append(keys.ACTION_MASK)
         self.epsilon = epsilon
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return an option for every environment, int64 `[*B]`; 0 where no decision is due."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
-        value = self.option_values(td.get(keys.OBSERVATION)[is_decision])
+        action_mask, option_mask = (
+            None if mask is None else mask[is_decision]
+            for mask in (td.get(keys.ACTION_MASK, None), td.get(keys.OPTION_MASK, None))
+        )
+        value = self.option_values(td.get(keys.OBSERVATION)[is_decision], action_mask)
+        value = masked_values(value, option_mask)
         if is_greedy():
             best = value.argmax(-1)
         else:
             is_best = value == value.amax(-1, keepdim=True)
             best = torch.where(is_best, torch.rand_like(value), -1.0).argmax(-1)  # a random one of equals
             is_random = torch.rand(best.shape, device=best.device) < self.epsilon
-            best = torch.where(is_random, torch.randint_like(best, self.specs.num_options), best)
+            anything = random_choice(best.shape, self.specs.num_options, option_mask, best.device)
+            best = torch.where(is_random, anything, best)
         option = torch.zeros_like(is_decision, dtype=torch.long)
         option[is_decision] = best
         return option

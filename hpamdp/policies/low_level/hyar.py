@@ -49,7 +49,7 @@ from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update, with_clipped_noise
-from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
+from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
@@ -356,10 +356,7 @@ class HyAR(ReplayLearner):
     def explore(self, frames: int) -> None:
         """Lower the fraction of random actions and the learning rates."""
         self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
-        fraction = linear_schedule(frames, self.lr_frames, self.lr_final)
-        for name, rate in self.learning_rates.items():
-            for group in self.optimizers[name].param_groups:
-                group["lr"] = rate * fraction
+        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(frames, self.lr_frames, self.lr_final))
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""

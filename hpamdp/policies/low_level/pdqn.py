@@ -47,7 +47,7 @@ from hpamdp.policies.shared.networks import (
     polyak_update,
     with_clipped_noise,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
+from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -131,6 +131,8 @@ class PDQN(ReplayLearner):
         reward_scale: PositiveFloat,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
+        lr_final: PositiveFraction,
+        lr_frames: NonNegativeInt,
         actor_tau: PositiveFraction,
         critic_tau: PositiveFraction,
         max_grad_norm: PositiveFloat | None,
@@ -155,6 +157,9 @@ class PDQN(ReplayLearner):
         self.target_smoothing_clip = target_smoothing_clip
         self.policy_delay = policy_delay
         self.n_step = n_step
+        self.learning_rates = {"actor": actor_lr, "critics": critic_lr}
+        self.lr_final = lr_final
+        self.lr_frames = lr_frames
         self.actor_tau = actor_tau
         self.critic_tau = critic_tau
         self.max_grad_norm = max_grad_norm
@@ -181,11 +186,12 @@ class PDQN(ReplayLearner):
         return super().learn(batch, mask)
 
     def explore(self, frames: int) -> None:
-        """Lower the fraction of random actions."""
+        """Lower the fraction of random actions and the learning rates."""
         time, over = frames, self.epsilon_frames
         if self.epsilon_episodes is not None:
             time, over = int(self.episodes), self.epsilon_episodes
         self.policy.epsilon.fill_(linear_schedule(time, over, self.epsilon_final))
+        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(frames, self.lr_frames, self.lr_final))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state that follows and the discount of that state's value."""

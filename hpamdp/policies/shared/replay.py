@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -205,6 +205,15 @@ class ReplayLearner(Learner):
             parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
             nn.utils.clip_grad_norm_(parameters, max_grad_norm)
         optimizer.step()
+
+
+def set_learning_rates(
+    optimizers: Mapping[str, torch.optim.Optimizer], rates: Mapping[str, float], fraction: float
+) -> None:
+    """Set the learning rate of each optimizer to a fraction of the rate of the same name."""
+    for name, rate in rates.items():
+        for group in optimizers[name].param_groups:
+            group["lr"] = rate * fraction
 
 
 def linear_schedule(time: int, over: int, final: float) -> float:
