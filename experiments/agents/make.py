@@ -31,6 +31,12 @@ AGENTS = {
     "hppo_hard_move_4": [*HARD_MOVE, "env.n=4"],
     "hppo_hard_move_6": [*HARD_MOVE, "env.n=6"],
     "hppo_hard_move_8": [*HARD_MOVE, "env.n=8"],
+    # Its options change inside an episode.
+    "meta_critic_hppo_rooms": [
+        *("high=meta_critic", "high.hidden_dims=[64,64]", "low=hppo", "env=rooms", "low.gamma=0.97"),
+        *("agent.termination=learned", "agent.sharing=shared", "low.minibatch_size=512"),
+        *("num_envs=128", "steps_per_batch=16", "total_frames=400000", "eval.every=100000"),
+    ],
     # The last layer has three rows for each of 1,024 discrete actions.
     "hppo_hard_move_10": [*HARD_MOVE, "env.n=10", "low.hidden_dims=[128,40]", SMALL, "total_frames=200000"],
 }
