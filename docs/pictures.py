@@ -13,7 +13,6 @@ from hpamdp.run import watch
 ROOT = Path(__file__).resolve().parent.parent
 PLAYERS = {
     "boatdock": ["agents/linucb_hppo"],
-    "boatdock_released": ["env=boatdock_released", "high=uniform", "low=random"],
     "platform": ["agents/hppo_platform"],
     "goal": ["agents/pdqn_goal"],
     "hard_goal": ["agents/pdqn_hard_goal"],

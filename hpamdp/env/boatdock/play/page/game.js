@@ -291,7 +291,7 @@
   const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   const share = (results) => mean(results.map((r) => (r.outcome === "success" ? 1 : 0)));
   const cssPercent = (value) => `${100 * value}%`;
-  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller} boat`);
+  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller}`);
   const percent = (value) => `${(100 * value).toFixed(0)} %`;
   const colourOf = (i) => COLOURS.agents[i % COLOURS.agents.length];
   const swatch = (colour, dashes) => `<span class="swatch" style="border-color:${colour};border-top-style:${dashes}"></span>`;
@@ -343,7 +343,7 @@
     $("#speed i").style.width = cssPercent(Math.min(speed / scale, 1));
     $("#speed i").className = speed > rules.docking_speed ? "low" : "";
     $("#speed em").style.left = cssPercent(rules.docking_speed / scale);
-    $("#speed-text").textContent = speed > rules.docking_speed ? "too fast to dock" : `${speed.toFixed(0)} px/s`;
+    $("#speed-text").textContent = speed > rules.docking_speed ? "too fast" : `${speed.toFixed(0)} px/s`;
   }
 
   // ---- drawing ----
@@ -479,13 +479,13 @@
     level(mean(results.map((r) => r.best)), "#2b2b2b", "ceiling", []);
     level(data.people.mean, "#D98200", "people", [6, 4]);
     level(data.people.best, "#D98200", "best person", [2, 3]);
-    data.agents.forEach((agent, i) => level(mean(results.map((r) => r.agents[i].score)), colourOf(i), agent.title, []));
+    data.agents.forEach((agent, i) => level(mean(results.map((r) => r.agents[i].score)), colourOf(i), titleOf(agent), []));
     results.forEach((r, i) => disc(pen, [X(i + 1), Y(r.score)], 2.5, "#9fb3c0"));
     const smooth = curve(results.map((r) => r.score));
     for (let i = 1; i < smooth.length; i++) {
       line(pen, [X(i), Y(smooth[i - 1])], [X(i + 1), Y(smooth[i])], COLOURS.you, 3, []);
     }
-    labels.push([Y(smooth[smooth.length - 1]), COLOURS.you, `you, last ${window_}: ${smooth[smooth.length - 1].toFixed(2)}`]);
+    labels.push([Y(smooth[smooth.length - 1]), COLOURS.you, `you${window_ > 1 ? `, last ${window_}` : ""} ${smooth[smooth.length - 1].toFixed(2)}`]);
     labels.sort((a, b) => a[0] - b[0]);
     let lowest = 0;
     pen.textAlign = "left";
