@@ -1,4 +1,4 @@
-# `make run` and `make test` need Python 3.10, 3.11 or 3.12 and nothing else; all that they install goes into .venv.
+# `make play`, `make run` and `make test` need Python 3.10, 3.11 or 3.12 and nothing else; all that they install goes into .venv.
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 IS_ALLOWED := import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 13))
@@ -13,14 +13,18 @@ COVERAGE := --cov=hpamdp --cov-report=term:skip-covered --cov-fail-under=90
 # The one slow test that needs the Ray launcher, which shares no environment with the others.
 RAY_TEST := test_a_killed_sweep_is_finished_by_the_same_command and ray
 
-.PHONY: run test slow slow-tests ray-launcher wheel lowest report docs
+.PHONY: play run test slow slow-tests ray-launcher wheel lowest report docs
+
+# Dock boats yourself, in the browser, beside agents. Ctrl-C ends it.
+play: $(VENV)/.installed
+	$(PYTHON) -m hpamdp.cli play $(ARGS)
 
 # A first run: which boat, by UCB; how to sail it, by HyAR. More settings: make run ARGS="seed=1"
 run: $(VENV)/.installed
 	$(PYTHON) run.py high=ucb low=hyar $(ARGS)
 
 # The gate: what every change has to pass.
-test: $(VENV)/.installed
+test: $(VENV)/.installed-dev
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy hpamdp
@@ -33,7 +37,8 @@ slow:
 	$(MAKE) wheel
 	$(MAKE) lowest
 
-# All slow tests, and those quick ones on sweeps that need a launcher.
+# All slow tests, and those quick ones on sweeps that need a launcher. Those of the page of `make play` in a browser skip
+# where there is no Chromium; on Debian, `apt-get install chromium` brings one.
 slow-tests: $(SLOW)/.installed
 	$(SLOW)/bin/python -m pytest -n 2 --dist worksteal -m slow -k 'not ($(RAY_TEST))' $(ARGS)
 	$(SLOW)/bin/python -m pytest tests/test_sweeps.py -k 'not missing_launcher' $(ARGS)
@@ -56,7 +61,7 @@ lowest: $(LOWEST)/.installed
 	$(LOWEST)/bin/python -m pytest -n auto --dist worksteal $(ARGS)
 
 # Figures, tables and pages of all studies, from their csv files: report/report.html
-report: $(VENV)/.installed
+report: $(VENV)/.installed-dev
 	$(PYTHON) experiments/report.py
 
 # The documentation site, in site/: runs the tutorials, then builds the pages. Warnings are errors.
@@ -79,8 +84,13 @@ define venv
 endef
 INSTALL = @$(@D)/bin/python -m pip install --quiet --disable-pip-version-check
 
+# What playing and runs need; tests need more.
 $(VENV)/.installed: pyproject.toml constraints.txt
 	$(venv)
+	$(INSTALL) -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
 	$(INSTALL) -c constraints.txt -e '.[dev]'
 	@touch $@
 

@@ -1,13 +1,15 @@
 """What mkdocs needs to make the site of the repository's own files, so that nothing is written twice.
 
-- Pages outside docs/ become pages of the site: the README, the changelog, the studies.
+- Pages outside docs/ become pages of the site: the README, the changelog, the agents, the studies.
 - Relative links are turned from files into pages. Code that a page links to gets a page of its own. A link that leads
   nowhere is a warning, and so an error.
 - Directives, which are HTML comments on lines of their own, are filled in:
   `<!-- settings of conf/low/hppo.yaml -->`, every value with its default and its comment;
   `<!-- docstring of hpamdp/policies/low_level/hppo.py: Source -->`, the parts of a module's docstring that begin so;
   `<!-- rows of experiments/table1/README.md, table 2: hppo -->`, the rows of a study's table by their first cell;
-  `<!-- csv experiments/domains/published.csv: domain=platform -->`, the rows of a csv file by a column.
+  `<!-- csv experiments/domains/published.csv: domain=platform -->`, the rows of a csv file by a column;
+  `<!-- runs experiments/domains/results.csv: learner=pdqn, pdqn_published -->`, a study's runs by a column, those that
+  differ in their seed alone as mean ± standard deviation.
 - Every module of the package with a public docstring gets a page in the API.
 """
 
@@ -18,6 +20,7 @@ import csv
 import logging
 import posixpath
 import re
+import statistics
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -27,10 +30,13 @@ log = logging.getLogger("mkdocs.hooks.pages")
 
 FENCE = re.compile(r"^ *```.*?^ *```[^\n]*$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?(?=\))")
-DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv) (.+?) -->$", re.MULTILINE)
+DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv|runs) (.+?) -->$", re.MULTILINE)
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
 PICTURES = {".png", ".gif", ".svg"}
+# The columns of runs that are shown, and their heads.
+MEASURED = {"frames": "steps", "score": "score", "success": "success", "cpu_s": "CPU, s"}
+PAGES = ("*.md", "agents/README.md", "experiments/*/README.md", "docs/**/*.md")
 
 
 class SiteError(Exception):
@@ -43,7 +49,14 @@ def page_of(path: str) -> str | None:
     Args:
         path: relative to the repository, as `experiments/table1/README.md`.
     """
-    fixed = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+    fixed = {
+        "README.md": "index.md",
+        "CHANGELOG.md": "changelog.md",
+        "CONTRIBUTING.md": "contributing.md",
+        "agents/README.md": "agents.md",
+        "agents": "agents.md",
+        "experiments": "results.md",
+    }
     if path in fixed:
         return fixed[path]
     study = re.fullmatch(r"experiments/(\w+)/README\.md", path)
@@ -51,8 +64,6 @@ def page_of(path: str) -> str | None:
         return f"studies/{study[1]}.md"
     if path.startswith(DOCS) and path.endswith(".md"):
         return path.removeprefix(DOCS)
-    if path == "experiments":
-        return "results.md"
     if path.startswith("hpamdp/") and path.endswith(".py"):
         return api_page(path)
     return None
@@ -60,7 +71,7 @@ def page_of(path: str) -> str | None:
 
 def pages() -> list[str]:
     """Return all Markdown files of the repository that are pages."""
-    files = [*ROOT.glob("*.md"), *ROOT.glob("experiments/*/README.md"), *ROOT.glob("docs/**/*.md")]
+    files = [file for pattern in PAGES for file in ROOT.glob(pattern)]
     paths = (file.relative_to(ROOT).as_posix() for file in sorted(files))
     return [path for path in paths if page_of(path) is not None]
 
@@ -225,11 +236,51 @@ def csv_table(words: str) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in table)
 
 
+def runs_table(words: str) -> str:
+    """Return a table of the runs in a csv file whose column has one of some values, as `PATH: column=value, value`.
+
+    The columns before `seed` tell settings apart; of those after it the table has the means over the seeds.
+    """
+    path, _, condition = words.partition(": ")
+    column, _, values = condition.partition("=")
+    with (ROOT / path).open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        names = list(reader.fieldnames or [])
+        rows = list(reader)
+    if column not in names or "seed" not in names:
+        raise SiteError(f"it has no column {column} or no column seed")
+    place = names.index("seed")
+    measured = [name for name in names[place + 1 :] if name in MEASURED]
+    wanted = [value.strip() for value in values.split(",")]
+    told = [name for name in names[:place] if name != column or len(wanted) > 1]
+    settings: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for row in rows:
+        if row[column] in wanted:
+            settings.setdefault(tuple(row[name] for name in told), []).append(row)
+    if not settings:
+        return "No run of it has been finished yet."
+    head = [*(MEASURED.get(name, name) for name in told), "seeds", *(MEASURED[name] for name in measured)]
+    table = [head, ["---"] * len(head)]
+    for setting, same in settings.items():
+        numbers = [f"{int(value):,}" if value.isdecimal() else cell(value) for value in setting]
+        table.append([*numbers, str(len(same)), *(mean_of(same, name) for name in measured)])
+    return "\n".join(f"| {' | '.join(row)} |" for row in table)
+
+
+def mean_of(rows: list[dict[str, str]], name: str) -> str:
+    """Return mean ± standard deviation of a column, or the one value."""
+    values = [float(row[name]) for row in rows]
+    digits = 0 if name == "cpu_s" else 3
+    spread = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
+    return f"{statistics.fmean(values):.{digits}f}{spread}"
+
+
 DIRECTIVES: dict[str, Callable[[str], str]] = {
     "settings of": settings_of,
     "docstring of": docstring_of,
     "rows of": rows_of,
     "csv": csv_table,
+    "runs": runs_table,
 }
 
 

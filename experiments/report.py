@@ -3,8 +3,8 @@
 python experiments/report.py    runs `main([])` of every study.py; renews the tables in the Markdown pages; writes
                                 report/report.html, and every figure as SVG
 
-In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables. In the project's README and in
-docs/, `<!-- table 2 of STUDY -->` and `<!-- /table -->` enclose the second table of that study.
+In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables. In the project's README, that of
+agents/ and in docs/, `<!-- table 2 of STUDY -->` and `<!-- /table -->` enclose the second table of that study.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ def report(experiments: Path, target: Path) -> list[str]:
     """Renew figures, tables and the report.
 
     Args:
-        experiments: the folder of the studies. README.md and docs/ beside it get their tables renewed, too.
+        experiments: the folder of the studies. README.md, agents/README.md and docs/ beside it get their tables
+            renewed, too.
         target: the folder of the report.
 
     Returns:
@@ -66,7 +67,7 @@ def report(experiments: Path, target: Path) -> list[str]:
         failures += [f"{folder.name}: no image {name}" for name in missing]
         pages.append((folder.name, body))
     root = experiments.parent
-    for page in (root / "README.md", *sorted((root / "docs").glob("*.md"))):
+    for page in (root / "README.md", root / "agents/README.md", *sorted((root / "docs").glob("*.md"))):
         if page.exists():
             failures += renew_numbered(page, tables)
     (target / "report.html").write_text(bind(pages), encoding="utf-8")

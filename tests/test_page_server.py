@@ -210,6 +210,7 @@ def test_other_sites_may_neither_send_nor_read(server):
     port = server.server_port
     assert send(server, EPISODES[0], Origin="http://evil.example")[0] == 403
     assert send(server, EPISODES[0], Origin="null")[0] == 403
+    assert send(server, EPISODES[0], Origin=f"ftp://127.0.0.1:{server.server_port}")[0] == 403
     assert send(server, EPISODES[0], Host="evil.example")[0] == 403  # a name that was made to mean this address
     assert ask(server, "GET", "/", headers={"Host": "evil.example"})[0] == 403
     assert ask(server, "GET", "/", headers={"Host": f"localhost:{port}"})[0] == 200
@@ -286,3 +287,10 @@ def test_play_tells_a_mistake_in_one_line(monkeypatch, capsys, words, said):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
     code, printed = play(monkeypatch, capsys, *words)
     assert code == 2 and said in printed.err and printed.err.count("\n") == 1
+
+
+def test_the_page_may_send_episodes_through_a_web_server_that_encrypts(tmp_path):
+    with serving(tmp_path / "played.jsonl") as server:
+        host = f"127.0.0.1:{server.server_port}"
+        assert send(server, EPISODES[0], Host=host, Origin=f"https://{host}")[0] == 201
+        assert send(server, EPISODES[1], Host=host, Origin="https://127.0.0.1")[0] == 403

@@ -108,3 +108,17 @@ def test_an_evaluation_knows_the_ceiling(tmp_path):
     parts = assemble(make_config(words), tmp_path)
     means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
     assert 0.8 < means["ceiling"] < 0.9 and means["score"] < means["ceiling"]
+
+
+def test_a_film_shows_the_floors_and_where_the_agent_goes():
+    env = RoomsEnv(1)
+    first = env.reset()
+    states = [env.env_state()]
+    first["option"] = torch.tensor([rules.SKATES])
+    first["action", "discrete"] = torch.tensor([1])
+    first["action", "parameters"] = torch.ones(1, 4)
+    env.step(first)
+    pictures = list(env.film([*states, env.env_state()], 4.0, 240))
+    assert len(pictures) == 2 and pictures[0].shape == (240, 240, 3)
+    assert (pictures[0] != pictures[1]).any()
+    assert len({tuple(colour) for colour in pictures[0].reshape(-1, 3)[::7]}) > 5

@@ -1,7 +1,8 @@
-"""Train the agents that come with the code anew, each by one command, and put them into agents/.
+"""Make the agents that come with the code anew, each by one run, and put them into agents/.
 
-python experiments/agents/make.py           all of them, one after another
-python experiments/agents/make.py NAME ...  only these
+python experiments/agents/make.py                train all of them, one after another
+python experiments/agents/make.py NAME ...       only these
+python experiments/agents/make.py NAME=FOLDER    only put the run in FOLDER there, which was made by NAME's command
 """
 
 import shutil
@@ -10,16 +11,34 @@ import sys
 import tempfile
 from pathlib import Path
 
+import torch
+
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ("policy.pt", "config.yaml", "summary.json")
-# The critics serve training alone; small ones keep policy.pt below 300 kB.
+# The critics serve training alone; small ones make small files.
 SMALL = "low.critic_hidden_dims=[64,64]"
+ONE_BOAT = ["high=none", "low=hppo", SMALL, "total_frames=1000000", "eval.every=250000"]
+HARD_MOVE = ["high=none", "low=hppo", "env=hard_move", "eval.every=50000"]
+GOAL = ["high=none", "low=pdqn", "total_frames=300000", "eval.every=30000"]
 AGENTS = {
     "linucb_hppo": ["high=linucb", "low=hppo", SMALL, "total_frames=4000000", "eval.every=500000"],
-    "hppo_congruent": [
-        *("high=none", "low=hppo", "env.controller=congruent", SMALL),
-        *("total_frames=1000000", "eval.every=250000"),
+    "hppo_congruent": [*ONE_BOAT, "env.controller=congruent"],
+    "hppo_incongruent": [*ONE_BOAT, "env.controller=incongruent"],
+    "hppo_platform": ["high=none", "low=hppo", "env=platform", "eval.every=20000"],
+    "pdqn_goal": [*GOAL, "env=goal"],
+    "pdqn_hard_goal": [*GOAL, "env=hard_goal"],
+    "hppo_catch_point": ["high=none", "low=hppo", "env=catch_point", "eval.every=100000", "seed=1"],
+    "hppo_hard_move_4": [*HARD_MOVE, "env.n=4"],
+    "hppo_hard_move_6": [*HARD_MOVE, "env.n=6"],
+    "hppo_hard_move_8": [*HARD_MOVE, "env.n=8"],
+    # Its options change inside an episode.
+    "meta_critic_hppo_rooms": [
+        *("high=meta_critic", "high.hidden_dims=[64,64]", "low=hppo", "env=rooms", "low.gamma=0.97"),
+        *("agent.termination=learned", "agent.sharing=shared", "low.minibatch_size=512"),
+        *("num_envs=128", "steps_per_batch=16", "total_frames=400000", "eval.every=100000"),
     ],
+    # The last layer has three rows for each of 1,024 discrete actions.
+    "hppo_hard_move_10": [*HARD_MOVE, "env.n=10", "low.hidden_dims=[128,40]", SMALL, "total_frames=100000"],
 }
 
 
@@ -27,18 +46,45 @@ def make(name: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
         words = [*AGENTS[name], f"hydra.run.dir={folder}", "overwrite=true"]
         subprocess.run([sys.executable, str(ROOT / "run.py"), *words], check=True)
-        (ROOT / "agents" / name).mkdir(parents=True, exist_ok=True)
-        for file in KEPT:
-            shutil.copyfile(Path(folder) / file, ROOT / "agents" / name / file)
+        keep(name, Path(folder))
 
 
-def main(names: list[str]) -> int:
-    unknown = set(names) - set(AGENTS)
+def keep(name: str, run: Path) -> None:
+    """Put a run's agent into agents/."""
+    target = ROOT / "agents" / name
+    target.mkdir(parents=True, exist_ok=True)
+    for file in KEPT:
+        shutil.copyfile(run / file, target / file)
+    round_networks(target / "policy.pt")
+
+
+def round_networks(file: Path) -> None:
+    """Store the learners' networks in half precision, for half the size; a selector stays, as it may hold counts."""
+    saved = torch.load(file, weights_only=True)
+    agent = saved["agent"]
+    # The same weights are there under several names, but only once in the file; so they must stay one tensor.
+    rounded = {
+        value.data_ptr(): value.half()
+        for name, value in agent.items()
+        if name.startswith("learners.") and isinstance(value, torch.Tensor) and value.is_floating_point()
+    }
+    for name, value in agent.items():
+        if isinstance(value, torch.Tensor) and value.data_ptr() in rounded:
+            agent[name] = rounded[value.data_ptr()]
+    torch.save(saved, file)
+
+
+def main(words: list[str]) -> int:
+    given = dict(word.partition("=")[::2] for word in words) or dict.fromkeys(AGENTS, "")
+    unknown = given.keys() - AGENTS.keys()
     if unknown:
         print(f"{', '.join(sorted(unknown))}: no such agent; there is {', '.join(AGENTS)}", file=sys.stderr)
         return 2
-    for name in names or AGENTS:
-        make(name)
+    for name, folder in given.items():
+        if folder:
+            keep(name, Path(folder))
+        else:
+            make(name)
     return 0
 
 

@@ -222,7 +222,8 @@ class _Handler(BaseHTTPRequestHandler):
         if self.server.is_local and name not in _LOOPBACK:
             return False
         origin = self.headers.get("Origin")
-        return origin is None or origin == f"http://{host}"
+        # A web server in front of this one may encrypt.
+        return origin is None or origin in (f"http://{host}", f"https://{host}")
 
     def _send_file(self, *, with_body: bool) -> None:
         if not self._is_from_here():

@@ -13,7 +13,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
-from hpamdp.env.rooms import rules
+from hpamdp.env.rooms import rendering, rules
 from hpamdp.env.rooms.rules import RoomsState
 
 
@@ -100,6 +100,11 @@ class RoomsEnv(CounterEnv[RoomsState]):
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the mean of the best possible returns, with options that may change at every step, as `ceiling`."""
         return {"ceiling": float(played["best_return"].mean())} if "best_return" in played else {}
+
+    def draw(self, track: Sequence[RoomsState]) -> np.ndarray:
+        """Return a picture of the rooms and the way so far, uint8 `[480, 480, 3]`."""
+        path = [(int(state.x), int(state.y)) for state in track]
+        return rendering.draw(path, int(track[-1].outcome))
 
     def _make_specs(self, low: Tensor, high: Tensor) -> None:
         super()._make_specs(low, high)

@@ -27,7 +27,7 @@
   const harbour = $("#harbour");
   const game = {
     screen: "loading", mode: null, keymap: 1, number: 0, layout: null, controller: null, origin: 0, events: [],
-    state: null, results: { practice: [], round: [], free: [] }, stored: [], unsent: [], sent: 0, refused: 0,
+    state: null, results: { practice: [], round: [], free: [] }, stored: [], unsent: [], sent: 0, refused: 0, downloaded: 0,
     player: null, resolution: 0,
   };
   window.hpamdpGame = game;
@@ -117,6 +117,7 @@
     } else if (game.screen === "choose" && !event.repeat && (event.code === "KeyC" || event.code === "KeyI")) {
       sail(event.code === "KeyC" ? "congruent" : "incongruent", event.timeStamp);
     } else if (game.screen === "result" && !event.repeat && (event.code === "Enter" || event.code === "Space")) {
+      if (event.target.closest("button:not(#next)")) return; // that button does what it says
       event.preventDefault();
       next();
     }
@@ -240,6 +241,7 @@
   }
 
   let isSending = false;
+  let isWaiting = false; // and the notice says so
   async function send() {
     if (isSending) return;
     isSending = true;
@@ -255,9 +257,12 @@
         }
         game.unsent.shift();
       }
-      if (!game.refused) notice("");
+      if (isWaiting) notice("");
+      isWaiting = false;
     } catch (error) {
-      notice(`${game.unsent.length} episodes wait for the server (${error.message}); you can go on playing`);
+      const num = game.unsent.length;
+      notice(`${num} ${num === 1 ? "episode waits" : "episodes wait"} for the server (${error.message}); you can go on playing`);
+      isWaiting = true;
       setTimeout(send, 3000);
     } finally {
       isSending = false;
@@ -270,8 +275,14 @@
     link.href = URL.createObjectURL(new Blob([text], { type: "application/x-ndjson" }));
     link.download = `episodes-${game.player}.jsonl`;
     link.click();
-    URL.revokeObjectURL(link.href);
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000); // some browsers begin to read it later
+    game.downloaded = game.stored.length;
   }
+
+  // Episodes that are nowhere else go with the page.
+  window.addEventListener("beforeunload", (event) => {
+    if (data.has_server ? game.unsent.length : game.downloaded < game.stored.length) event.preventDefault();
+  });
 
   const notice = (text) => { $("#notice").textContent = text; };
 
@@ -280,7 +291,7 @@
   const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
   const share = (results) => mean(results.map((r) => (r.outcome === "success" ? 1 : 0)));
   const cssPercent = (value) => `${100 * value}%`;
-  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller} boat`);
+  const titleOf = (agent) => agent.title + (agent.controller === "choose" ? "" : `, ${agent.controller}`);
   const percent = (value) => `${(100 * value).toFixed(0)} %`;
   const colourOf = (i) => COLOURS.agents[i % COLOURS.agents.length];
   const swatch = (colour, dashes) => `<span class="swatch" style="border-color:${colour};border-top-style:${dashes}"></span>`;
@@ -332,7 +343,7 @@
     $("#speed i").style.width = cssPercent(Math.min(speed / scale, 1));
     $("#speed i").className = speed > rules.docking_speed ? "low" : "";
     $("#speed em").style.left = cssPercent(rules.docking_speed / scale);
-    $("#speed-text").textContent = speed > rules.docking_speed ? "too fast to dock" : `${speed.toFixed(0)} px/s`;
+    $("#speed-text").textContent = speed > rules.docking_speed ? "too fast" : `${speed.toFixed(0)} px/s`;
   }
 
   // ---- drawing ----
@@ -468,13 +479,13 @@
     level(mean(results.map((r) => r.best)), "#2b2b2b", "ceiling", []);
     level(data.people.mean, "#D98200", "people", [6, 4]);
     level(data.people.best, "#D98200", "best person", [2, 3]);
-    data.agents.forEach((agent, i) => level(mean(results.map((r) => r.agents[i].score)), colourOf(i), agent.title, []));
+    data.agents.forEach((agent, i) => level(mean(results.map((r) => r.agents[i].score)), colourOf(i), titleOf(agent), []));
     results.forEach((r, i) => disc(pen, [X(i + 1), Y(r.score)], 2.5, "#9fb3c0"));
     const smooth = curve(results.map((r) => r.score));
     for (let i = 1; i < smooth.length; i++) {
       line(pen, [X(i), Y(smooth[i - 1])], [X(i + 1), Y(smooth[i])], COLOURS.you, 3, []);
     }
-    labels.push([Y(smooth[smooth.length - 1]), COLOURS.you, `you, last ${window_}: ${smooth[smooth.length - 1].toFixed(2)}`]);
+    labels.push([Y(smooth[smooth.length - 1]), COLOURS.you, `you${window_ > 1 ? `, last ${window_}` : ""} ${smooth[smooth.length - 1].toFixed(2)}`]);
     labels.sort((a, b) => a[0] - b[0]);
     let lowest = 0;
     pen.textAlign = "left";
@@ -507,7 +518,9 @@
     "ended, under a random number that is drawn anew each time the page is loaded. " +
     (data.has_server ? "They are stored in a file on the computer that serves this page." :
       "They stay in this page until you download them as a file.") + " Without this, nothing is kept.";
-  window.addEventListener("resize", () => game.layout && game.screen !== "start" && game.screen !== "end" &&
-    draw(game.screen === "result" ? game.results[game.mode].at(-1) : undefined));
+  window.addEventListener("resize", () => {
+    if (game.screen === "end") drawCurve(game.results[game.mode]);
+    else if (game.screen !== "start") draw(game.screen === "result" ? game.results[game.mode].at(-1) : undefined);
+  });
   show("start");
 })();

@@ -1,0 +1,37 @@
+"""Film the pictures of docs/domains again: the agents that come with the code and, where there is none, other players.
+
+python docs/pictures.py            all of them
+python docs/pictures.py NAME ...   only these
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from hpamdp.run import watch
+
+ROOT = Path(__file__).resolve().parent.parent
+PLAYERS = {
+    "boatdock": ["agents/linucb_hppo"],
+    "platform": ["agents/hppo_platform"],
+    "goal": ["agents/pdqn_goal"],
+    "hard_goal": ["agents/pdqn_hard_goal"],
+    "catch_point": ["agents/hppo_catch_point"],
+    "hard_move": ["agents/hppo_hard_move_4"],
+    "moving": ["env=moving", "high=none", "low=planner"],
+    "sliding": ["env=sliding", "high=none", "low=planner"],
+    "rooms": ["agents/meta_critic_hppo_rooms"],
+}
+
+
+def main(names: list[str]) -> int:
+    """Write the GIFs beside the pages."""
+    for name in names or PLAYERS:
+        who = [str(ROOT / word) if word.startswith("agents/") else word for word in PLAYERS[name]]
+        to = ROOT / "docs" / "domains" / f"{name}.gif"
+        watch.main([*who, "--to", str(to), "--episodes", "3", "--size", "240"], argparse.ArgumentParser())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

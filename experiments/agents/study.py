@@ -1,0 +1,57 @@
+"""Tabulate the agents that come with the code, from their own configs and summaries.
+
+python experiments/agents/study.py
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+AGENTS = Path(__file__).resolve().parents[2] / "agents"
+# What of a problem's settings tells one agent from another.
+TOLD = ("controller", "n")
+HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success", "length", "trained for", "CPU")
+
+
+def row(folder: Path) -> list[str]:
+    """Return an agent's cells."""
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    env = OmegaConf.load(folder / "config.yaml").env
+    told = [f"env.{name}={env[name]}" for name in TOLD if name in env and env[name] != "choose"]
+    ceiling = summary.get("ceiling")
+    return [
+        f"`{folder.name}`",
+        f"`{' '.join([f'env={env.name}', *told])}`",
+        summary["high"],
+        summary["low"],
+        f"{summary['score']:.3f}",
+        "" if ceiling is None else f"{ceiling:.3f}",
+        f"{100.0 * summary['success']:.1f} %",
+        f"{summary['steps']:.2f} steps",
+        f"{summary['frames']:,} steps",
+        f"{summary['cpu_s']:.0f} s",
+    ]
+
+
+def main(words: Sequence[str]) -> None:
+    """Print the table."""
+    assert not words
+    folders = sorted((file.parent for file in AGENTS.glob("*/summary.json")), key=_order)
+    for cells in (HEAD, ["---"] * len(HEAD), *map(row, folders)):
+        print(f"| {' | '.join(cells)} |")
+
+
+def _order(folder: Path) -> tuple[bool, str, int, str]:
+    """Return what puts the boats first, then the problems by name, and Hard Move by its number of actuators."""
+    problem = OmegaConf.load(folder / "config.yaml").env.name
+    return problem != "boatdock", problem, len(folder.name), folder.name
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
