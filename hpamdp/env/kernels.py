@@ -134,6 +134,9 @@ def sin_cos(angle: Any) -> Any:
 
 # What the kernels of all `CounterEnv`s share: the modes, the first places in their settings, and the last rows of their
 # integers.
+#
+# Each kernel states its loop over the rows itself. A factory that closes over the problem's functions would compile it
+# anew in every process: Numba's cache on disk never hits for closures over compiled functions.
 ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
 SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, OWN = range(6)
 STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1
@@ -157,7 +160,7 @@ def invalid_row(discrete: Any, parameters: Any, places: Any, integers: Any, mode
         if is_valid:
             for place in range(places[discrete[row]], places[discrete[row] + 1]):
                 is_valid &= math.isfinite(parameters[row, place])
-        if not is_valid and not (mode == ACT_OR_RESTART and integers[len(integers) + OUTCOME_ROW, row] != 0):
+        if not is_valid and not (mode == ACT_OR_RESTART and integers[OUTCOME_ROW, row] != 0):
             return row
     return -1
 
@@ -169,6 +172,27 @@ def parameter(parameters: Any, row: Any, number: Any, action: Any, places: Any, 
     if place >= places[action + 1]:
         return ZERO
     return min(max(parameters[row, place], bounds[0, place]), bounds[1, place])
+
+
+@inlined
+def _row_key(settings: Any, stream_place: Any, row: Any, episode: Any) -> Any:
+    stream = int32(settings[stream_place])
+    base = stream_key(settings[SEED], stream)
+    return episode_key(base, int32(settings[FIRST_ENV]) + row, episode), stream_step(stream)
+
+
+@inlined
+def noise_key(settings: Any, row: Any, episode: Any) -> Any:
+    """Return bits and step of the random numbers within an episode, which `uniform` and `normal` take."""
+    return _row_key(settings, NOISE_STREAM, row, episode)
+
+
+@inlined
+def new_episode(integers: Any, row: Any, settings: Any) -> Any:
+    """Count a row's new episode, with no steps yet; return bits and step of the random numbers of its start."""
+    episode = integers[EPISODE_ROW, row] + 1
+    integers[STEPS_ROW, row], integers[OUTCOME_ROW, row], integers[EPISODE_ROW, row] = 0, 0, episode
+    return _row_key(settings, EPISODE_STREAM, row, episode)
 
 
 @inlined
