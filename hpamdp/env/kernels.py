@@ -51,25 +51,31 @@ def _sources() -> tuple[str]:
     return (digest.hexdigest(),)
 
 
+# What compiling and running have in common; division by 0 is as in NumPy. A wrapper to call a function from C, or from
+# Python, takes LLVM as long as the function itself.
+_OPTIONS: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+_PART_OPTIONS: Any = {**_OPTIONS, "no_cpython_wrapper": True}
+
+
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function at its first call and keep the machine code on disk; division by 0 is as in NumPy."""
+    """Compile a function at its first call and keep the machine code on disk."""
     try:
-        compiled: Any = njit(function, cache=True, error_model="numpy", nogil=True)
+        compiled: Any = njit(function, cache=True, **_OPTIONS)
     except RuntimeError:  # there is no folder for it
-        return njit(function, error_model="numpy", nogil=True)
+        return njit(function, **_OPTIONS)
     # Numba keeps the code for as long as the function's own file is unchanged, even if it calls functions of others.
     compiled._cache._cache_file._source_stamp = _sources()
     return compiled
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Compile a function that kernels call for many rows."""
-    return njit(function, error_model="numpy", nogil=True)
+    """Compile a function that kernels call for many rows; Python cannot call it."""
+    return njit(function, **_PART_OPTIONS)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function that kernels call for one row; inlined, since a loop with a call is not vectorised."""
-    return njit(function, error_model="numpy", nogil=True, forceinline=True)
+    return njit(function, forceinline=True, **_PART_OPTIONS)
 
 
 def folded(seed: int) -> int:
