@@ -29,7 +29,7 @@ from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import check_arguments, invalid_press, one_or_two
-from hpamdp.env.columns import where
+from hpamdp.env.columns import cloned, from_arrays, overwrite, where
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:
@@ -179,7 +179,7 @@ class BoatDockEnv(PAMDPEnv):
     @property
     def state(self) -> BoatState:
         """The boats as they are; assign a state to put them elsewhere (checkpoints do)."""
-        return self._columns if self._fleet is None else BoatState(*(column.clone() for column in self._state))
+        return self._columns if self._fleet is None else cloned(self._state)
 
     @state.setter
     def state(self, state: BoatState) -> None:
@@ -189,16 +189,13 @@ class BoatDockEnv(PAMDPEnv):
     @property
     def _state(self) -> BoatState:
         """The boats as they are; where the kernel moves them, the columns change with them."""
-        if self._fleet is None:
-            return self._columns
-        return BoatState(*(torch.from_numpy(column) for column in self._fleet.columns()))
+        return self._columns if self._fleet is None else from_arrays(BoatState, self._fleet.columns())
 
     def _put(self, state: BoatState) -> None:
         if self._fleet is None:
             self._columns = state
-            return
-        for column, new in zip(self._state, state, strict=True):
-            column.copy_(new)
+        else:
+            overwrite(self._state, state)
 
     @property
     def position(self) -> Tensor:
@@ -351,7 +348,7 @@ class BoatDockEnv(PAMDPEnv):
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
         """Return the pictures of one episode, in which the boat moves as it does in the task."""
-        from hpamdp.env.boatdock import film  # which draws, as few who sail do
+        from hpamdp.env.boatdock import film  # only films need it
 
         return film.film(track, fps, size)
 
@@ -531,7 +528,7 @@ class BoatDockEnv(PAMDPEnv):
 
 def _figures_of(recording: str, controller: str) -> dict[str, float]:
     """Return the means of a recording, of the episodes with this controller where it is fixed."""
-    from hpamdp.env.boatdock.play import episodes  # which few need
+    from hpamdp.env.boatdock.play import episodes  # only recordings need it
 
     of_controller = controller if controller in harbour.CONTROLLERS else None
     means = episodes.figures(episodes.read(Path(recording)), of_controller)

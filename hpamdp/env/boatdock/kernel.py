@@ -464,7 +464,7 @@ def advance(
         for reading in range(len(observations)):
             if reading == 1:
                 _mark_over(count, numbers)
-            if reading == 1 or mode >= RESTART or mode == PRESS_OR_RESTART:
+            if reading == 1 or mode in (RESTART, PRESS_OR_RESTART):
                 _restart(first, count, scratch, numbers, settings)
             _observe(first, count, scratch, numbers, settings, observations[reading])
             _report(first, count, scratch, numbers, outcomes[reading], fuel[reading], flags[reading])
