@@ -314,10 +314,15 @@ def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
 
 
 def better_option(plans: Plan | OptionPlans) -> Tensor:
-    """Return the option with the highest score, the first one of equals, int64 `[N]`; plans `[N, num_options]`."""
-    return plans.score.argmax(1)
+    """Return the option with the highest score, the first one of equals, int64 `[N]`; plans `[N, num_options]`.
+
+    An option that begins with a press of 0 s, to change boats then, is as good as the change at once; it loses, since
+    whoever asks again before the next press would idle for ever.
+    """
+    return (plans.score - _IDLE * (plans.durations[..., 0] == 0.0)).argmax(1)
 
 
+_IDLE = 1e-3  # of score
 _Direction = tuple[float, float]
 _Press = tuple[int, int]  # the number of a kind of boat, and of one of its directions
 

@@ -187,7 +187,7 @@ def _write_labels(canvas: Canvas, scene: Scene) -> None:
 
 def fuel_at_press(before: BoatState, after: BoatState, switch_cost: float | None) -> Tensor:
     """Return the fuel (s) with which the press between two states of one boat began: a change of boats comes first."""
-    if switch_cost is None or int(before.controller) in (harbour.NOT_CHOSEN, int(after.controller)):
+    if switch_cost is None or before.controller.item() in (harbour.NOT_CHOSEN, after.controller.item()):
         return before.fuel
     return (before.fuel - switch_cost).clip(0.0)
 
