@@ -275,7 +275,11 @@ def test_selectors_that_end_options_train_with_changes_of_boats(high, tmp_path):
     config = read(compose_config([*words, "total_frames=32", "eval.layouts=4", "low.minibatch_size=16"]))
     parts = assemble(config, tmp_path)
     means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
-    assert means["ceiling"] >= means["score"] and "human_normalised" in means
+    assert (
+        means["option_changes"] <= means["steps"] - 1.0
+        and means["ceiling"] >= means["score"]
+        and "human_normalised" in means
+    )
 
 
 def test_other_boats_are_not_compared_with_people():
@@ -300,3 +304,13 @@ def test_the_maps_of_other_boats_are_those_that_their_directions_share():
     assert len(BoatDockEnv(1, boats=THREE).symmetries) == 6
     assert len(BoatDockEnv(1, boats=["congruent", "incongruent2"]).symmetries) == 12
     assert len(BoatDockEnv(1, boats=["congruent", "sideways"], controllers=SIDEWAYS).symmetries) == 2
+
+
+def test_the_changes_of_boats_in_an_evaluation_are_counted(tmp_path):
+    words = ["high=uniform", "low=random", "env.switch_cost=0.2", "agent.termination=steps", "agent.option_length=1"]
+    parts = assemble(read(compose_config([*words, "num_envs=4", "eval.layouts=300"])), tmp_path)
+    played = parts.evaluation.run(parts.agent.policy)
+    assert (played["option_changes"][played["steps"] == 1] == 0).all()
+    later = played["steps"] > 1
+    shares = played["option_changes"][later] / (played["steps"][later] - 1)
+    assert shares.mean() == pytest.approx(0.5, abs=0.1)

@@ -122,6 +122,7 @@ class BoatDockEnv(PAMDPEnv):
         Metric("time_limit", "time limit", "share"),
         Metric("steps", "presses an episode", "count"),
         Metric("option_congruent", "congruent boat", "share"),
+        Metric("option_changes", "changes of boats an episode", "count"),
         Metric("oracle_agreement", "oracle's choice", "share"),
         Metric("optimality_gap", "gap to the ceiling"),
     )
