@@ -66,9 +66,7 @@ class MemberNet(nn.Module):
             nn.init.zeros_(layer.bias)
         self.layers = nn.ModuleList(layers)
 
-    def forward(
-        self, x: Tensor, precision: torch.dtype = torch.float32, output_map: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, x: Tensor, precision: torch.dtype = torch.float32, output_map: Tensor | None = None) -> Tensor:
         """Apply each member to its own slice of `x`.
 
         Args:
@@ -492,7 +490,6 @@ class PETSPolicy(TensorDictModuleBase):
             return total.mean(0) if is_mean else total.flatten(0, 1)
 
         return returns
-
 
     def _returns_of_single_members(self, state: Tensor) -> Returns:
         """Return what maps sequences to the returns that a single member expects, from states `[N, observation_dim]`.
