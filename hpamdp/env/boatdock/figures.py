@@ -187,9 +187,11 @@ def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequenc
     optimum = evaluation["optimum"]
     is_best = optimum == optimum.max(1, keepdims=True)
     for boat, name in enumerate(names):
+        chosen: dict[str, Any] = {"label": name, "linewidth": 2.0, "marker": "o", "markersize": 5}
+        best: dict[str, Any] = {"linewidth": 1.1, "linestyle": "--"}
         for weights, line in (
-            (evaluation["option"] == boat, {"label": name, "linewidth": 2.0, "marker": "o", "markersize": 5}),
-            (is_best[:, boat] / is_best.sum(1), {"linewidth": 1.1, "linestyle": "--"}),
+            (evaluation["option"] == boat, chosen),
+            (is_best[:, boat] / is_best.sum(1), best),
         ):
             share = np.bincount(bins, weights=weights, minlength=len(centres))[filled] / num[filled]
             axes.plot(centres[filled], share, color=f"C{boat}", **line)
