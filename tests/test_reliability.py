@@ -139,7 +139,7 @@ def started(folder: Path, *words: str, output: IO[str] | int, start: Callable[..
     endless = ["total_frames=100000000", "log_every=32", "eval.every=0", f"hydra.run.dir={folder}"]
     process = start(folder.parent, [*endless, *words], output)
     metrics = folder / "metrics.csv"
-    for _ in range(1200):
+    for _ in range(4800):
         if metrics.is_file() and len(metrics.read_text().splitlines()) > 3:
             return process
         time.sleep(0.05)

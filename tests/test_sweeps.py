@@ -248,7 +248,8 @@ def test_a_search_maximises_the_score_skips_finished_trials_and_survives_failed_
         if len(tried) == 2:
             raise ZeroDivisionError("a bug")
         OmegaConf.save(OmegaConf.create(read(cfg).to_dict()), folder / "config.yaml")
-        (folder / "summary.json").write_text(json.dumps({"score": cfg.low.clip, "frames": cfg.total_frames}))
+        summary = {"score": cfg.low.clip, "frames": cfg.total_frames, "finished": True}
+        (folder / "summary.json").write_text(json.dumps(summary))
 
     monkeypatch.setattr(train, "run", run)
     words = ["search=hppo", "hydra.sweep.dir=sweep"]
