@@ -19,7 +19,6 @@ PLAYERS = {
     "catch_point": ["agents/hppo_catch_point"],
     "hard_move": ["agents/hppo_hard_move_4"],
     "moving": ["env=moving", "high=none", "low=planner"],
-    "sliding": ["env=sliding", "high=none", "low=planner"],
     "rooms": ["agents/meta_critic_hppo_rooms"],
 }
 
