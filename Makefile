@@ -40,7 +40,7 @@ slow:
 # All slow tests, and those quick ones on sweeps that need a launcher. Those of the page of `make play` in a browser skip
 # where there is no Chromium; on Debian, `apt-get install chromium` brings one.
 slow-tests: $(SLOW)/.installed
-	$(SLOW)/bin/python -m pytest -m slow -k 'not ($(RAY_TEST))' $(ARGS)
+	$(SLOW)/bin/python -m pytest -n 2 --dist worksteal -m slow -k 'not ($(RAY_TEST))' $(ARGS)
 	$(SLOW)/bin/python -m pytest tests/test_sweeps.py -k 'not missing_launcher' $(ARGS)
 
 ray-launcher: $(RAY)/.installed

@@ -58,8 +58,6 @@ _MOST_COMPLAINTS = 3
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
 # Entries of a group that are not options of its class.
 _NO_OPTIONS = {"low": ("budget", "checkpoint", "freeze", "per_option"), "env": ("options",)}
-# Options whose names have changed since a config may have been saved: old name to new.
-_RENAMED = {"compile_physics": "compile_rules"}
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
 
@@ -423,21 +421,11 @@ def compose_saved(saved: Mapping[str, Any]) -> tuple[DictConfig, dict[str, str]]
     """
     choices = {group: saved[group]["name"] for group in GROUPS}
     today = _compose([f"{group}={name}" for group, name in choices.items()])
-    values = {**saved, "agent": _with_termination(saved["agent"])}
+    values = dict(saved)
     for group in GROUPS:
-        options = {_RENAMED.get(name, name): value for name, value in saved[group].items() if name != "name"}
+        options = {name: value for name, value in saved[group].items() if name != "name"}
         values[group] = {**{str(key): value for key, value in today[group].items()}, **options}
     return OmegaConf.create(values), choices
-
-
-def _with_termination(agent: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `agent` as it is set today; `option_length` used to say all by itself where options end."""
-    length = agent.get("option_length")
-    if "termination" in agent:
-        return dict(agent)
-    if isinstance(length, str):
-        return {**agent, "termination": length, "option_length": None}
-    return {**agent, "termination": "steps"}
 
 
 def _compose(overrides: list[str]) -> DictConfig:

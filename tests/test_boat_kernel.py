@@ -27,13 +27,23 @@ SETTINGS = {
     "sensor_noise": st.sampled_from([0.0, 3.0]),
     "slip": st.sampled_from([0.0, 0.3, 1.0]),
 }
+SIDEWAYS = {"sideways": [0.0, 100.0, 215.0]}
+# Other boats, and changes between boats.
+BOAT_SETTINGS = [
+    {"boats": ["congruent", "incongruent1", "incongruent2"]},
+    {"boats": ["congruent", "sideways", "incongruent2"], "controllers": SIDEWAYS, "controller": "random"},
+    {"boats": ["congruent", "sideways"], "controllers": SIDEWAYS, "controller": "sideways"},
+    {"switch_cost": 0.3},
+    {"switch_cost": 0.0, "keymap": "random"},
+    {"boats": ["sideways", "incongruent1", "congruent"], "controllers": SIDEWAYS, "switch_cost": 1.5},
+]
 
 
-def random_action(num_envs: int, generator: torch.Generator) -> dict:
+def random_action(num_envs: int, generator: torch.Generator, num_boats: int = 2) -> dict:
     """Return presses of which many are short, so that episodes last, and some are out of their bounds."""
     durations = 2.4 * torch.rand(num_envs, 3, generator=generator).pow(3) - 0.05
     return {
-        keys.OPTION: torch.randint(2, (num_envs,), generator=generator),
+        keys.OPTION: torch.randint(num_boats, (num_envs,), generator=generator),
         keys.DISCRETE: torch.randint(3, (num_envs,), generator=generator),
         keys.PARAMETERS: durations,
     }
@@ -64,7 +74,7 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
     generator = torch.Generator().manual_seed(seed)
     outcomes, num_different = set(), 0
     for _ in range(num_steps):
-        action = random_action(num_envs, generator)
+        action = random_action(num_envs, generator, len(env.option_names))
         before = env.state
         chosen = action[keys.OPTION] if env.has_choice else before.controller
         moved, reward, _ = episode.step(before, chosen, action[keys.DISCRETE], action[keys.PARAMETERS], *arguments)
@@ -78,7 +88,7 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
         reading = episode.read(moved, *arguments)
         for name in ("observation", "fuel", "done", "terminated", "truncated"):
             left, right = after[name][same].float(), getattr(reading, name)[same].float()
-            assert torch.allclose(left, right, atol=1e-3 if rules["observation"] == "pixels" else 3e-5), name
+            assert torch.allclose(left, right, atol=1e-3 if rules.get("observation") == "pixels" else 3e-5), name
         assert torch.allclose(after[keys.REWARD][same, 0], reward[same], atol=1e-5)
         # What starts anew is compared from the same state, too.
         done = after[keys.DONE][:, 0]
@@ -89,7 +99,7 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
         compare(env.state, fresh, same)
         again = episode.read(fresh, *arguments).observation
         assert torch.allclose(
-            root["observation"][same], again[same], atol=1e-3 if rules["observation"] == "pixels" else 3e-5
+            root["observation"][same], again[same], atol=1e-3 if rules.get("observation") == "pixels" else 3e-5
         )
         outcomes |= set(after[keys.OUTCOME].tolist())
         td = root
@@ -101,6 +111,14 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
 def test_the_kernel_does_what_the_tensor_functions_do_with_all_settings(seed, is_evaluation, rules):
     _, num_different = play(300, 6, seed, is_evaluation, **rules)
     assert num_different <= 1
+
+
+@pytest.mark.parametrize("rules", BOAT_SETTINGS, ids=str)
+def test_the_kernel_does_what_the_tensor_functions_do_with_other_boats_and_changes(rules):
+    noise = len(rules.get("boats", "ab")) * [0.1]
+    for seed, disturbed in enumerate(({}, {"motor_noise": [*noise[:-1], 0.3], "slip": 0.2, "sensor_noise": 2.0})):
+        _, num_different = play(300, 6, seed, **rules, **disturbed)
+        assert num_different <= 1
 
 
 @pytest.mark.parametrize("num_envs", [1, 127, 128, 129])

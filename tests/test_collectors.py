@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 
 import pytest
 import torch
@@ -104,6 +105,17 @@ def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
         pending = {name: value for name, value in now.items() if name.endswith("pending")}
         assert_same_state(now, {**theirs, **pending})
     assert collection.cpu_s > 0.0
+
+
+def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
+    listed = subprocess.run(["ps", "-eo", "pid=,ppid=,ni="], capture_output=True, text=True, check=True).stdout
+    rows = [tuple(map(int, line.split())) for line in listed.splitlines() if line.split()[2] != "-"]
+    niceness, family = set(), {os.getpid()}
+    for _ in range(3):  # actors are grandchildren
+        found = [(pid, nice) for pid, parent, nice in rows if parent in family]
+        family |= {pid for pid, _ in found}
+        niceness |= {nice for _, nice in found}
+    assert niceness == {os.getpriority(os.PRIO_PROCESS, 0)}
 
 
 @pytest.mark.parametrize("low", TRAINED)
@@ -228,21 +240,25 @@ def test_a_terminals_ctrl_c_stops_all_processes_and_the_run_goes_on_in_one(colle
     # A session of its own is what a terminal gives: the signal goes to all of its processes.
     process = subprocess.Popen([*command, "log_every=32", folder], start_new_session=True, cwd=tmp_path)
     metrics = tmp_path / "run/metrics.csv"
-    for _ in range(1200):
-        if metrics.is_file() and len(metrics.read_text().splitlines()) > 3:
-            break
-        time.sleep(0.1)
-    os.killpg(process.pid, signal.SIGINT)
-    assert process.wait(60) == 130
-    for _ in range(50):
-        if not processes_of(process.pid):
-            break
-        time.sleep(0.1)
-    assert not processes_of(process.pid)
+    try:
+        wait_until(lambda: metrics.is_file() and len(metrics.read_text().splitlines()) > 3, seconds=240)
+        os.killpg(process.pid, signal.SIGINT)
+        assert process.wait(120) == 130
+        wait_until(lambda: not processes_of(process.pid), seconds=10)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
     frames = len(metrics.read_text().splitlines())
     more = checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] + 32
     overrides = [f"resume={tmp_path / 'run'}", "collector=single", f"total_frames={more}"]
     assert run(compose_config(overrides), tmp_path / "resumed", overrides) == 0 and frames > 3
+
+
+def wait_until(condition, seconds):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
 
 
 def processes_of(session):

@@ -176,25 +176,6 @@ def test_a_saved_config_has_names_instead_of_modules_and_is_read_back_the_same(w
     assert read(*compose_saved(saved)) == config
 
 
-def test_a_config_that_was_saved_before_an_option_was_renamed_is_read():
-    config = make_config([])
-    saved = config.to_dict()
-    saved["env"]["compile_physics"] = saved["env"].pop("compile_rules")
-    assert read(*compose_saved(saved)) == config
-
-
-@pytest.mark.parametrize(
-    ("saved_length", "termination"), [("episode", "episode"), ("learned", "learned"), (3, "steps")]
-)
-def test_a_config_that_was_saved_when_a_length_alone_said_where_options_end_is_read(saved_length, termination):
-    saved = make_config([]).to_dict()
-    del saved["agent"]["termination"]
-    saved["agent"]["option_length"] = saved_length
-    agent = read(*compose_saved(saved)).run.agent
-    assert agent.termination == termination
-    assert agent.option_length == (3 if termination == "steps" else None)
-
-
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [

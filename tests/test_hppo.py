@@ -18,13 +18,27 @@ OPTIONS = dict(
     initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
     max_scale=1.0, epochs=4, minibatch_size=256, clip=0.2, gamma=0.9, gae_lambda=0.8, lr=3e-3, lr_final=3e-4,
     critic_weight=0.5, discrete_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_frames=40_000,
-    max_grad_norm=1.0,
+    max_grad_norm=1.0, greedy_discrete="most_probable",
 )  # fmt: skip
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> HPPO:
     torch.manual_seed(0)
     return HPPO(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+
+
+@pytest.mark.parametrize("greedy_discrete", ["most_probable", "sampled"])
+def test_the_greedy_policy_takes_mean_parameters_and_one_discrete_action_or_samples_it(greedy_discrete):
+    learner = make(greedy_discrete=greedy_discrete)
+    td = TensorDict({keys.OBSERVATION: torch.zeros(300, 4)}, [300])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        acted = learner.policy(td)
+    taken = acted[keys.DISCRETE].bincount(minlength=3) / 300
+    probabilities = learner.actor(td[keys.OBSERVATION]).discrete_log_probs[0].exp()
+    expected = probabilities if greedy_discrete == "sampled" else torch.eye(3)[probabilities.argmax()]
+    torch.testing.assert_close(taken, expected, atol=0.1, rtol=0.0)
+    assert (acted[RAW] == acted[RAW][0]).all()
+    assert (learner.portable() is None) == (greedy_discrete == "sampled")
 
 
 def one_step_rows(learner: HPPO, num: int) -> TensorDict:

@@ -18,11 +18,12 @@ BOAT = PAMDPSpecs.from_env(BoatDockEnv(1, controller="congruent"))
 
 SEARCH = dict(
     horizon=2, max_sequences=16, num_kept=3, num_samples=16, num_elites=4, num_iterations=3, temperature=0.1,
-    min_deviation=0.02,
+    first_min_deviation=0.2, min_deviation=0.02,
 )  # fmt: skip
 OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False, lr=2e-3,
-    weight_decay=0.1, transition_weight=2.0, warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
+    weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0, warmup_frames=64, updates_per_frame=2.0,
+    batch_size=32, buffer_size=4000,
     parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
@@ -80,14 +81,71 @@ def test_sequences_that_begin_alike_share_their_first_steps_parameters():
 
     def returns(steps):
         seen.append(steps)
-        return torch.rand(4, 9, 16) if len(seen) == 1 else torch.rand(4, 3, 16)
+        return torch.rand(4, steps[-1].discrete.shape[1], 16)
 
     SequenceSearch(SPECS.parameter_dims, **SEARCH)(returns, 4, CPU)
-    assert [[tuple(step.own.shape[:3]) for step in steps] for steps in seen] == [
-        [(4, 3, 16), (4, 9, 16)],
-        [(4, 3, 16), (4, 3, 16)],
-        [(4, 3, 16), (4, 3, 16)],
-    ]
+    assert [tuple(step.own.shape[:3]) for step in seen[0]] == [(4, 3, 16), (4, 9, 16)]
+
+
+def test_half_as_many_sequences_are_refined_in_each_iteration_those_with_the_best_samples():
+    seen = []
+
+    def returns(steps):
+        discrete, unit = whole(steps)
+        seen.append(discrete)
+        return (3.0 * discrete[..., 0] + discrete[..., 1]).unsqueeze(-1).expand(unit.shape[:3]).float()
+
+    options = {**SEARCH, "num_kept": 5, "num_iterations": 5}
+    SequenceSearch((1, 1, 1), **options)(returns, 2, CPU)
+    best = [[2, 2], [2, 1], [2, 0], [1, 2], [1, 1]]
+    assert [discrete[0].tolist() for discrete in seen[1:]] == [best, best[:2], best[:1], best[:1]]
+
+
+def test_the_plan_is_the_best_sample_of_all_iterations():
+    seen = []
+
+    def returns(steps):
+        unit = whole(steps)[1]
+        seen.append((unit[..., 0, 0].flatten(1), -(unit[..., 0, 0] - 0.3).abs().flatten(1)))
+        return seen[-1][1].unsqueeze(1)
+
+    found = SequenceSearch((1,), **{**SEARCH, "horizon": 1})(returns, 30, CPU)
+    unit, value = (torch.cat(part, -1) for part in zip(*seen, strict=True))
+    torch.testing.assert_close(found.value, value.amax(-1))
+    torch.testing.assert_close(found.own, unit.take_along_dim(value.argmax(-1, keepdim=True), -1))
+
+
+def test_the_smallest_deviation_falls_from_iteration_to_iteration():
+    spread = []
+
+    def returns(steps):
+        unit = whole(steps)[1]
+        spread.append(unit[..., 0, 0].std().item())
+        return -unit[..., 0, 0].square()
+
+    options = {**SEARCH, "num_iterations": 4, "num_samples": 256, "first_min_deviation": 0.2, "min_deviation": 0.05}
+    SequenceSearch((1,), **options)(returns, 20, CPU)
+    assert [round(value, 2) for value in spread[1:]] == [0.2, 0.1, 0.05]
+
+
+def test_a_smallest_deviation_that_rises_is_refused():
+    with pytest.raises(ValueError, match=r"min_deviation=0.3, but must be at most first_min_deviation=0.2"):
+        make(min_deviation=0.3)
+
+
+def test_a_rougher_estimate_may_choose_what_is_refined():
+    def rough(steps):
+        discrete, unit = whole(steps)
+        return (discrete[..., 0] == 2).float().unsqueeze(-1).expand(unit.shape[:3])
+
+    def exact(steps):
+        discrete, unit = whole(steps)
+        return -unit[..., 0, 0].square() - (discrete[..., 0] == 2).float().unsqueeze(-1)
+
+    search = SequenceSearch((1, 1, 1), **{**SEARCH, "num_iterations": 4})
+    found = search(exact, 10, CPU, first_returns=rough)
+    assert (found.discrete == 2).all() and (found.value < -0.9).all()
+    assert (SequenceSearch((1, 1, 1), **SEARCH)(exact, 10, CPU).discrete != 2).all()
 
 
 def test_samples_are_spread_evenly():
@@ -144,7 +202,7 @@ def test_what_an_action_has_no_parameter_for_is_0_in_every_sample():
     for discrete, unit in seen:
         has_none = torch.arange(2) >= dims[discrete].unsqueeze(-1)
         assert (unit.abs().amax(2)[has_none] == 0).all() and (unit.abs().amax(2)[~has_none] > 0).all()
-    assert [discrete.shape[1] for discrete, _ in seen] == [9, 3, 3]
+    assert [discrete.shape[1] for discrete, _ in seen] == [9, 3, 1]
 
 
 def test_actions_without_any_parameters_can_be_searched():
@@ -307,6 +365,15 @@ def acting(learner: PETS, td: TensorDict) -> TensorDict:
     return learner.policy(td)
 
 
+def test_the_weight_decay_falls_with_the_number_of_steps():
+    learner = make(weight_decay=0.8, weight_decay_frames=100, updates_per_frame=0.01)
+    decays = []
+    for num in (80, 120, 200):
+        learn(learner, random_batch(num))
+        decays.append(learner.optimizers["model"].param_groups[0]["weight_decay"])
+    assert decays == pytest.approx([0.8, 0.4, 0.2])
+
+
 def test_an_environment_follows_one_member_until_its_episode_ends():
     env = with_decisions(BoatDockEnv(40, controller="congruent"))
     learner = make(BOAT, num_members=5)
@@ -344,6 +411,26 @@ def test_exploring_plans_with_the_environments_own_member_and_greedy_ones_with_a
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acting(learner, td.clone())
     assert torch.equal(asked[0], member) and asked[1] is None
+
+
+@pytest.mark.parametrize("num_states", [1, 7, 10])
+def test_in_greedy_plans_single_members_choose_the_sequences_that_all_refine(num_states):
+    learner = make(num_members=3)
+    rows = []
+    forward = learner.model.forward
+
+    def counted(state, *rest):
+        rows.append(state.shape[:2].numel())
+        return forward(state, *rest)
+
+    learner.model.forward = counted
+    found = learner.policy.plan(torch.randn(num_states, 4))
+    assert [len(part) for part in found] == [num_states] * 3
+    of_single = -(-num_states // 3) * 3
+    assert rows == [
+        *(of_single * num * 16 for num in (3, 9)),
+        *(num_states * 3 * num * 16 for num in (3, 3, 1, 1)),
+    ]
 
 
 def test_plans_with_own_members_come_back_in_the_order_of_the_states():

@@ -82,7 +82,36 @@ REFUSED = [
     ("high=uniform high._target_=torch.nn.Identity", "high=uniform: Identity is no Selector (hpamdp.policies.base)"),
     ("low._target_=collections.OrderedDict", " more like this"),
     ("agent=null", "agent=null: must be a mapping (conf/config.yaml)"),
-    ("env.motor_noise=[1]", "env.motor_noise=[1]: must be a valid number or must have at least 2 items (BoatDockEnv"),
+    ("env.motor_noise=[1]", "env: BoatDockEnv: motor_noise=[1.0], but must be one number or two (BoatDockEnv"),
+    # Boats.
+    (
+        "env.boats=[congruent,sideways]",
+        "env: BoatDockEnv: boats=['congruent', 'sideways'], but there is no controller sideways; controllers has "
+        "congruent, incongruent1, incongruent2 (BoatDockEnv, conf/env/boatdock.yaml)",
+    ),
+    ("env.boats=[congruent,congruent]", "but must be one or more different controllers"),
+    ("env.boats=[congruent]", "boats=['congruent']: nothing to choose; name more, or use controller=congruent"),
+    ("env.boats=congruent", 'env.boats="congruent": must be a valid list or must be null'),
+    ("env.controllers.sideways=[0,180]", "controllers.sideways=[0.0, 180.0], but must be 3 directions in degrees"),
+    ("env.controllers.sideways=[0,180,.inf]", "controllers.sideways=[0.0, 180.0, inf], but must be 3 directions"),
+    ("env.controllers.congruent=[0,120,240]", "but congruent has [150.0, 270.0, 30.0]; take another name"),
+    ("env.controllers.random=[0,120,240]", "but random is no name for a controller; take another one"),
+    ("env.boats=[congruent,incongruent1] env.keymap=2", "keymap=2: the controllers in boats="),
+    (
+        "env.boats=[congruent,incongruent1] env.controller=incongruent high=none",
+        "controller='incongruent', but must be one of choose, congruent, incongruent1, random",
+    ),
+    ("env.boats=[congruent,incongruent1] env.motor_noise=[0,0,1]", "motor_noise=[0.0, 0.0, 1.0], but must be one "),
+    ("env.boats=[congruent,incongruent1] high=human", "people kept one of their two boats; leave it out, or leave "),
+    ("env.switch_cost=7", "switch_cost=7.0, but must lie between 0 and 6 seconds of fuel"),
+    ("env.switch_cost=0.2 env.controller=random high=none", "switch_cost=0.2: controller=random never changes boats"),
+    ("env.switch_cost=0.2 high=human", "switch_cost=0.2: people kept one of their two boats"),
+    ("env.switch_cost=0.2 agent.termination=steps agent.option_length=1", "high=ucb is a bandit, which counts what "),
+    (
+        "high=meta_critic agent.termination=steps agent.option_length=1",
+        "agent.termination=steps: env=boatdock keeps an option for an episode; use agent.termination=episode or "
+        "env.switch_cost=0.2",
+    ),
     ("low=hppo low.critic_hidden_dims=[]", "low.critic_hidden_dims=[]: must have at least 1 item (HPPO"),
     ("env=boatdock_released high=none env.test_mode=2", "env.test_mode=2: must be 0, 1 or null (Released"),
     ("logger=wandb logger.project=''", 'logger.project="": must have at least 1 character (WandbLogger'),

@@ -45,8 +45,8 @@ DOMAINS = {
     "hard_move_6": (1_000_000, "success"),
     "hard_move_8": (1_000_000, "success"),
     "hard_move_10": (1_000_000, "success"),
-    "moving": (1_000_000, "score"),
-    "sliding": (1_000_000, "score"),
+    "moving": (3_000_000, "score"),
+    "sliding": (3_000_000, "score"),
 }
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_COMPARED = 3  # of both learners, for a probability of improvement

@@ -34,7 +34,7 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
     rows = read_rows(output_dir / "metrics.csv")
     evaluation = _read_evaluation(output_dir / "evaluation.npz")
     with mpl.rc_context(STYLE):
-        curves = _learning_curves(rows, summary, env.curve_metrics)
+        curves = _learning_curves(rows, summary, env.curves(summary))
         figures = {} if curves is None else {"learning_curves.png": curves}
         figures |= env.draw_figures(evaluation, summary)
         for name, figure in figures.items():

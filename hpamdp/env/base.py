@@ -66,7 +66,7 @@ class PAMDPEnv(EnvBase):
     option_names: tuple[str, ...] = ()
     discrete_names: tuple[str, ...] = ()  # of the discrete actions, where they have names
     option_actions: tuple[tuple[bool, ...], ...] | None = None  # what `group_actions` has made of the options
-    can_change_option: ClassVar[bool] = True  # whether an option may end before its episode
+    can_change_option: bool = True  # whether an option may end before its episode
     parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
@@ -78,6 +78,8 @@ class PAMDPEnv(EnvBase):
     # Settings that leave the choice of an option to the agent and that take it away, to name in an error.
     choice_setting: ClassVar[str] = ""
     no_choice_setting: ClassVar[str] = ""
+    # A setting with which an option may end before its episode, where others forbid it.
+    change_setting: ClassVar[str] = ""
 
     # Rows of the closing table, and panels of the learning curves.
     table_metrics: ClassVar[tuple[Metric, ...]] = (
@@ -242,6 +244,11 @@ class PAMDPEnv(EnvBase):
     def summary_entries(self) -> dict[str, Any]:
         """Return JSON values that a run's summary shows of the problem."""
         return {}
+
+    @classmethod
+    def curves(cls, summary: Mapping[str, Any]) -> tuple[Metric, ...]:
+        """Return the panels of the learning curves of a run with this summary: `curve_metrics` by default."""
+        return cls.curve_metrics
 
     @classmethod
     def draw_figures(cls, evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Protocol, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -34,6 +35,22 @@ def where(mask: Tensor, new: State, old: State) -> State:
 def replaced(state: State, **columns: Tensor) -> State:
     """Return the state with other columns in the place of those of the same names."""
     return type(state)(*{**state._asdict(), **columns}.values())
+
+
+def from_arrays(kind: type[State], arrays: Iterable[np.ndarray]) -> State:
+    """Return a state whose columns share the memory of the arrays, `[N]` each."""
+    return kind(*(torch.from_numpy(array) for array in arrays))
+
+
+def cloned(state: State) -> State:
+    """Return a copy of the state."""
+    return type(state)(*(column.clone() for column in state))
+
+
+def overwrite(state: State, new: State) -> None:
+    """Copy the values of another state into the columns of this one."""
+    for column, values in zip(state, new, strict=True):
+        column.copy_(values)
 
 
 def restored(saved: Mapping[str, Tensor], current: State, owner: str) -> State:

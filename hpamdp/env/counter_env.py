@@ -23,7 +23,7 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.columns import Columns, replaced, restored, where
+from hpamdp.env.columns import Columns, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.rows import Advance, Results, Rows
 
@@ -155,16 +155,14 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         """The columns; where a kernel moves them, they change in place."""
         if self.rows is None:
             return self._columns
-        columns = (torch.from_numpy(column) for column in (*self.rows.floats, *self.rows.integers))
-        return type(self._columns)(*columns)
+        return from_arrays(type(self._columns), (*self.rows.floats, *self.rows.integers))
 
     @_state.setter
     def _state(self, state: EpisodeState) -> None:
         if self.rows is None:
             self._columns = state
-            return
-        for column, new in zip(self._state, state, strict=True):
-            column.copy_(new)
+        else:
+            overwrite(self._state, state)
 
     @abstractmethod
     def start(self, episode: Tensor, rng: Key) -> EpisodeState:
@@ -221,8 +219,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     @property
     def state(self) -> EpisodeState:
         """The columns of the state, `[N]` each."""
-        state = self._state
-        return state if self.rows is None else type(state)(*(column.clone() for column in state))
+        return self._state if self.rows is None else cloned(self._state)
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

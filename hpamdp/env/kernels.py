@@ -51,25 +51,31 @@ def _sources() -> tuple[str]:
     return (digest.hexdigest(),)
 
 
+# What compiling and running have in common; division by 0 is as in NumPy. A wrapper to call a function from C, or from
+# Python, takes LLVM as long as the function itself.
+_OPTIONS: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+_PART_OPTIONS: Any = {**_OPTIONS, "no_cpython_wrapper": True}
+
+
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function at its first call and keep the machine code on disk; division by 0 is as in NumPy."""
+    """Compile a function at its first call and keep the machine code on disk."""
     try:
-        compiled: Any = njit(function, cache=True, error_model="numpy", nogil=True)
+        compiled: Any = njit(function, cache=True, **_OPTIONS)
     except RuntimeError:  # there is no folder for it
-        return njit(function, error_model="numpy", nogil=True)
+        return njit(function, **_OPTIONS)
     # Numba keeps the code for as long as the function's own file is unchanged, even if it calls functions of others.
     compiled._cache._cache_file._source_stamp = _sources()
     return compiled
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Compile a function that kernels call for many rows."""
-    return njit(function, error_model="numpy", nogil=True)
+    """Compile a function that kernels call for many rows; Python cannot call it."""
+    return njit(function, **_PART_OPTIONS)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function that kernels call for one row; inlined, since a loop with a call is not vectorised."""
-    return njit(function, error_model="numpy", nogil=True, forceinline=True)
+    return njit(function, forceinline=True, **_PART_OPTIONS)
 
 
 def folded(seed: int) -> int:
@@ -134,6 +140,9 @@ def sin_cos(angle: Any) -> Any:
 
 # What the kernels of all `CounterEnv`s share: the modes, the first places in their settings, and the last rows of their
 # integers.
+#
+# Each kernel states its loop over the rows itself. A factory that closes over the problem's functions would compile it
+# anew in every process: Numba's cache on disk never hits for closures over compiled functions.
 ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
 SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, OWN = range(6)
 STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1
@@ -157,7 +166,7 @@ def invalid_row(discrete: Any, parameters: Any, places: Any, integers: Any, mode
         if is_valid:
             for place in range(places[discrete[row]], places[discrete[row] + 1]):
                 is_valid &= math.isfinite(parameters[row, place])
-        if not is_valid and not (mode == ACT_OR_RESTART and integers[len(integers) + OUTCOME_ROW, row] != 0):
+        if not is_valid and not (mode == ACT_OR_RESTART and integers[OUTCOME_ROW, row] != 0):
             return row
     return -1
 
@@ -169,6 +178,27 @@ def parameter(parameters: Any, row: Any, number: Any, action: Any, places: Any, 
     if place >= places[action + 1]:
         return ZERO
     return min(max(parameters[row, place], bounds[0, place]), bounds[1, place])
+
+
+@inlined
+def _row_key(settings: Any, stream_place: Any, row: Any, episode: Any) -> Any:
+    stream = int32(settings[stream_place])
+    base = stream_key(settings[SEED], stream)
+    return episode_key(base, int32(settings[FIRST_ENV]) + row, episode), stream_step(stream)
+
+
+@inlined
+def noise_key(settings: Any, row: Any, episode: Any) -> Any:
+    """Return bits and step of the random numbers within an episode, which `uniform` and `normal` take."""
+    return _row_key(settings, NOISE_STREAM, row, episode)
+
+
+@inlined
+def new_episode(integers: Any, row: Any, settings: Any) -> Any:
+    """Count a row's new episode, with no steps yet; return bits and step of the random numbers of its start."""
+    episode = integers[EPISODE_ROW, row] + 1
+    integers[STEPS_ROW, row], integers[OUTCOME_ROW, row], integers[EPISODE_ROW, row] = 0, 0, episode
+    return _row_key(settings, EPISODE_STREAM, row, episode)
 
 
 @inlined

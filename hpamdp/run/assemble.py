@@ -321,7 +321,8 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
         raise ConfigError(f"high=none: {config.env} needs a selector; use another high{without}")
     if termination != "episode" and not (env.has_choice and env.can_change_option):
         why = "keeps an option for an episode" if env.has_choice else "has no options"
-        raise ConfigError(f"agent.termination={termination}: {config.env} {why}; use agent.termination=episode")
+        change = f" or {env.change_setting}" if env.has_choice and env.change_setting else ""
+        raise ConfigError(f"agent.termination={termination}: {config.env} {why}; use agent.termination=episode{change}")
     if freeze and not env.has_choice:
         raise ConfigError("low.freeze=true: there is no choice left to learn; use low.freeze=false")
     if freeze and termination != "episode":

@@ -59,6 +59,7 @@ class Evaluation:
 
             - `return`, `steps`, and `score`: the return, where the environment has no score of its own;
             - `option`: the first one of each episode, where the agent chooses;
+            - `option_changes`: how often the option changed in each episode, where options may end inside episodes;
             - `path` `[N, T + 1, 2]`, NaN past an episode's end, where the environment has positions;
             - what the environment's `describe` and `results` give.
         """
@@ -66,6 +67,7 @@ class Evaluation:
         td = self._reset()
         total = torch.zeros(td.batch_size, device=device)
         steps = torch.zeros(td.batch_size, dtype=torch.long, device=device)
+        changes = torch.zeros_like(steps)
         over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]
         self._film(states)
         # A policy that samples even when greedy (a random one) must not move the run's generators.
@@ -80,6 +82,8 @@ class Evaluation:
                 total += td.get(("next", keys.REWARD)).squeeze(-1)
                 steps += ~over
                 options.append(td.get(keys.OPTION, None))
+                if len(options) > 1 and options[0] is not None:
+                    changes += (options[-1] != options[-2]) & ~over
                 path.append(_unless(over, self.env.position))
                 self._film(states)
                 td = self.env.step_mdp(td)
@@ -89,6 +93,8 @@ class Evaluation:
         played: dict[str, Tensor] = {"return": total, "steps": steps, "score": total, **self.known}
         if options[0] is not None:
             played["option"] = options[0]
+            if keys.OPTION_ENDED in td.keys():
+                played["option_changes"] = changes
         if path[0] is not None:
             played["path"] = torch.stack(path, 1)
         played |= self.env.results(td)
@@ -117,13 +123,15 @@ class Evaluation:
 
         - `optimality_gap`: the environment's `ceiling` less the score.
 
+        Where options may end inside their episodes: `option_changes`, how often the option changed in an episode.
+
         Where the agent chooses options:
         - `score_NAME`: the score with the option NAME held;
         - `regret`: the score of each episode's best option, with the agent's own learners, less the score;
         - `choice_gain`: the score less that of the best single option;
         - `choice_entropy`: entropy of the options' shares (nats).
         """
-        names = [name for name in ("score", "success", "return", "steps") if name in played]
+        names = [name for name in ("score", "success", "return", "steps", "option_changes") if name in played]
         means = {name: float(played[name].mean()) for name in names} | self.env.measure(played)
         if "ceiling" in means:
             means["optimality_gap"] = means["ceiling"] - means["score"]

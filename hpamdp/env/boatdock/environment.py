@@ -6,13 +6,13 @@ human data. What a user gives and reads are screen px; the state inside is px fr
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
-from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
@@ -28,8 +28,8 @@ from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
-from hpamdp.env.boatdock.task import check_arguments, invalid_press, one_or_two
-from hpamdp.env.columns import where
+from hpamdp.env.boatdock.task import check_arguments, chosen_boats, invalid_press, noise_of_each
+from hpamdp.env.columns import cloned, from_arrays, overwrite, where
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 
     from hpamdp.env.boatdock.play.boat_page import BoatPage
 
-Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
-
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
+_MOST_SWAPPED = 4  # boats; of more, symmetries swap none
+
 _CONTROLLER_ENTRY = episode.OBSERVATION_NAMES.index("controller")
 # What a tensordict has whose next root holds nothing else.
 _PLAIN_KEYS = {
@@ -62,20 +62,26 @@ class BoatDockEnv(PAMDPEnv):
     - `("action", "discrete")` int64 `[N]` in {0, 1, 2}: the key to press;
     - `("action", "parameters")` float32 `[N, 3]`: how long to press each key, seconds in [0, 2], of which only the
       pressed key's counts; values outside are clipped, NaN and infinite ones refused;
-    - with `controller="choose"`, `option` int64 `[N]` (0 incongruent, 1 congruent): read at an episode's first press
-      and held until its end.
+    - with `controller="choose"`, `option` int64 `[N]` (0 incongruent, 1 congruent, or the number in `boats`): read at
+      an episode's first press and held until its end; with a `switch_cost`, read at every press.
 
     Args:
         num_envs: how many boats.
-        controller: `choose` (the agent picks), `congruent`, `incongruent`, or `random` (drawn for each episode).
+        controller: `choose` (the agent picks), `congruent`, `incongruent` or the name of one of the `boats`, or
+            `random` (drawn for each episode).
         keymap: of the incongruent boat: 1, 2 or `random`.
         reward: `paper` (progress, 5 x fuel fraction on success, -1 on failure) or `sparse` (the success term alone).
         observation: `scaled` to about [-1, 1] with goal - boat appended (`[N, 16]`), or the paper's `pixels`
             (`[N, 14]`).
-        motor_noise: standard deviation of the log of the executed duration; two of them: of the incongruent and of the
-            congruent boat.
+        motor_noise: standard deviation of the log of the executed duration; or a list, of the incongruent and of the
+            congruent boat, or of each of the `boats`.
         sensor_noise: standard deviation (px) of the observed positions.
         slip: probability that a uniformly random key is pressed.
+        boats: the names of the boats, of those in `controllers`; None: people's two, `incongruent` and `congruent`.
+        controllers: more controllers that `boats` may name, beside `congruent`, `incongruent1` and `incongruent2` (its
+            two key maps): for each key the direction in which it pushes, degrees, 0 to the right, 90 down.
+        switch_cost: seconds of fuel for changing the boat at a press, where the option is another one than before;
+            None: a boat is kept for the episode.
         recording: a file of `hpamdp play`, whose figures stand in tables and curves in place of people's.
         compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU, instead
             of using the kernel.
@@ -98,13 +104,13 @@ class BoatDockEnv(PAMDPEnv):
         RuntimeError: a step before the first reset, or before the one after `set_seed`.
     """
 
-    option_names = harbour.CONTROLLERS
-    can_change_option: ClassVar[bool] = False
+    option_names: tuple[str, ...] = harbour.CONTROLLERS
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
     result_keys = (keys.OUTCOME, episode.FUEL)
     reset_returns_all_rows = True
     choice_setting: ClassVar[str] = "env.controller=choose"
+    change_setting: ClassVar[str] = "env.switch_cost=0.2"
     no_choice_setting: ClassVar[str] = "env.controller=congruent, incongruent, random"
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
@@ -116,6 +122,7 @@ class BoatDockEnv(PAMDPEnv):
         Metric("time_limit", "time limit", "share"),
         Metric("steps", "presses an episode", "count"),
         Metric("option_congruent", "congruent boat", "share"),
+        Metric("option_changes", "changes of boats an episode", "count"),
         Metric("oracle_agreement", "oracle's choice", "share"),
         Metric("optimality_gap", "gap to the ceiling"),
     )
@@ -130,13 +137,16 @@ class BoatDockEnv(PAMDPEnv):
         self,
         num_envs: int = 1,
         *,
-        controller: Literal["choose", "congruent", "incongruent", "random"] = "choose",
+        controller: str = "choose",
         keymap: Literal[1, 2, "random"] = 1,
         reward: Literal["paper", "sparse"] = "paper",
         observation: Literal["scaled", "pixels"] = "scaled",
-        motor_noise: float | Pair = 0.0,
+        motor_noise: float | list[float] = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
+        boats: list[str] | None = None,
+        controllers: dict[str, list[float]] | None = None,
+        switch_cost: float | None = None,
         recording: str | None = None,
         compile_rules: bool = False,
         oracle: bool = False,
@@ -145,8 +155,14 @@ class BoatDockEnv(PAMDPEnv):
         seed: int = 0,
         first_env: int = 0,
     ) -> None:
-        rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
+        chosen = chosen_boats(boats, controllers)
+        noise = (noise_of_each(motor_noise, chosen), sensor_noise, slip)
+        rules = Rules(controller, keymap, reward, observation, *noise, chosen, switch_cost)
         check_arguments(num_envs, rules)
+        if human or recording is not None:
+            _check_people(rules, "human" if human else f"recording={recording}")
+        self.option_names = rules.names
+        self.can_change_option = switch_cost is not None
         self._played = None if recording is None else _figures_of(recording, controller)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
@@ -179,7 +195,7 @@ class BoatDockEnv(PAMDPEnv):
     @property
     def state(self) -> BoatState:
         """The boats as they are; assign a state to put them elsewhere (checkpoints do)."""
-        return self._columns if self._fleet is None else BoatState(*(column.clone() for column in self._state))
+        return self._columns if self._fleet is None else cloned(self._state)
 
     @state.setter
     def state(self, state: BoatState) -> None:
@@ -191,14 +207,13 @@ class BoatDockEnv(PAMDPEnv):
         """The boats as they are; where the kernel moves them, the columns change with them."""
         if self._fleet is None:
             return self._columns
-        return BoatState(*(torch.from_numpy(column) for column in self._fleet.columns()))
+        return from_arrays(BoatState, (*self._fleet.floats, *self._fleet.integers))
 
     def _put(self, state: BoatState) -> None:
         if self._fleet is None:
             self._columns = state
-            return
-        for column, new in zip(self._state, state, strict=True):
-            column.copy_(new)
+        else:
+            overwrite(self._state, state)
 
     @property
     def position(self) -> Tensor:
@@ -207,28 +222,25 @@ class BoatDockEnv(PAMDPEnv):
 
     @property
     def symmetries(self) -> Symmetries:
-        """The turns and mirrors of the plane that permute a boat's directions and, where both occur, swap the boats.
+        """The turns and mirrors of the plane that permute a boat's directions or swap boats that occur.
 
-        Six maps keep a boat, and six more swap it for the other, whose directions are the opposite ones. With a random
-        key map, which is not observed, only those remain that permute the keys of both key maps alike; with motor noise
-        that differs between the boats, those that keep the boat.
+        Of people's two boats, six maps keep each, and six more swap it for the other, whose directions are the opposite
+        ones. With a random key map, which is not observed, only those remain that permute the keys of both key maps
+        alike; with motor noise that differs between boats, those that keep them.
         """
         tables = self._directions()
-        plane = plane_maps(6)
-        flips = []  # for each map, whether every boat's directions become those of the other boat
-        discrete = []
-        for each in plane:
-            for is_swap in {False, len(tables) > 1}:
-                targets = tables[::-1] if is_swap else tables
-                rows = [_as_one_table(each, own, other) for own, other in zip(tables, targets, strict=True)]
-                found = [row for row in rows if row is not None]
-                if len(found) == len(rows) and not (is_swap and len(set(self.rules.motor_noise)) > 1):
-                    flips.append((each, is_swap))
-                    discrete.append(torch.stack(found))
-        kept = torch.stack([each for each, _ in flips])
+        found = []  # the map, which boats the boats become, and which keys their keys become
+        for each in plane_maps(6):
+            for order in self._orders(len(tables)):
+                rows = [_as_one_table(each, own, tables[other]) for own, other in zip(tables, order, strict=True)]
+                mapped = [row for row in rows if row is not None]
+                if len(mapped) == len(rows):
+                    found.append((each, order, torch.stack(mapped)))
+                    break
+        kept = torch.stack([each for each, _, _ in found])
         weight, offset = on_observations(kept, self._observation_dim, *self._vectors())
-        keys_after = torch.stack(discrete)
-        contexts = torch.stack([torch.tensor([1, 0] if is_swap else range(len(tables))) for _, is_swap in flips])
+        keys_after = torch.stack([mapped for _, _, mapped in found])
+        contexts = torch.tensor([order for _, order, _ in found])
         return make_symmetries(
             weight,
             offset=offset,
@@ -238,6 +250,13 @@ class BoatDockEnv(PAMDPEnv):
             context_entry=_CONTROLLER_ENTRY if len(tables) > 1 else None,
             num_parameters=harbour.NUM_KEYS,
         )
+
+    def _orders(self, num_boats: int) -> list[tuple[int, ...]]:
+        """Return which boats the boats may become under a map: with the same noise, and few enough to try them all."""
+        orders = itertools.permutations(range(num_boats)) if num_boats <= _MOST_SWAPPED else [range(num_boats)]
+        noise = self.rules.motor_noise
+        allowed = [tuple(order) for order in orders]
+        return [order for order in allowed if num_boats == 1 or [noise[boat] for boat in order] == list(noise)]
 
     @property
     def geometry(self) -> PlaneGeometry:
@@ -265,6 +284,11 @@ class BoatDockEnv(PAMDPEnv):
 
     def _directions(self) -> list[list[Tensor]]:
         """Return for each boat that occurs the possible tables of its keys' directions, float64 `[3, 2]`."""
+        boats = self.rules.boats
+        if boats is not None:
+            each_boat = [[table] for table in torch.tensor(boats.directions, dtype=torch.float64)]
+            is_fixed = self.rules.controller in boats.names
+            return [each_boat[boats.names.index(self.rules.controller)]] if is_fixed else each_boat
         maps = (1, 2) if self.rules.keymap == "random" else (self.rules.keymap,)
         table = torch.tensor(harbour.DIRECTIONS, dtype=torch.float64)
         both = [[table[number - 1] for number in maps], [table[2]]]
@@ -306,8 +330,9 @@ class BoatDockEnv(PAMDPEnv):
     def describe(self) -> dict[str, Tensor]:
         """Return the boats' layouts for evaluation, px from the harbour's centre.
 
-        `start`, `goal` `[N, 2]`, `bearing_offset` `[N]` (degrees) and `optimum` `[N, 2]`: the best possible score with
-        the incongruent and the congruent boat from a full tank; `controller` `[N]` where it is not chosen.
+        `start`, `goal` `[N, 2]`, `bearing_offset` `[N]` (degrees) and `optimum` `[N, num_boats]`: the best possible
+        score with each boat from a full tank, with a `switch_cost` of beginning with it; `controller` `[N]` where it is
+        not chosen.
         """
         state = self.state
         layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
@@ -315,13 +340,13 @@ class BoatDockEnv(PAMDPEnv):
             "start": torch.stack(layout[:2], -1),
             "goal": torch.stack(layout[2:], -1),
             "bearing_offset": harbour.bearing_offset(layout),
-            "optimum": planner.best_plans(layout, state.keymap).score,
+            "optimum": planner.best_scores(self.rules, layout, state.keymap),
         }
         return known if self.has_choice else {**known, "controller": state.controller}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of `measure_boats`."""
-        return measure_boats(played, self._controller_of_run)
+        return measure_boats(played, self._controller_of_run, self.rules)
 
     @property
     def _controller_of_run(self) -> str:
@@ -329,18 +354,29 @@ class BoatDockEnv(PAMDPEnv):
         return "chosen" if self.has_choice else self.rules.controller
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the figures of people, of the best of them, or of a recording, and of the ceiling on these layouts."""
+        """Return the figures of the ceiling and, with people's two boats, of people and the best, or of a recording."""
         ceiling = {**super().references(measured)["ceiling"], "success": 1.0}
-        ceiling["human_normalised"] = human_normalised(ceiling["score"], self._controller_of_run)
         if self.has_choice:
             ceiling["oracle_agreement"] = 1.0
+        if self.rules.boats is not None:
+            return {"ceiling": ceiling}
+        ceiling["human_normalised"] = human_normalised(ceiling["score"], self._controller_of_run)
         if self._played is not None:
             return {"you": self._played, "ceiling": ceiling}
         return {**human_references(self._controller_of_run), "ceiling": ceiling}
 
-    def summary_entries(self) -> dict[str, str]:
-        """Return which `controller` the boats have, `chosen` where the agent chooses."""
-        return {"controller": self._controller_of_run}
+    def summary_entries(self) -> dict[str, Any]:
+        """Return which `controller` the boats have, `chosen` where the agent chooses, and the `boats`, if set."""
+        entries = {"controller": self._controller_of_run}
+        return entries if self.rules.boats is None else {**entries, "boats": list(self.rules.names)}
+
+    @classmethod
+    def curves(cls, summary: Mapping[str, Any]) -> tuple[Metric, ...]:
+        """Return the panels of the learning curves: where there are `boats`, with the share of each."""
+        if not summary.get("boats"):
+            return cls.curve_metrics
+        shares = (Metric(f"option_{name}", f"{name} chosen", "share") for name in summary["boats"])
+        return (*(metric for metric in cls.curve_metrics if not metric.name.startswith("option_")), *shares)
 
     @classmethod
     def draw_figures(cls, evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
@@ -351,9 +387,9 @@ class BoatDockEnv(PAMDPEnv):
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
         """Return the pictures of one episode, in which the boat moves as it does in the task."""
-        from hpamdp.env.boatdock import film  # which draws, as few who sail do
+        from hpamdp.env.boatdock import film  # only films need it
 
-        return film.film(track, fps, size)
+        return film.film(track, fps, size, self.rules)
 
     def page(self, seed: int) -> BoatPage:
         """Return the page on which people dock boats."""
@@ -428,7 +464,7 @@ class BoatDockEnv(PAMDPEnv):
     def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
         """Check a user's layout and return the state's columns that it sets."""
         arrays = {name: given.get(name).cpu().numpy() for name in _LAYOUT_KEYS & set(given.keys())}
-        columns = layout_columns(arrays, self.num_envs, has_choice=self.has_choice)
+        columns = layout_columns(arrays, self.num_envs, self.rules)
         return {name: torch.from_numpy(column).to(self.device) for name, column in columns.items()}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -442,7 +478,7 @@ class BoatDockEnv(PAMDPEnv):
             self._columns, chosen, key, durations, self._seed, self._environment, self.rules
         )
         if not is_action.all():
-            raise _invalid(int((~is_action).nonzero()[0]), key, durations, chosen)
+            raise self._invalid(int((~is_action).nonzero()[0]), key, durations, chosen)
         if mask is not None:
             state, reward = where(mask, state, self._columns), torch.where(mask, reward, 0.0)
         self._columns = state
@@ -490,8 +526,12 @@ class BoatDockEnv(PAMDPEnv):
             restarts=restarts,
         )
         if isinstance(result, int):
-            raise _invalid(result, key, durations, self._state.controller if option is None else option)
+            raise self._invalid(result, key, durations, self._state.controller if option is None else option)
         return result
+
+    def _invalid(self, row: int, key: Tensor, durations: Tensor, option: Tensor) -> ValueError:
+        values = option[row].item(), key[row].item(), durations[row].tolist()
+        return invalid_press(row, *values, len(self.option_names))
 
     def _read(self) -> TensorDict:
         if self._fleet is not None:
@@ -529,9 +569,20 @@ class BoatDockEnv(PAMDPEnv):
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
 
 
+def _check_people(rules: Rules, what: str) -> None:
+    """Refuse what people did where they could not have done it."""
+    if rules.boats is not None:
+        given = f"boats={list(rules.names)}"
+    elif rules.switch_cost is not None:
+        given = f"switch_cost={rules.switch_cost}"
+    else:
+        return
+    raise ValueError(f"BoatDockEnv: {given}: people kept one of their two boats; leave it out, or leave out {what}")
+
+
 def _figures_of(recording: str, controller: str) -> dict[str, float]:
     """Return the means of a recording, of the episodes with this controller where it is fixed."""
-    from hpamdp.env.boatdock.play import episodes  # which few need
+    from hpamdp.env.boatdock.play import episodes  # only recordings need it
 
     of_controller = controller if controller in harbour.CONTROLLERS else None
     means = episodes.figures(episodes.read(Path(recording)), of_controller)
@@ -560,7 +611,3 @@ def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) ->
 
 def _array(tensor: Tensor) -> np.ndarray:
     return tensor.detach().contiguous().numpy()
-
-
-def _invalid(row: int, key: Tensor, durations: Tensor, option: Tensor) -> ValueError:
-    return invalid_press(row, option[row].item(), key[row].item(), durations[row].tolist())

@@ -56,7 +56,7 @@ def step(
 
     Args:
         state: of the boats; an episode that is over stays as it is and earns 0.
-        option: integers `[N]`: the controller of boats that have none yet.
+        option: integers `[N]`: the controller of boats that have none yet; with a `switch_cost`, of all.
         key: integers `[N]`.
         durations: seconds `[N, K]`, of which only the pressed key's counts; clipped to [0, MAX_DURATION].
         seed: int32 scalar.
@@ -73,7 +73,7 @@ def step(
         duration = torch.where(allowed_key == k, durations[:, k], duration)
     is_valid = (key == allowed_key) & duration.isfinite()
     if rules.controller == "choose":
-        is_valid = is_valid & (option >= 0) & (option < len(harbour.CONTROLLERS))
+        is_valid = is_valid & (option >= 0) & (option < len(rules.names))
     noise_key = _noise_key(state, seed, environment, rules)
     moved = _press(state, option.to(torch.int32), allowed_key.to(torch.int32), duration, noise_key, rules)
     over = state.outcome != physics.SAILING
@@ -90,11 +90,14 @@ def reset(state: BoatState, mask: Tensor, seed: Tensor, environment: Tensor, rul
     zeros = torch.zeros_like(layout.start_x)
     integer_zeros = torch.zeros_like(episode)
     if rules.controller == "random":
-        controller = (counter_rng.uniform(key, harbour.INDEX_CONTROLLER) < 0.5).to(torch.int32)
+        num = len(rules.names)
+        # The last boat for the smallest numbers, as there were two at first and the second for those under a half.
+        drawn = (counter_rng.uniform(key, harbour.INDEX_CONTROLLER) * num).to(torch.int32)
+        controller = (num - 1 - drawn).clamp(min=0)
     elif rules.controller == "choose":
         controller = integer_zeros + harbour.NOT_CHOSEN
     else:
-        controller = integer_zeros + harbour.CONTROLLERS.index(rules.controller)
+        controller = integer_zeros + rules.names.index(rules.controller)
     if rules.keymap == "random":
         keymap = 1 + (counter_rng.uniform(key, harbour.INDEX_KEYMAP) < 0.5).to(torch.int32)
     else:
@@ -129,13 +132,21 @@ def _press(
         random_key = (counter_rng.uniform(noise_key, first + SLIPPED_KEY) * harbour.NUM_KEYS).to(torch.int32)
         key = torch.where(counter_rng.uniform(noise_key, first + SLIP) < rules.slip, random_key, key)
     duration = duration.clamp(0.0, physics.MAX_DURATION)
-    controller = torch.where(state.controller == harbour.NOT_CHOSEN, option, state.controller)
+    fuel = state.fuel
+    if rules.switch_cost is None:
+        controller = torch.where(state.controller == harbour.NOT_CHOSEN, option, state.controller)
+    else:
+        controller = option
+        is_other = (option != state.controller) & (state.controller != harbour.NOT_CHOSEN)
+        fuel = torch.where(is_other, (fuel - rules.switch_cost).clamp(min=0.0), fuel)
     if max(rules.motor_noise) > 0.0:
-        deviation = torch.where(controller == 0, *rules.motor_noise)
+        deviation = torch.full(controller.shape, rules.motor_noise[0], device=controller.device)
+        for boat, noise in enumerate(rules.motor_noise[1:], start=1):
+            deviation = torch.where(controller == boat, noise, deviation)
         duration = duration * (deviation * counter_rng.normal(noise_key, first // 2 + MOTOR)).exp()
         duration = duration.clamp(max=physics.MAX_DURATION)
-    dir_x, dir_y = harbour.direction(controller, state.keymap, key)
-    pressed = physics.press(state.x, state.y, state.fuel, state.goal_x, state.goal_y, dir_x, dir_y, duration)
+    dir_x, dir_y = harbour.direction_of(rules, controller, state.keymap, key)
+    pressed = physics.press(state.x, state.y, fuel, state.goal_x, state.goal_y, dir_x, dir_y, duration)
     presses = state.presses + 1
     out_of_time = (presses >= MAX_PRESSES) & (pressed.outcome == physics.SAILING)
     return state._replace(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,16 +36,17 @@ def draw(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> di
 
     Args:
         evaluation: the arrays that `BoatDockEnv.describe` and an evaluation give; figures that lack one are left out.
-        summary: of the run; `references` has the figures of people.
+        summary: of the run; `references` has the figures of people, `boats` the names of other boats than theirs.
     """
     evaluation = dict(evaluation)
     if "option" in evaluation:
         evaluation.setdefault("controller", evaluation["option"])
-    figures = {"trajectories.png": _trajectories(evaluation), "choices.png": _choices(evaluation, summary)}
+    names = tuple(summary.get("boats", ()))
+    figures = {"trajectories.png": _trajectories(evaluation, names), "choices.png": _choices(evaluation, summary)}
     return {name: figure for name, figure in figures.items() if figure is not None}
 
 
-def _trajectories(evaluation: Mapping[str, np.ndarray]) -> Figure | None:
+def _trajectories(evaluation: Mapping[str, np.ndarray], names: tuple[str, ...]) -> Figure | None:
     if not {"path", "goal", "outcome", "score"} <= evaluation.keys() or not len(evaluation["score"]):
         return None
     scores, outcomes = evaluation["score"], evaluation["outcome"].astype(int)
@@ -60,7 +61,7 @@ def _trajectories(evaluation: Mapping[str, np.ndarray]) -> Figure | None:
     for axes in all_axes:
         axes.set_axis_off()
     for axes, episode in zip(all_axes, chosen, strict=False):
-        _draw_episode(axes, evaluation, int(episode))
+        _draw_episode(axes, evaluation, int(episode), names)
     present = [(name, (outcomes == code).mean()) for code, name in enumerate(OUTCOMES) if (outcomes == code).any()]
     handles = [
         Line2D([], [], color=_OUTCOME_COLOURS[name], marker=_end_marker(name), label=f"{_words(name)} {share:.1%}")
@@ -69,7 +70,7 @@ def _trajectories(evaluation: Mapping[str, np.ndarray]) -> Figure | None:
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
     figure.supxlabel(
         f"{num} of {len(scores)} episodes, evenly spaced by score. Open circle: start; a dot where each press ends.\n"
-        "Above: score / best possible score, boat (C congruent, I incongruent).",
+        f"Above: score / best possible score, boat{'' if names else ' (C congruent, I incongruent)'}.",
         fontsize=8.5,
         color=FAINT,
     )
@@ -84,7 +85,7 @@ def _end_marker(outcome: str) -> str:
     return "o" if outcome == OUTCOMES[SUCCESS] else "X"
 
 
-def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int) -> None:
+def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...]) -> None:
     outcome = OUTCOMES[int(evaluation["outcome"][episode])]
     colour = _OUTCOME_COLOURS[outcome]
     path = evaluation["path"][episode]
@@ -100,10 +101,10 @@ def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int
     axes.set_xlim(-HARBOUR_RADIUS - 3, HARBOUR_RADIUS + 3)
     axes.set_ylim(HARBOUR_RADIUS + 3, -HARBOUR_RADIUS - 3)  # y points down
     axes.set_aspect("equal")
-    axes.set_title(_episode_title(evaluation, episode), fontsize=8.5, fontweight="normal", loc="center", pad=2)
+    axes.set_title(_episode_title(evaluation, episode, names), fontsize=8.5, fontweight="normal", loc="center", pad=2)
 
 
-def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int) -> str:
+def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...]) -> str:
     title = f"{evaluation['score'][episode]:.2f}"
     boat = int(evaluation["controller"][episode]) if "controller" in evaluation else NOT_CHOSEN
     if "optimum" in evaluation:
@@ -113,7 +114,7 @@ def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int) -> str:
         best = best if is_chosen or boat == NOT_CHOSEN else best[boat : boat + 1]
         if np.isfinite(best).any():
             title += f" / {np.nanmax(best):.2f}"
-    letter = {CONGRUENT: "C", INCONGRUENT: "I"}.get(boat)
+    letter = dict(enumerate(names)).get(boat) if names else {CONGRUENT: "C", INCONGRUENT: "I"}.get(boat)
     return f"{title}  {letter}" if letter else title
 
 
@@ -126,7 +127,11 @@ def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -
     people = summary.get("references", {}).get("human", {})
     figure = Figure(figsize=(9.6, 3.7), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=[1.5, 1.0])
-    _draw_choices(left, {name: array[chose] for name, array in evaluation.items()}, has_people=bool(people))
+    of_choices = {name: array[chose] for name, array in evaluation.items()}
+    if summary.get("boats"):
+        _draw_boats(left, of_choices, summary["boats"])
+    else:
+        _draw_choices(left, of_choices, has_people=bool(people))
     _draw_outcomes(right, evaluation["outcome"].astype(int), people)
     return figure
 
@@ -168,6 +173,34 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: 
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_title(title)
     label_ends(axes, labels, ends=centres[filled][-1] / edges[-1])
+
+
+def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
+    """Draw the share of each boat by the goal's bearing; equally good boats share what the planner would choose."""
+    to_goal = evaluation["goal"] - evaluation["start"]
+    bearing = np.degrees(np.arctan2(to_goal[:, 1], to_goal[:, 0])) % 360.0
+    edges = np.arange(0.0, 361.0, 30.0)
+    centres = (edges[:-1] + edges[1:]) / 2.0
+    bins = np.clip(np.digitize(bearing, edges) - 1, 0, len(centres) - 1)
+    num = np.bincount(bins, minlength=len(centres))
+    filled = num > 0
+    optimum = evaluation["optimum"]
+    is_best = optimum == optimum.max(1, keepdims=True)
+    for boat, name in enumerate(names):
+        chosen: dict[str, Any] = {"label": name, "linewidth": 2.0, "marker": "o", "markersize": 5}
+        best: dict[str, Any] = {"linewidth": 1.1, "linestyle": "--"}
+        for weights, line in (
+            (evaluation["option"] == boat, chosen),
+            (is_best[:, boat] / is_best.sum(1), best),
+        ):
+            share = np.bincount(bins, weights=weights, minlength=len(centres))[filled] / num[filled]
+            axes.plot(centres[filled], share, color=f"C{boat}", **line)
+    agreement = is_best[np.arange(len(bins)), evaluation["option"].astype(int)].mean()
+    axes.set(xlim=(0, 360), ylim=(-0.03, 1.03), xticks=edges[::2])
+    axes.set_xlabel("the goal's bearing, degrees (0 to the right, 90 down); dashed: oracle")
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.set_title(f"Boat chosen (best one in {agreement:.0%})")
+    axes.legend(frameon=False, fontsize=8.5)
 
 
 def _draw_outcomes(axes: Axes, outcomes: np.ndarray, people: Mapping[str, float]) -> None:

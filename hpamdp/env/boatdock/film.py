@@ -14,23 +14,29 @@ from torch import Tensor
 from hpamdp.env.boatdock import harbour, physics, rendering
 from hpamdp.env.boatdock.episode import MAX_PRESSES, BoatState
 from hpamdp.env.boatdock.rendering import Leg, Scene
+from hpamdp.env.boatdock.task import Boats, Rules
 
 
-def film(track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+def film(
+    track: Sequence[Mapping[str, Tensor]], fps: float, size: int, rules: Rules | None = None
+) -> Iterator[np.ndarray]:
     """Yield the pictures of one episode, uint8 `[size, size, 3]` each, from its start to its end.
 
     Args:
         track: the states at the start and after every press, columns `[1]`; columns that are no boat's are ignored.
         fps: pictures a second.
         size: px from edge to edge.
+        rules: of the environment; None: the default ones.
     """
+    rules = Rules() if rules is None else rules
     states = [BoatState(*(columns[name].double() for name in BoatState._fields)) for columns in track]
-    scene = _scene(states[0], states[-1])
+    scene = _scene(states[0], states[min(1, len(states) - 1)], rules.boats)
     yield rendering.draw(scene, size)
     late = 0.0  # from the last press's end to the next picture, s
     for before, after in itertools.pairwise(states):
         if before.outcome.item() != physics.SAILING:
             break
+        before = before._replace(fuel=rendering.fuel_at_press(before, after, rules.switch_cost))
         length = math.hypot((after.x - before.x).item(), (after.y - before.y).item())
         burnt = (before.fuel - after.fuel).clamp(min=0.0)  # how long the key was down
         seconds = physics.time_at(burnt, burnt.new_tensor([length])).item()
@@ -42,15 +48,16 @@ def film(track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterat
     yield rendering.draw(scene, size)
 
 
-def _scene(first: BoatState, last: BoatState) -> Scene:
-    """Return the scene before the first press; the controller is the one that will be held."""
+def _scene(first: BoatState, second: BoatState, boats: Boats | None) -> Scene:
+    """Return the scene before the first press, with the controller of that press."""
     return Scene(
         start=(first.start_x.item(), first.start_y.item()),
         goal=(first.goal_x.item(), first.goal_y.item()),
         boat=(first.x.item(), first.y.item()),
         fuel=first.fuel.item() / physics.TANK,
-        controller=int(last.controller),
+        controller=int(second.controller),
         keymap=int(first.keymap),
+        boats=boats,
     )
 
 
@@ -71,6 +78,7 @@ def _underway(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, 
         legs=(*scene.legs, leg),
         fuel=(before.fuel.item() - min(seconds, burnt.item())) / physics.TANK,
         presses=scene.presses + 1,
+        controller=int(after.controller),
     )
 
 
@@ -87,6 +95,7 @@ def _rested(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, le
         legs=(*scene.legs, Leg(start, end, share)),
         fuel=after.fuel.item() / physics.TANK,
         presses=min(scene.presses + 1, MAX_PRESSES),
+        controller=int(after.controller),
         outcome=physics.OUTCOMES[outcome],
         score=harbour.score(after.outcome, after.fuel / physics.TANK).item() if is_over else None,
     )

@@ -55,21 +55,25 @@ class Fleet:
         self.floats[:] = 0.0
         self.integers[:] = 0
         self.integers[kernel.EPISODE] = -1
-        self._settings = np.zeros(kernel.NUM_SETTINGS)
+        self._settings = np.zeros(kernel.NUM_SETTINGS + len(rules.names) * kernel.NUM_BOAT_SETTINGS)
         self._settings[kernel.SEED] = folded(seed)
         self._settings[kernel.FIRST_ENV] = self._first_env
-        self._settings[kernel.SET_CONTROLLER] = {
-            "choose": task.NOT_CHOSEN,
-            "random": kernel.RANDOM,
-            "incongruent": task.INCONGRUENT,
-            "congruent": task.CONGRUENT,
-        }[rules.controller]
+        special = {"choose": task.NOT_CHOSEN, "random": kernel.RANDOM}
+        controller = rules.controller
+        number = special[controller] if controller in special else rules.names.index(controller)
+        self._settings[kernel.SET_CONTROLLER] = number
         self._settings[kernel.SET_KEYMAP] = kernel.RANDOM if rules.keymap == "random" else rules.keymap
         self._settings[kernel.IS_SPARSE] = rules.reward == "sparse"
         self._settings[kernel.IS_PIXELS] = rules.observation == "pixels"
-        self._settings[kernel.INCONGRUENT_NOISE], self._settings[kernel.CONGRUENT_NOISE] = rules.motor_noise
         self._settings[kernel.SENSOR_NOISE] = rules.sensor_noise
         self._settings[kernel.SLIP_CHANCE] = rules.slip
+        self._settings[kernel.NUM_BOATS] = len(rules.names)
+        self._settings[kernel.HAS_KEYMAPS] = rules.boats is None
+        self._settings[kernel.SWITCH_COST] = -1.0 if rules.switch_cost is None else rules.switch_cost
+        of_boats = self._settings[kernel.NUM_SETTINGS :].reshape(len(rules.names), -1)
+        of_boats[:, 0] = rules.motor_noise
+        if rules.boats is not None:
+            of_boats[:, 1:] = np.array(rules.boats.directions).reshape(len(rules.names), -1)
         self.set_streams(is_evaluation=is_evaluation)
 
     def set_streams(self, *, is_evaluation: bool) -> None:
@@ -99,7 +103,8 @@ class Fleet:
         """Press a key in every boat; those whose episode is over stay as they are.
 
         Args:
-            option: int64 `[N]`, the controllers of boats that have none yet; None where nobody chooses.
+            option: int64 `[N]`, the controllers of boats that have none yet, with a `switch_cost` of all; None where
+                nobody chooses.
             key: int64 `[N]`.
             durations: seconds, float32 `[N, 3]`.
             mask: bool `[N]`, the boats that move; all by default.

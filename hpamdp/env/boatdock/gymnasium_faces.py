@@ -2,15 +2,15 @@
 
 Actions are dicts or, with `action_format="tuple"`, the field's nested tuples: see `hpamdp.env.boatdock.numpy_boats`.
 
-Options of `reset`: `start` and `goal` `[2]` in screen px and, with these, `controller` (0 or 1, not with
+Options of `reset`: `start` and `goal` `[2]` in screen px and, with these, `controller` (its number, not with
 `controller="choose"`) and `keymap` (1 or 2). Infos: `outcome` (name), `fuel` (fraction of the tank), `presses`,
-`controller` (0, 1, or -1 before one is chosen) and, once the episode is over, `score`.
+`controller` (its number, or -1 before one is chosen) and, once the episode is over, `score`.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from hpamdp.env.boatdock.numpy_boats import ActionFormat, NumpyBoats
-from hpamdp.env.boatdock.task import Rules, one_or_two
+from hpamdp.env.boatdock.task import Rules, chosen_boats, noise_of_each
 from hpamdp.env.faces import Face, VectorFace
 
 
@@ -26,7 +26,8 @@ class BoatDock(Face):
     """One boat to dock.
 
     Args:
-        controller, keymap, reward, observation, motor_noise, sensor_noise, slip: the task, as in BoatDockEnv.
+        controller, keymap, reward, observation, motor_noise, sensor_noise, slip, boats, controllers, switch_cost: the
+            task, as in BoatDockEnv.
         action_format: `dict` or `tuple`; see `hpamdp.env.boatdock.numpy_boats`.
         render_mode: None or `rgb_array` (`render` returns uint8 `[480, 480, 3]`).
 
@@ -40,18 +41,24 @@ class BoatDock(Face):
     def __init__(
         self,
         *,
-        controller: Literal["choose", "congruent", "incongruent", "random"] = "choose",
+        controller: str = "choose",
         keymap: Literal[1, 2, "random"] = 1,
         reward: Literal["paper", "sparse"] = "paper",
         observation: Literal["scaled", "pixels"] = "scaled",
         motor_noise: float | Sequence[float] = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
+        boats: Sequence[str] | None = None,
+        controllers: Mapping[str, Sequence[float]] | None = None,
+        switch_cost: float | None = None,
         action_format: ActionFormat = "dict",
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
-        rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
+        chosen = chosen_boats(boats, controllers)
+        noise = (noise_of_each(motor_noise, chosen), sensor_noise, slip)
+        rules = Rules(controller, keymap, reward, observation, *noise, chosen, switch_cost)
         super().__init__(NumpyBoats(rules, (), action_format), render_mode)
+        self._rules = rules
 
     def _draw(self) -> np.ndarray:
         from hpamdp.env.boatdock import rendering  # it brings torch along
@@ -63,8 +70,9 @@ class BoatDock(Face):
                 goal=(state.goal_x.item(), state.goal_y.item()),
                 boat=(state.x.item(), state.y.item()),
                 heading=(state.velocity_x.item(), state.velocity_y.item()),
-                legs=tuple(rendering.leg(*pair) for pair in itertools.pairwise(self._track)),
+                legs=tuple(rendering.leg(*pair, self._rules.switch_cost) for pair in itertools.pairwise(self._track)),
                 keymap=state.keymap.item(),
+                boats=self._rules.boats,
                 **self._problem.info(),
             )
         )
@@ -75,7 +83,8 @@ class BoatDockVector(VectorFace):
 
     Args:
         num_envs: number of boats.
-        controller, keymap, reward, observation, motor_noise, sensor_noise, slip: the task, as in BoatDockEnv.
+        controller, keymap, reward, observation, motor_noise, sensor_noise, slip, boats, controllers, switch_cost: the
+            task, as in BoatDockEnv.
         action_format: `dict` or `tuple`; see `hpamdp.env.boatdock.numpy_boats`.
         autoreset_mode: when finished boats start again: in the next step (which ignores their actions), in the same
             step (the last observations and infos are `infos["final_obs"]` and `infos["final_info"]`), or only by
@@ -93,19 +102,24 @@ class BoatDockVector(VectorFace):
         self,
         num_envs: int = 1,
         *,
-        controller: Literal["choose", "congruent", "incongruent", "random"] = "choose",
+        controller: str = "choose",
         keymap: Literal[1, 2, "random"] = 1,
         reward: Literal["paper", "sparse"] = "paper",
         observation: Literal["scaled", "pixels"] = "scaled",
         motor_noise: float | Sequence[float] = 0.0,
         sensor_noise: float = 0.0,
         slip: float = 0.0,
+        boats: Sequence[str] | None = None,
+        controllers: Mapping[str, Sequence[float]] | None = None,
+        switch_cost: float | None = None,
         action_format: ActionFormat = "dict",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         compile_rules: bool = False,
         device: Any = "cpu",
     ) -> None:
-        rules = Rules(controller, keymap, reward, observation, one_or_two(motor_noise), sensor_noise, slip)
+        chosen = chosen_boats(boats, controllers)
+        noise = (noise_of_each(motor_noise, chosen), sensor_noise, slip)
+        rules = Rules(controller, keymap, reward, observation, *noise, chosen, switch_cost)
         make_fleet = None
         if compile_rules or str(device) != "cpu":
             # It brings torch along.

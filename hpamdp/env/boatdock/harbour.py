@@ -24,6 +24,7 @@ from hpamdp.env.boatdock.task import (
     NUM_KEYS,
     SUCCESS,
     TANK,
+    Rules,
 )
 
 _COS30 = math.sqrt(3.0) / 2.0
@@ -51,6 +52,19 @@ def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, 
     column = torch.where(congruent, key, reordered)
     sign = torch.where(congruent, 1.0, -1.0)
     return sign * _COS30 * (column - 1).to(torch.float32), sign * torch.where(column == 1, -1.0, 0.5)
+
+
+def direction_of(rules: Rules, controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the unit direction (x, y) of a key, each `[*B]` float32; arguments as for `direction`."""
+    if rules.boats is None:
+        return direction(controller, keymap, key)
+    row = controller * NUM_KEYS + key
+    every = [each for keys in rules.boats.directions for each in keys]
+    x, y = (torch.full(row.shape, each, device=row.device) for each in every[0])
+    # No gather, as above.
+    for number, (key_x, key_y) in enumerate(every[1:], start=1):
+        x, y = torch.where(row == number, key_x, x), torch.where(row == number, key_y, y)
+    return x, y
 
 
 class Layout(NamedTuple):

@@ -46,12 +46,15 @@ CONTROLLER, KEYMAP, PRESSES, OUTCOME, EPISODE = range(5)
     SET_KEYMAP,
     IS_SPARSE,
     IS_PIXELS,
-    INCONGRUENT_NOISE,
-    CONGRUENT_NOISE,
     SENSOR_NOISE,
     SLIP_CHANCE,
-) = range(12)
-NUM_SETTINGS = 12
+    NUM_BOATS,
+    HAS_KEYMAPS,
+    SWITCH_COST,
+) = range(13)
+NUM_SETTINGS = 13
+# Behind them each boat has its motor noise and, unless the directions follow from the key map, x and y of each key.
+NUM_BOAT_SETTINGS = 7
 RANDOM = -2  # of SET_CONTROLLER and SET_KEYMAP
 
 # What `advance` does: press a key where the episode is not over; the same, but start new episodes where they are over
@@ -62,6 +65,7 @@ _BLOCK = 128
 
 # Columns of the float32 scratch: the state's nine, then these. Sixteen columns of the observation start at _SEEN.
 _DURATION, _REWARD, _SEEN = 9, 10, 11
+_DIR_X, _DIR_Y = _SEEN, _SEEN + 1
 _NUM_FLOATS = 27
 # Columns of the int32 scratch: the state's five, the key, the option, whether the row moves, whether it starts anew,
 # the bits of its episode's key, and whether a try at a layout was too near.
@@ -170,7 +174,7 @@ def _invalid_row(option: Any, key: Any, durations: Any, integers: Any, is_later:
     chooses = settings[SET_CONTROLLER] == task.NOT_CHOSEN
     for row in range(len(key)):
         is_key = (key[row] >= 0) & (key[row] < task.NUM_KEYS)
-        is_option = (not chooses) | ((option[row] >= 0) & (option[row] < 2))
+        is_option = (not chooses) | ((option[row] >= 0) & (option[row] < settings[NUM_BOATS]))
         duration = durations[row, key[row] if is_key else 0]
         is_ignored = is_later & (integers[OUTCOME, row] != task.SAILING)
         if not (is_key & is_option & math.isfinite(duration)) and not is_ignored:
@@ -199,12 +203,15 @@ def _mark_over(count: Any, numbers: Any) -> None:
 
 
 @part
-def _load_actions(option: Any, key: Any, durations: Any, first: Any, count: Any, scratch: Any, numbers: Any) -> None:
+def _load_actions(
+    option: Any, key: Any, durations: Any, first: Any, count: Any, scratch: Any, numbers: Any, settings: Any
+) -> None:
+    last_boat = int32(settings[NUM_BOATS] - 1.0)
     for j in range(count):
-        # An action that is ignored may have any key.
+        # An action that is ignored may have any key and option.
         pressed = int32(min(max(key[first + j], 0), task.NUM_KEYS - 1))
         numbers[_KEY * _BLOCK + j] = pressed
-        numbers[_OPTION * _BLOCK + j] = option[first + j]
+        numbers[_OPTION * _BLOCK + j] = int32(min(max(option[first + j], 0), last_boat))
         scratch[_DURATION * _BLOCK + j] = min(max(durations[first + j, pressed], ZERO), _LONGEST)
 
 
@@ -219,12 +226,50 @@ def _store(floats: Any, integers: Any, first: Any, count: Any, scratch: Any, num
 
 
 @part
+def _has_motor_noise(settings: Any) -> Any:
+    """Return whether the presses of any boat vary."""
+    has_noise = False
+    for boat in range(int(settings[NUM_BOATS])):
+        has_noise |= settings[NUM_SETTINGS + boat * NUM_BOAT_SETTINGS] > 0.0
+    return has_noise
+
+
+@part
+def _switch(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
+    """Change boats where the option is another one, for the fuel that it costs."""
+    cost = _F(settings[SWITCH_COST])
+    for j in range(count):
+        held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
+        moves = (numbers[_MOVES * _BLOCK + j] != 0) & (numbers[OUTCOME * _BLOCK + j] == task.SAILING)
+        if moves & (held != task.NOT_CHOSEN) & (held != option):
+            numbers[CONTROLLER * _BLOCK + j] = option
+            scratch[FUEL * _BLOCK + j] = max(scratch[FUEL * _BLOCK + j] - cost, ZERO)
+
+
+@part
+def _aim(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
+    """Write the directions of the keys to two columns that are free at this moment."""
+    if settings[HAS_KEYMAPS] != 0.0:
+        for j in range(count):
+            held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
+            controller = option if held == task.NOT_CHOSEN else held
+            dir_x, dir_y = _direction(controller, numbers[KEYMAP * _BLOCK + j], numbers[_KEY * _BLOCK + j])
+            scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j] = dir_x, dir_y
+        return
+    for j in range(count):
+        held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
+        controller = option if held == task.NOT_CHOSEN else held
+        place = NUM_SETTINGS + controller * NUM_BOAT_SETTINGS + 1 + 2 * numbers[_KEY * _BLOCK + j]
+        scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j] = _F(settings[place]), _F(settings[place + 1])
+
+
+@part
 def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
     """Let keys slip and durations vary, as `episode` does."""
     base = stream_key(settings[SEED], int32(settings[NOISE_STREAM]))
     step = stream_step(int32(settings[NOISE_STREAM]))
     slip = _F(settings[SLIP_CHANCE])
-    has_motor_noise = max(settings[INCONGRUENT_NOISE], settings[CONGRUENT_NOISE]) > 0.0
+    has_motor_noise = _has_motor_noise(settings)
     for j in range(count):
         environment = int32(settings[FIRST_ENV]) + first + j
         bits = episode_key(base, environment, numbers[EPISODE * _BLOCK + j])
@@ -235,7 +280,7 @@ def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
         if has_motor_noise:
             held = numbers[CONTROLLER * _BLOCK + j]
             controller = numbers[_OPTION * _BLOCK + j] if held == task.NOT_CHOSEN else held
-            deviation = _F(settings[INCONGRUENT_NOISE] if controller == 0 else settings[CONGRUENT_NOISE])
+            deviation = _F(settings[NUM_SETTINGS + controller * NUM_BOAT_SETTINGS])
             factor = _F(math.exp(deviation * normal(bits, step, index // 2 + task.MOTOR)))
             scratch[_DURATION * _BLOCK + j] = min(scratch[_DURATION * _BLOCK + j] * factor, _LONGEST)
 
@@ -250,12 +295,11 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
         start_x, start_y = scratch[START_X * _BLOCK + j], scratch[START_Y * _BLOCK + j]
         old_vx, old_vy = scratch[VELOCITY_X * _BLOCK + j], scratch[VELOCITY_Y * _BLOCK + j]
         held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
-        keymap, key = numbers[KEYMAP * _BLOCK + j], numbers[_KEY * _BLOCK + j]
         presses, old_outcome = numbers[PRESSES * _BLOCK + j], numbers[OUTCOME * _BLOCK + j]
         moves = (numbers[_MOVES * _BLOCK + j] != 0) & (old_outcome == task.SAILING)
 
         controller = option if held == task.NOT_CHOSEN else held
-        dir_x, dir_y = _direction(controller, keymap, key)
+        dir_x, dir_y = scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j]
         new_x, new_y, left, speed, outcome = _press(
             x, y, fuel, goal_x, goal_y, dir_x, dir_y, scratch[_DURATION * _BLOCK + j]
         )
@@ -308,6 +352,7 @@ def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
                 goal, turn = _QUARTER, _PI  # after the last try the goal lies on the far side of the centre
             scratch[start_at + j], scratch[goal_at + j], scratch[turn_at + j] = start, goal, turn
     chosen, keymap = int32(settings[SET_CONTROLLER]), int32(settings[SET_KEYMAP])
+    num_boats, last_boat = _F(settings[NUM_BOATS]), int32(settings[NUM_BOATS] - 1.0)
     draws_controller, draws_keymap = chosen == RANDOM, keymap == RANDOM
     for j in range(count):
         bits = numbers[_BITS * _BLOCK + j]
@@ -335,7 +380,7 @@ def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
         numbers[OUTCOME * _BLOCK + j] = int32(task.SAILING) if is_new else outcome
         numbers[EPISODE * _BLOCK + j] += numbers[_IS_NEW * _BLOCK + j]
         held, held_keymap = numbers[CONTROLLER * _BLOCK + j], numbers[KEYMAP * _BLOCK + j]
-        drawn = int32(uniform(bits, step, task.INDEX_CONTROLLER) < HALF)
+        drawn = max(last_boat - int32(uniform(bits, step, task.INDEX_CONTROLLER) * num_boats), int32(0))
         controller = drawn if draws_controller else chosen
         drawn_keymap = int32(1) + int32(uniform(bits, step, task.INDEX_KEYMAP) < HALF)
         new_keymap = drawn_keymap if draws_keymap else keymap
@@ -435,7 +480,7 @@ def advance(
         option, key: int64 `[N]`.
         durations: float32 `[N, 3]`.
         mask: bool `[N]`, the rows that move or, with RESTART, start anew; the others stay as they are.
-        settings: float64 `[12]`.
+        settings: float64, NUM_SETTINGS and then NUM_BOAT_SETTINGS of each boat.
         mode: PRESS, PRESS_OR_RESTART (in which rows that start anew may have any action), PRESS_AND_RESTART or RESTART.
         rewards: float32 `[N]`, 0 where nothing moves.
         observations, outcomes, fuel, flags: the reading, float32 `[R, N, D]`, int64 `[R, N]`, float32 `[R, N]`, bool
@@ -450,21 +495,24 @@ def advance(
             return invalid
     scratch = np.empty(_NUM_FLOATS * _BLOCK, np.float32)
     numbers = np.empty(_NUM_INTEGERS * _BLOCK, np.int32)
-    has_noise = max(settings[SLIP_CHANCE], settings[INCONGRUENT_NOISE], settings[CONGRUENT_NOISE]) > 0.0
+    has_noise = (settings[SLIP_CHANCE] > 0.0) | _has_motor_noise(settings)
     for first in range(0, len(mask), _BLOCK):
         count = min(_BLOCK, len(mask) - first)
         _load(floats, integers, mask, first, count, scratch, numbers)
         if mode == PRESS_OR_RESTART:
             _mark_over(count, numbers)
         if mode != RESTART:
-            _load_actions(option, key, durations, first, count, scratch, numbers)
+            _load_actions(option, key, durations, first, count, scratch, numbers, settings)
+            if settings[SWITCH_COST] >= 0.0:
+                _switch(count, scratch, numbers, settings)
             if has_noise:
                 _disturb(first, count, scratch, numbers, settings)
+            _aim(count, scratch, numbers, settings)
             _press_block(first, count, scratch, numbers, settings, rewards)
         for reading in range(len(observations)):
             if reading == 1:
                 _mark_over(count, numbers)
-            if reading == 1 or mode >= RESTART or mode == PRESS_OR_RESTART:
+            if reading == 1 or mode in (RESTART, PRESS_OR_RESTART):
                 _restart(first, count, scratch, numbers, settings)
             _observe(first, count, scratch, numbers, settings, observations[reading])
             _report(first, count, scratch, numbers, outcomes[reading], fuel[reading], flags[reading])

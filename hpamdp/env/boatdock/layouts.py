@@ -6,16 +6,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hpamdp.env.boatdock.task import CENTRE, DOCK_RADIUS, HARBOUR_RADIUS
+from hpamdp.env.boatdock.task import CENTRE, DOCK_RADIUS, HARBOUR_RADIUS, Rules
 
 
-def layout_columns(given: Mapping[str, np.ndarray], num_envs: int, *, has_choice: bool) -> dict[str, np.ndarray]:
+def layout_columns(given: Mapping[str, np.ndarray], num_envs: int, rules: Rules) -> dict[str, np.ndarray]:
     """Check a layout and return the columns `[N]` of the state that it sets.
 
     Args:
         given: `start` and `goal` `[N, 2]` in screen px and, optionally, `controller` and `keymap` `[N]`.
         num_envs: N.
-        has_choice: whether the agent chooses the controller, so that the layout may not.
+        rules: of the environment; where the agent chooses the controller, the layout may not.
 
     Raises:
         ValueError: an entry has another shape or a value that is not allowed.
@@ -35,13 +35,16 @@ def layout_columns(given: Mapping[str, np.ndarray], num_envs: int, *, has_choice
         raise ValueError(f"reset: a start lies within the dock's {DOCK_RADIUS:g} px of its goal")
     columns = {"start_x": start[:, 0], "start_y": start[:, 1], "goal_x": goal[:, 0], "goal_y": goal[:, 1]}
     columns |= {"x": start[:, 0], "y": start[:, 1]}
-    for name, allowed in (("controller", (0, 1)), ("keymap", (1, 2))):
+    for name, first, last in (("controller", 0, len(rules.names) - 1), ("keymap", 1, 2)):
         value = given.get(name)
         if value is None:
             continue
-        if name == "controller" and has_choice:
+        if name == "controller" and rules.controller == "choose":
             raise ValueError('reset: controller is given, but with controller="choose" it comes from the option')
-        if value.shape != (num_envs,) or not np.isin(value, allowed).all():
-            raise ValueError(f"reset: {name} must be {allowed[0]} or {allowed[1]} in shape [{num_envs}]")
+        if name == "keymap" and rules.boats is not None:
+            raise ValueError("reset: keymap is given, but with boats=... each boat has its keys")
+        if value.shape != (num_envs,) or not np.isin(value, range(first, last + 1)).all():
+            between = "or" if last == first + 1 else "to"
+            raise ValueError(f"reset: {name} must be {first} {between} {last} in shape [{num_envs}]")
         columns[name] = value.astype(np.int32)
     return columns

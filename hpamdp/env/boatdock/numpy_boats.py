@@ -3,8 +3,8 @@
 Formats of an action, for one boat (batched spaces are Gymnasium's own: every leaf has a leading `[N]`):
 
 - `dict`: `{"key": 0 to 2, "duration": [3] seconds in [0, 2]}`, a duration for each key, of which only the pressed
-  key's counts; with `controller="choose"` also `"option": 0 (incongruent) or 1 (congruent)`, which is read at an
-  episode's first press.
+  key's counts; with `controller="choose"` also `"option": 0 (incongruent) or 1 (congruent)`, or the number in `boats`,
+  which is read at an episode's first press and, with a `switch_cost`, at every one.
 - `tuple`, the field's convention: `(key, (seconds [1], seconds [1], seconds [1]))`; with `controller="choose"` the
   option comes first: `(option, key, (...))`.
 """
@@ -33,9 +33,10 @@ _OPTION_SHAPES = {"start": (2,), "goal": (2,), "controller": (), "keymap": ()}
 _LARGEST_NORMAL = 6.0
 
 
-def action_space(has_choice: bool, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
+def action_space(rules: Rules, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
     """Return the action space of one boat; see the module's docstring."""
-    option = spaces.Discrete(len(task.CONTROLLERS))
+    has_choice = rules.controller == "choose"
+    option = spaces.Discrete(len(rules.names))
     key = spaces.Discrete(task.NUM_KEYS)
     if action_format == "dict":
         duration = spaces.Box(0.0, task.MAX_DURATION, (task.NUM_KEYS,))
@@ -56,7 +57,7 @@ def observation_space(rules: Rules) -> spaces.Box:
     reach = task.HARBOUR_RADIUS + 1.0 + _LARGEST_NORMAL * rules.sensor_noise
     bounds = {
         "radius": (0.0, 2.0 * task.HARBOUR_RADIUS * unit),
-        "controller": (-1.0, 1.0),
+        "controller": (-1.0, len(rules.names) - 1.0),
         "fuel": (0.0, 1.0),
         # In units of the distance at the start, which counts as at least the radius of the dock.
         "distance": (0.0, 2.0 * 2.0**0.5 * reach / task.DOCK_RADIUS),
@@ -94,10 +95,11 @@ class NumpyBoats(NumpyEnv):
             raise ValueError(f"BoatDock: action_format={action_format!r}, but must be dict or tuple")
         num_boats = batch[0] if batch else 1
         task.check_arguments(num_boats, rules)
+        self._rules = rules
         self.num_boats = num_boats
         self.is_reset = False
         self.has_choice = rules.controller == "choose"
-        self.action_space = action_space(self.has_choice, action_format)
+        self.action_space = action_space(rules, action_format)
         self.observation_space = observation_space(rules)
         self._fleet: Any = Fleet(num_boats, rules, first_env=0) if make_fleet is None else make_fleet(num_boats, rules)
         self._batch = batch
@@ -131,7 +133,8 @@ class NumpyBoats(NumpyEnv):
         result = press(option, key, durations)
         if isinstance(result, int):
             chosen = self._fleet.integers[kernel.CONTROLLER] if option is None else option
-            raise task.invalid_press(result, chosen[result].item(), key[result].item(), durations[result].tolist())
+            values = chosen[result].item(), key[result].item(), durations[result].tolist()
+            raise task.invalid_press(result, *values, len(self._rules.names))
         readings, rewards = result
         return After(readings.observations[0], rewards, readings.flags[0, 1], readings.flags[0, 2])
 
@@ -175,7 +178,7 @@ class NumpyBoats(NumpyEnv):
             shape = _OPTION_SHAPES[name]
             array = as_array(f"reset: {name}", value, self._batch + shape, is_integer=shape == ())
             given[name] = array.reshape(self.num_boats, *shape)
-        return layout_columns(given, self.num_boats, has_choice=self.has_choice)
+        return layout_columns(given, self.num_boats, self._rules)
 
     def _leaves(self, action: Any) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
         """Check the structure, types and shapes of an action and return options, keys and durations."""

@@ -17,7 +17,7 @@ def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
     """Return the spec of what `BoatDockOracle.read` returns."""
     shape = (num_envs, _num_plans(rules))
     return Composite(
-        option=Categorical(len(harbour.CONTROLLERS), shape=(num_envs,), device=device),
+        option=Categorical(len(rules.names), shape=(num_envs,), device=device),
         discrete=Categorical(harbour.NUM_KEYS, shape=shape, device=device),
         parameters=Bounded(0.0, physics.MAX_DURATION, shape=shape, device=device),
         shape=(num_envs,),
@@ -26,11 +26,13 @@ def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
 
 def _num_plans(rules: Rules) -> int:
     """Return how many plans each boat has: one for each controller that it may get."""
-    return len(harbour.CONTROLLERS) if rules.controller == "choose" else 1
+    return len(rules.names) if rules.controller == "choose" else 1
 
 
 class BoatDockOracle:
-    """Keep the best plan of every boat, made at the start of an episode and, with noise, again before every press.
+    """Keep the best plan of every option, made at the start of an episode.
+
+    With noise or a `switch_cost` it is made again before every press.
 
     Args:
         num_envs: number of boats.
@@ -61,24 +63,16 @@ class BoatDockOracle:
     def plan(self, state: BoatState, rows: Tensor) -> None:
         """Plan for the boats of `rows` bool `[N]` from where they are."""
         boats = BoatState(*(column[rows] for column in state))
-        plans = [self._plan_with(boats, controller) for controller in range(_num_plans(self.rules))]
-        stacked = planner.Plan(*(torch.stack(fields, 1) for fields in zip(*plans, strict=True)))
-        self.option[rows] = planner.better_option(stacked)
-        self.keys[rows] = stacked.keys
-        self.durations[rows] = stacked.durations
-
-    def _plan_with(self, boats: BoatState, controller: int) -> planner.Plan:
-        """Return the boats' plans with this controller, or with the one that they already have."""
-        if self.rules.controller == "choose":
-            controllers = torch.full_like(boats.controller, controller)
-        else:
-            controllers = boats.controller
-        return planner.best_plan(boats.x, boats.y, boats.goal_x, boats.goal_y, boats.fuel, controllers, boats.keymap)
+        plans = planner.plans_of_options(self.rules, boats)
+        self.option[rows] = planner.better_option(plans)
+        self.keys[rows] = plans.keys
+        self.durations[rows] = plans.durations
 
     def read(self, state: BoatState) -> TensorDict:
         """Return `option` `[N]` and the next press of each plan, `discrete` and `parameters` `[N, num_plans]`."""
         num_presses = state.presses.long()  # since the plan was made
-        if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0:
+        # With a cost of changing boats, the plans of the other boats are no longer those from the start.
+        if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
             num_presses = torch.zeros_like(num_presses)
         index = num_presses.clamp(max=planner.MAX_PRESSES - 1).view(-1, 1, 1).expand(-1, self.keys.shape[1], 1)

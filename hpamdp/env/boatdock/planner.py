@@ -10,11 +10,16 @@ covers the plans of one and two presses. A coarse grid over every sequence of ke
 grids around the best of them find the optimum. Because of the concavity most optima of three presses lie on the border
 of the feasible region (a leg that ends just short of harbour or dock), so the grid includes the borders and is denser
 there.
+
+The same search serves other boats, and boats that may be changed before a press for some fuel: it then goes over the
+sequences of boats and keys, and adds what their changes cost.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -30,6 +35,7 @@ from hpamdp.env.boatdock.physics import (
     distance_to_harbour,
     press_for,
 )
+from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Boats, BoatState, Rules
 
 MAX_PRESSES = 3
 
@@ -258,6 +264,205 @@ def best_plans(layout: Layout, keymap: Tensor) -> Plan:
     return Plan(*(field.unflatten(0, (len(keymap), num_options)) for field in plan))
 
 
-def better_option(plans: Plan) -> Tensor:
-    """Return the controller with the higher score in `best_plans`, int64 `[N]`."""
-    return plans.score.argmax(1)
+class OptionPlans(NamedTuple):
+    """The best plan of each option, fields `[N, num_options, ...]`; see `Plan`.
+
+    With `boats` of which one cannot reach the dock, or a `switch_cost`, a press of 0 s may stand before others: the
+    option presses nothing with its own boat.
+    """
+
+    boats: Tensor  # [N, num_options, 3] int64, the boat of each press
+    keys: Tensor
+    durations: Tensor
+    num_presses: Tensor
+    score: Tensor
+
+
+def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
+    """Return the best plan of each option from where the boats rest.
+
+    Where the agent does not choose, there is one option: the boat that each has. With a `switch_cost`, an option's plan
+    presses the first key with that option's boat, and may change boats before each press that follows.
+    """
+    position = state.x, state.y, state.goal_x, state.goal_y, state.fuel
+    has_choice = rules.controller == "choose"
+    if rules.boats is not None or rules.switch_cost is not None:
+        plans = _plans_with_boats(rules, *position, state.controller, state.keymap)
+        if has_choice:
+            return plans
+        own = state.controller.long()
+        return OptionPlans(*(field[torch.arange(len(own), device=own.device), own].unsqueeze(1) for field in plans))
+    numbers = range(len(CONTROLLERS)) if has_choice else (None,)
+    controllers = [state.controller if each is None else torch.full_like(state.controller, each) for each in numbers]
+    found = [best_plan(*position, controller, state.keymap) for controller in controllers]
+    boats = [
+        controller.long().unsqueeze(-1).expand_as(plan.keys)
+        for controller, plan in zip(controllers, found, strict=True)
+    ]
+    return OptionPlans(torch.stack(boats, 1), *(torch.stack(fields, 1) for fields in zip(*found, strict=True)))
+
+
+def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
+    """Return the best score with each boat, from the start with a full tank, `[N, num_boats]`.
+
+    With a `switch_cost` it is the best one that begins with the boat.
+    """
+    if rules.boats is None and rules.switch_cost is None:
+        return best_plans(layout, keymap).score
+    fuel = torch.full_like(layout.start_x, TANK)
+    return _plans_with_boats(rules, *layout, fuel, torch.full_like(keymap, NOT_CHOSEN), keymap).score
+
+
+def better_option(plans: Plan | OptionPlans) -> Tensor:
+    """Return the option with the highest score, the first one of equals, int64 `[N]`; plans `[N, num_options]`.
+
+    An option that begins with a press of 0 s, to change boats then, is as good as the change at once; it loses, since
+    whoever asks again before the next press would idle for ever.
+    """
+    return (plans.score - _IDLE * (plans.durations[..., 0] == 0.0)).argmax(1)
+
+
+_IDLE = 1e-3  # of score
+_Direction = tuple[float, float]
+_Press = tuple[int, int]  # the number of a kind of boat, and of one of its directions
+
+_PARALLEL = 1e-3  # directions whose cross product is smaller count as parallel; one leg does for two such
+_CANDIDATES = 24  # local minima that are refined, over all sequences of presses
+_FEWER = 1e-4  # seconds by which a plan of more presses must be better
+
+
+def _plans_with_boats(
+    rules: Rules, x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, fuel: Tensor, held: Tensor, keymap: Tensor
+) -> OptionPlans:
+    """Return the best plan that begins with each boat, for boats of any number that may be changed at a cost.
+
+    Boats that push in the same directions with other keys are of one kind, with one search.
+
+    Args:
+        rules: of the environment.
+        x, y, goal_x, goal_y, fuel, keymap: as in `best_plan`.
+        held: the controller so far, or NOT_CHOSEN, `[N]`.
+    """
+    peoples = Boats(CONTROLLERS, (CONTROLLER_DEGREES["incongruent1"], CONTROLLER_DEGREES["congruent"]))
+    directions = (peoples if rules.boats is None else rules.boats).directions
+    sets = [tuple(sorted(each)) for each in directions]
+    kinds = list(dict.fromkeys(sets))
+    kind_of = [kinds.index(each) for each in sets]
+    position = tuple(column.to(torch.float32) for column in (x, y, goal_x, goal_y))
+    found = [_plans_of_kind(kinds, kind, rules.switch_cost, position) for kind in range(len(kinds))]
+
+    # The key of each kind's directions on each boat, and which boat stands for a kind that others change to.
+    key_of = torch.tensor(
+        [[keys.index(each) for each in kinds[kind]] for keys, kind in zip(directions, kind_of, strict=True)],
+        device=x.device,
+    )
+    plans = []
+    for boat, kind in enumerate(kind_of):
+        legs, durations, num_presses, seconds = found[kind]
+        members = [boat if other == kind else kind_of.index(other) for other in range(len(kinds))]
+        boats = torch.tensor(members, device=x.device)[legs[..., 0]]
+        keys = key_of[boats, legs[..., 1]]
+        if rules.boats is None:
+            # Key map 2 has the same directions, each one key later.
+            keys = torch.where((boats == INCONGRUENT) & (keymap[:, None] == 2), (keys + 1) % NUM_KEYS, keys)
+        if rules.switch_cost is not None:
+            seconds = seconds + rules.switch_cost * ((held != NOT_CHOSEN) & (held != boat))
+        left = fuel.to(torch.float32) - seconds
+        is_solved = left >= 0.0
+        is_press = (torch.arange(MAX_PRESSES, device=x.device) < num_presses[:, None]) & is_solved[:, None]
+        plans.append(
+            OptionPlans(
+                boats=torch.where(is_press, boats, boat),
+                keys=torch.where(is_press, keys, 0),
+                durations=torch.where(is_press, durations, 0.0),
+                num_presses=is_press.sum(1),
+                score=torch.where(is_solved, 5.0 * fuel_fraction(left), -1.0),
+            )
+        )
+    return OptionPlans(*(torch.stack(fields, 1) for fields in zip(*plans, strict=True)))
+
+
+def _plans_of_kind(
+    kinds: Sequence[Sequence[_Direction]], kind: int, switch_cost: float | None, position: Sequence[Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the best plan that begins with a boat of this kind.
+
+    Returns:
+        The presses int64 `[N, 3, 2]` (kind and direction), their seconds `[N, 3]`, their number `[N]`, and the seconds
+        of fuel that all of it takes, changes of boats after the first press included, `[N]`; `inf` where none docks.
+    """
+    device = position[0].device
+    legs = torch.zeros(len(position[0]), MAX_PRESSES, 2, dtype=torch.long, device=device)
+    legs[..., 0] = kind
+    durations = torch.zeros(len(position[0]), MAX_PRESSES, device=device)
+    num_presses = torch.zeros(len(position[0]), dtype=torch.long, device=device)
+    seconds = torch.full((len(position[0]),), torch.inf, device=device)
+    for num in range(1, MAX_PRESSES + 1):
+        sequences = _sequences(kinds, kind, num, may_change=switch_cost is not None)
+        if not sequences:
+            continue
+        changes = [sum(a[0] != b[0] for a, b in itertools.pairwise(presses)) for presses in sequences]
+        cost = torch.tensor(changes, dtype=torch.float32, device=device) * (switch_cost or 0.0)
+        course = [[kinds[each][number] for each, number in presses] for presses in sequences]
+        directions = torch.tensor([_padded(each) for each in course], device=device)
+        chunks = zip(*(column.split(_CHUNK) for column in position), strict=True)
+        found = [_search_sequences(directions, cost, chunk, num) for chunk in chunks]
+        sequence, pressed = (torch.cat(parts) for parts in zip(*found, strict=True))
+        total = pressed.sum(-1) + cost[sequence]
+        is_better = total < seconds - _FEWER
+        table = torch.tensor([[*presses, *[(kind, 0)] * (MAX_PRESSES - num)] for presses in sequences], device=device)
+        pressed = torch.nn.functional.pad(pressed[:, MAX_PRESSES - num :], (0, MAX_PRESSES - num))
+        legs = torch.where(is_better[:, None, None], table[sequence], legs)
+        durations = torch.where(is_better[:, None], pressed, durations)
+        num_presses = torch.where(is_better, num, num_presses)
+        seconds = torch.where(is_better, total, seconds)
+    return legs, durations, num_presses, seconds
+
+
+def _sequences(
+    kinds: Sequence[Sequence[_Direction]], first: int, num: int, *, may_change: bool
+) -> list[tuple[_Press, ...]]:
+    """Return the sequences of `num` presses that begin with this kind, of which no two in a row are parallel."""
+    every = [(kind, number) for kind in range(len(kinds)) for number in range(NUM_KEYS) if may_change or kind == first]
+
+    def is_turn(before: _Press, after: _Press) -> bool:
+        (a, b), (c, d) = kinds[before[0]][before[1]], kinds[after[0]][after[1]]
+        return abs(a * d - b * c) > _PARALLEL
+
+    sequences: list[tuple[_Press, ...]] = [(each,) for each in every if each[0] == first]
+    for _ in range(num - 1):
+        sequences = [(*presses, each) for presses in sequences for each in every if is_turn(presses[-1], each)]
+    return sequences
+
+
+def _padded(course: Sequence[_Direction]) -> list[_Direction]:
+    """Return three directions, of which the first are those of legs of length 0; no leg is parallel to the last one."""
+    aside = (-course[-1][1], course[-1][0])
+    return [aside] * (MAX_PRESSES - len(course)) + list(course)
+
+
+def _search_sequences(
+    directions: Tensor, cost: Tensor, position: Sequence[Tensor], num_presses: int
+) -> tuple[Tensor, Tensor]:
+    """Return the index of each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`.
+
+    Args:
+        directions: of each sequence's three legs, `[S, 3, 2]`.
+        cost: seconds of each sequence beside those of its presses, `[S]`.
+        position: x, y, goal x, goal y, `[N]` each.
+        num_presses: of each sequence; legs before these have length 0.
+    """
+    num = len(position[0])
+    place = (column[:, None].expand(num, len(directions)) for column in position)
+    legs = directions.flatten(1).unbind(1)
+    course = _Course(*place, *(leg.expand(num, len(directions)) for leg in legs))
+    sequence, first, second = _local_minima(course, num_presses)
+    candidates = _Course(*(field.gather(1, sequence) for field in course))
+    coarse = _total_seconds(candidates, first, second, num_presses) + cost[sequence]
+    kept = coarse.topk(min(_CANDIDATES, coarse.shape[1]), dim=1, largest=False).indices
+    sequence, first, second = (field.gather(1, kept) for field in (sequence, first, second))
+    candidates = _Course(*(field.gather(1, sequence) for field in course))
+    first, second = _zoom(candidates, first, second, num_presses)
+    durations = torch.stack(_durations(candidates, first, second, num_presses), dim=-1)
+    best = (durations.sum(-1) + cost[sequence]).argmin(1, keepdim=True)
+    return sequence.gather(1, best).squeeze(1), durations.take_along_dim(best[..., None], 1).squeeze(1)

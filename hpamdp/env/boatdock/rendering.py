@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
+from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
-from hpamdp.env.boatdock.task import BoatState
+from hpamdp.env.boatdock.task import Boats, BoatState
 from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
 
 _WATER = "#d6e7ec"
@@ -47,8 +48,9 @@ class Scene:
         legs: the track so far.
         fuel: fraction of the tank.
         presses: number of presses so far.
-        controller: 0, 1, or -1 before one is chosen.
+        controller: its number, or -1 before one is chosen.
         keymap: 1 or 2.
+        boats: that the numbers stand for; None: people's two.
         outcome: one of `physics.OUTCOMES`.
         score: shown at the end of an episode, unless it is None.
     """
@@ -64,6 +66,7 @@ class Scene:
     keymap: int = 1
     outcome: str = physics.OUTCOMES[physics.SAILING]
     score: float | None = None
+    boats: Boats | None = None
 
 
 def draw(scene: Scene, size: int = 480) -> np.ndarray:
@@ -149,6 +152,8 @@ def _directions(scene: Scene) -> tuple[Point, ...]:
     """Return the directions of the keys; none before a controller is chosen."""
     if scene.controller == harbour.NOT_CHOSEN:
         return ()
+    if scene.boats is not None:
+        return scene.boats.directions[scene.controller]
     return harbour.DIRECTIONS[2 if scene.controller == harbour.CONGRUENT else scene.keymap - 1]
 
 
@@ -167,7 +172,8 @@ def _write_labels(canvas: Canvas, scene: Scene) -> None:
     directions = _directions(scene)
     for number, (dir_x, dir_y) in enumerate(directions, start=1):
         canvas.write((x + (_ARROW + 10.0) * dir_x, y + (_ARROW + 10.0) * dir_y), str(number), size=13.0, anchor="mm")
-    name = harbour.CONTROLLERS[scene.controller] if directions else "no boat chosen"
+    names = harbour.CONTROLLERS if scene.boats is None else scene.boats.names
+    name = names[scene.controller] if directions else "no boat chosen"
     canvas.write((18.0, 463.0), name, INK if directions else FAINT)
     canvas.write((_GAUGE[0] - 8.0, 23.0), "fuel", FAINT, anchor="rm")
     canvas.write((462.0, 40.0), f"{100.0 * scene.fuel:.0f} %", FAINT, 12.0, anchor="rm")
@@ -179,11 +185,18 @@ def _write_labels(canvas: Canvas, scene: Scene) -> None:
             canvas.write((462.0, 441.0), f"score {scene.score:.2f}", INK, anchor="rm")
 
 
-def leg(before: BoatState, after: BoatState) -> Leg:
+def fuel_at_press(before: BoatState, after: BoatState, switch_cost: float | None) -> Tensor:
+    """Return the fuel (s) with which the press between two states of one boat began: a change of boats comes first."""
+    if switch_cost is None or before.controller.item() in (harbour.NOT_CHOSEN, after.controller.item()):
+        return before.fuel
+    return (before.fuel - switch_cost).clip(0.0)
+
+
+def leg(before: BoatState, after: BoatState, switch_cost: float | None = None) -> Leg:
     """Return the track of the press between two states of one boat."""
     start = (before.x.item(), before.y.item())
     end = (after.x.item(), after.y.item())
     # The fuel burnt is the time that the key was down, after noise and with what was left in the tank.
-    pressed = physics.pressed_distance(before.fuel - after.fuel).item()
+    pressed = physics.pressed_distance(fuel_at_press(before, after, switch_cost) - after.fuel).item()
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     return Leg(start, end, min(pressed / length, 1.0) if length > 0.0 else 1.0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from hpamdp.messages import invalid_action
@@ -31,6 +32,15 @@ NUM_KEYS = 3
 INCONGRUENT, CONGRUENT = 0, 1
 CONTROLLERS = ("incongruent", "congruent")  # option 0, option 1
 NOT_CHOSEN = -1
+
+# Controllers that `boats` may name: the degrees in which each key pushes, 0 to the right, 90 down. People's incongruent
+# boat had one of two key maps, which are two controllers here.
+CONTROLLER_DEGREES: dict[str, tuple[float, ...]] = {
+    "congruent": (150.0, 270.0, 30.0),
+    "incongruent1": (330.0, 210.0, 90.0),
+    "incongruent2": (90.0, 330.0, 210.0),
+}
+_RESERVED = ("choose", "random")  # other values of `controller`
 
 # Indices of an episode's random numbers: three for each try at a layout, then the others.
 LAYOUT_TRIES = 4
@@ -73,17 +83,39 @@ SLIP, SLIPPED_KEY = 0, 1
 MOTOR, SENSOR = 1, 2
 
 
+class Boats(NamedTuple):
+    """Boats to choose from, in place of people's two: their names, and the degrees in which each key pushes."""
+
+    names: tuple[str, ...]
+    degrees: tuple[tuple[float, ...], ...]
+
+    @property
+    def directions(self) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The unit directions (x, y) of each boat's keys; rounded, so that a right angle has exact ones."""
+        return tuple(
+            tuple((round(math.cos(math.radians(d)), 12), round(math.sin(math.radians(d)), 12)) for d in keys)
+            for keys in self.degrees
+        )
+
+
 class Rules(NamedTuple):
     """The settings of an environment, as BoatDockEnv explains them."""
 
-    controller: Literal["choose", "congruent", "incongruent", "random"] = "choose"
+    controller: str = "choose"
     keymap: Literal[1, 2, "random"] = 1
     reward: RewardForm = "paper"
     observation: ObservationForm = "scaled"
-    motor_noise: tuple[float, float] = (0.0, 0.0)  # of the incongruent and of the congruent boat
+    motor_noise: tuple[float, ...] = (0.0, 0.0)  # of each boat
     sensor_noise: float = 0.0
     slip: float = 0.0
+    boats: Boats | None = None  # None: people's two
+    switch_cost: float | None = None  # seconds of fuel; None: a boat is kept for the episode
     is_evaluation: bool = False  # whether episodes and noise come from the streams of evaluation
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the boats, in the order of their numbers."""
+        return CONTROLLERS if self.boats is None else self.boats.names
 
 
 class BoatState(NamedTuple):
@@ -108,11 +140,44 @@ class BoatState(NamedTuple):
     episode: Tensor
 
 
-def one_or_two(motor_noise: float | Sequence[float]) -> tuple[float, float]:
-    """Return the motor noise of the incongruent and of the congruent boat."""
-    noises = (motor_noise, motor_noise) if isinstance(motor_noise, int | float) else tuple(motor_noise)
-    if len(noises) != 2:
-        raise ValueError(f"BoatDockEnv: motor_noise={list(noises)}, but must be one number or two")
+def chosen_boats(names: Sequence[str] | None, controllers: Mapping[str, Sequence[float]] | None = None) -> Boats | None:
+    """Return the boats with these names; arguments `boats` and `controllers` as in BoatDockEnv.
+
+    Raises:
+        ValueError: a boat has no controller, or a controller has no directions for the keys.
+    """
+    known: dict[str, tuple[float, ...]] = dict(CONTROLLER_DEGREES)
+    for name, degrees in (controllers or {}).items():
+        given = f"BoatDockEnv: controllers.{name}={list(degrees)}"
+        if name in _RESERVED:
+            raise ValueError(f"{given}, but {name} is no name for a controller; take another one")
+        if len(degrees) != NUM_KEYS or not all(math.isfinite(d) for d in degrees):
+            raise ValueError(f"{given}, but must be {NUM_KEYS} directions in degrees, one for each key")
+        degrees = tuple(float(d) for d in degrees)
+        if degrees != known.setdefault(name, degrees):
+            raise ValueError(f"{given}, but {name} has {list(known[name])}; take another name")
+    if names is None:
+        return None
+    given = f"BoatDockEnv: boats={list(names)}"
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"{given}, but there is no controller {unknown[0]}; controllers has {', '.join(known)}")
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"{given}, but must be one or more different controllers")
+    return Boats(tuple(names), tuple(known[name] for name in names))
+
+
+def noise_of_each(motor_noise: float | Sequence[float], boats: Boats | None) -> tuple[float, ...]:
+    """Return the motor noise of each boat.
+
+    Raises:
+        ValueError: there are not as many as boats.
+    """
+    num = len(CONTROLLERS if boats is None else boats.names)
+    noises = (motor_noise,) * num if isinstance(motor_noise, int | float) else tuple(motor_noise)
+    if len(noises) != num:
+        allowed = "one number or two" if num == 2 else f"one number or {num}, one for each boat"
+        raise ValueError(f"BoatDockEnv: motor_noise={list(noises)}, but must be {allowed}")
     return noises
 
 
@@ -123,7 +188,7 @@ def check_arguments(num_envs: int, rules: Rules) -> None:
         ValueError: a value is not allowed.
     """
     choices = {
-        "controller": ("choose", *CONTROLLERS[::-1], "random"),
+        "controller": ("choose", *(CONTROLLERS[::-1] if rules.boats is None else rules.names), "random"),
         "keymap": (1, 2, "random"),
         "reward": ("paper", "sparse"),
         "observation": ("scaled", "pixels"),
@@ -132,6 +197,7 @@ def check_arguments(num_envs: int, rules: Rules) -> None:
         value = getattr(rules, name)
         if value not in allowed:
             raise ValueError(f"BoatDockEnv: {name}={value!r}, but must be one of {', '.join(map(str, allowed))}")
+    _check_boats(rules)
     if num_envs < 1:
         raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
     if not 0.0 <= rules.slip <= 1.0:
@@ -143,12 +209,32 @@ def check_arguments(num_envs: int, rules: Rules) -> None:
                 raise ValueError(f"BoatDockEnv: {name}={value}, but must lie between 0 and {largest}")
 
 
-def invalid_press(row: int, option: object, key: object, durations: object) -> ValueError:
+def _check_boats(rules: Rules) -> None:
+    """Check the settings of other boats and of changes between boats."""
+    names, cost = list(rules.names), rules.switch_cost
+    if rules.boats is not None and rules.keymap != 1:
+        raise ValueError(
+            f"BoatDockEnv: keymap={rules.keymap!r}: the controllers in boats={names} have none; leave it out"
+        )
+    if rules.controller == "choose" and len(names) < 2:
+        raise ValueError(f"BoatDockEnv: boats={names}: nothing to choose; name more, or use controller={names[0]}")
+    if cost is None:
+        return
+    if not 0.0 <= cost <= TANK:
+        raise ValueError(f"BoatDockEnv: switch_cost={cost}, but must lie between 0 and {TANK:g} seconds of fuel")
+    if rules.controller != "choose":
+        raise ValueError(
+            f"BoatDockEnv: switch_cost={cost}: controller={rules.controller} never changes boats; "
+            "use controller=choose or leave switch_cost out"
+        )
+
+
+def invalid_press(row: int, option: object, key: object, durations: object, num_options: int) -> ValueError:
     """Return the error for an invalid action of boat `row`."""
     return invalid_action(
         row,
         {
-            "option": (option, "allowed 0 to 1"),
+            "option": (option, f"allowed 0 to {num_options - 1}"),
             "key": (key, "allowed 0 to 2"),
             "durations": (durations, "the pressed key's must be finite"),
         },

@@ -29,6 +29,9 @@ class TensorFleet:
     def __init__(self, num_boats: int, rules: Rules, *, device: torch.device | str, compile_rules: bool) -> None:
         settings: dict[str, Any] = {**rules._asdict(), "motor_noise": list(rules.motor_noise)}
         del settings["is_evaluation"]
+        if rules.boats is not None:
+            settings["boats"] = list(rules.boats.names)
+            settings["controllers"] = {n: list(degrees) for n, degrees in zip(*rules.boats, strict=True)}
         self._env = BoatDockEnv(num_boats, **settings, device=device, compile_rules=compile_rules)
 
     @property

@@ -9,15 +9,14 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import int32
 
 from hpamdp.env import kernels, point_kernel
 from hpamdp.env.catch_point import rules
-from hpamdp.env.kernels import ONE, ZERO, kernel, part, sin_cos
+from hpamdp.env.kernels import ONE, OUTCOME_ROW, STEPS_ROW, ZERO, kernel, part, sin_cos
 
 CATCHES, LATE_END, PROGRESS = range(kernels.OWN, kernels.OWN + 3)  # the problem's own settings
 
-_MISSES, _STEPS, _OUTCOME, _EPISODE = range(4)
+_MISSES = 0  # the first row of the integers
 
 _F = np.float32
 _FORCE, _PI, _SIX, _TWELVE = _F(rules._FORCE), _F(math.pi), _F(6.0), _F(12.0)
@@ -61,28 +60,24 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    stream = int32(settings[kernels.EPISODE_STREAM])
-    base, step = kernels.stream_key(settings[kernels.SEED], stream), kernels.stream_step(stream)
     for row in range(len(mask)):
-        was_over = integers[_OUTCOME, row] != rules.GOING_ON
+        was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
-            action, steps = discrete[row], integers[_STEPS, row] + 1
+            action, steps = discrete[row], integers[STEPS_ROW, row] + 1
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
             outcome, rewards[row] = _act(floats, integers, row, action, given, settings)
             if outcome == rules.GOING_ON and steps >= settings[kernels.MAX_STEPS]:
                 outcome = rules.TIME_LIMIT
-            integers[_STEPS, row], integers[_OUTCOME, row] = steps, outcome
+            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, outcome
         for reading in range(len(observations)):
-            if kernels.must_restart(mode, reading, was_over, integers[_OUTCOME, row], mask[row]):
-                integers[_EPISODE, row] += 1
-                integers[_STEPS, row], integers[_OUTCOME, row] = 0, rules.GOING_ON
-                bits = kernels.episode_key(base, int32(settings[kernels.FIRST_ENV]) + row, integers[_EPISODE, row])
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                bits, step = kernels.new_episode(integers, row, settings)
                 integers[_MISSES, row] = 0
                 point_kernel.start(floats, row, bits, step)
             point_kernel.observe(floats, row, observations[reading, row])
             if settings[PROGRESS] != 0.0:
                 misses = min(integers[_MISSES, row], rules.PUBLISHED_CATCHES)
                 observations[reading, row, 4] = _F(misses) / _SIX - ONE
-                observations[reading, row, 5] = _F(integers[_STEPS, row]) / _TWELVE - ONE
-            kernels.report(integers[_OUTCOME, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+                observations[reading, row, 5] = _F(integers[STEPS_ROW, row]) / _TWELVE - ONE
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

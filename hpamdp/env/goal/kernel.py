@@ -10,11 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import int32
 
 from hpamdp.env import kernels
 from hpamdp.env.goal import rules
-from hpamdp.env.kernels import HALF, ONE, TURN, TWO, ZERO, inlined, kernel, part
+from hpamdp.env.kernels import EPISODE_ROW, HALF, ONE, OUTCOME_ROW, STEPS_ROW, TURN, TWO, ZERO, inlined, kernel, part
 
 # The problem's own settings.
 NOISE, IS_SCALED, KICKS_TO_POINT, REPAIRS_DISTANCE, REPAIRS_PROJECTION, HAS_MIDDLE, IS_HARD = range(
@@ -38,7 +37,6 @@ NOISE, IS_SCALED, KICKS_TO_POINT, REPAIRS_DISTANCE, REPAIRS_PROJECTION, HAS_MIDD
     _PLAYER_ANGLE,
     _KEEPER_ANGLE,
 ) = range(14)
-_STEPS, _OUTCOME, _EPISODE = range(3)
 _GOING = -1  # the end of an action that is not over
 
 _F = np.float32
@@ -204,10 +202,8 @@ def _goal_distance(body: Any, is_repaired: Any) -> Any:
 
 
 @part
-def _start(floats: Any, integers: Any, row: Any, settings: Any, key: Any, step: Any) -> None:
-    """Start a new episode in a row: `rules.start`."""
-    integers[_EPISODE, row] += 1
-    bits = kernels.episode_key(key, int32(settings[kernels.FIRST_ENV]) + row, integers[_EPISODE, row])
+def _start(floats: Any, row: Any, bits: Any, step: Any) -> None:
+    """Put everyone where an episode begins: `rules.start`."""
     y = _HALF_WIDTH * (TWO * kernels.uniform(bits, step, 0) - ONE)
     angle = math.atan2(-y, _LENGTH)
     ball_x, ball_y = _REACH * math.cos(angle), y + _REACH * math.sin(angle)
@@ -217,7 +213,6 @@ def _start(floats: Any, integers: Any, row: Any, settings: Any, key: Any, step: 
     floats[_BALL_X, row], floats[_BALL_Y, row] = ball_x, ball_y
     floats[_KEEPER_X, row], floats[_KEEPER_Y, row] = _KEEPER_START, keeper_y
     floats[_KEEPER_ANGLE, row] = math.atan2(ball_y - keeper_y, ball_x - _KEEPER_START)
-    integers[_STEPS, row], integers[_OUTCOME, row] = 0, rules.PLAYING
 
 
 @part
@@ -277,37 +272,33 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    episode_stream, noise_stream = int32(settings[kernels.EPISODE_STREAM]), int32(settings[kernels.NOISE_STREAM])
-    episode_base = kernels.stream_key(settings[kernels.SEED], episode_stream)
-    noise_base = kernels.stream_key(settings[kernels.SEED], noise_stream)
-    episode_step, noise_step = kernels.stream_step(episode_stream), kernels.stream_step(noise_stream)
     noise = _F(settings[NOISE])
     body = np.empty(14, np.float32)
     for row in range(len(mask)):
-        was_over = integers[_OUTCOME, row] != rules.PLAYING
+        was_over = integers[OUTCOME_ROW, row] != rules.PLAYING
         body[:] = floats[:, row]
         if mode != kernels.RESTART and mask[row] and not was_over:
-            steps = integers[_STEPS, row]
-            integers[_STEPS, row] = steps + 1
+            steps = integers[STEPS_ROW, row]
+            integers[STEPS_ROW, row] = steps + 1
             end = rules.TIME_LIMIT  # the last action is not played
             if steps + 1 < settings[kernels.MAX_STEPS]:
                 action = discrete[row]
                 first = kernels.parameter(parameters, row, 0, action, places, bounds)
                 second = kernels.parameter(parameters, row, 1, action, places, bounds)
                 aim_x, aim_y = _aim(action, first, second, settings)
-                environment = int32(settings[kernels.FIRST_ENV]) + row
-                bits = kernels.episode_key(noise_base, environment, integers[_EPISODE, row])
-                end = _act(body, steps, aim_x, aim_y, action == rules.KICK_TO, bits, noise_step, noise)
+                bits, step = kernels.noise_key(settings, row, integers[EPISODE_ROW, row])
+                end = _act(body, steps, aim_x, aim_y, action == rules.KICK_TO, bits, step, noise)
                 floats[:, row] = body
-            integers[_OUTCOME, row] = end
+            integers[OUTCOME_ROW, row] = end
             if end == rules.GOAL:
                 rewards[row] = _GOAL_REWARD
             elif end != rules.PLAYING:
                 rewards[row] = -_goal_distance(body, settings[REPAIRS_DISTANCE] != 0.0)
         for reading in range(len(observations)):
-            if kernels.must_restart(mode, reading, was_over, integers[_OUTCOME, row], mask[row]):
-                _start(floats, integers, row, settings, episode_base, episode_step)
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                bits, step = kernels.new_episode(integers, row, settings)
+                _start(floats, row, bits, step)
                 body[:] = floats[:, row]
             _observe(body, settings, observations[reading, row])
-            kernels.report(integers[_OUTCOME, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

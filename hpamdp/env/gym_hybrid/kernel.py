@@ -9,16 +9,14 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import int32
 
 from hpamdp.env import kernels
 from hpamdp.env.gym_hybrid import rules
-from hpamdp.env.kernels import ONE, TURN, TWO, ZERO, inlined, kernel, part, sin_cos
+from hpamdp.env.kernels import ONE, OUTCOME_ROW, STEPS_ROW, TURN, TWO, ZERO, inlined, kernel, part, sin_cos
 
 SLIDES = kernels.OWN  # the problem's own setting
 
 _X, _Y, _SPEED, _HEADING, _COURSE, _TARGET_X, _TARGET_Y = range(7)
-_STEPS, _OUTCOME, _EPISODE = range(3)
 
 _F = np.float32
 _PUSH, _STEP, _BRAKE, _RIGHT_ANGLE = _F(rules.LARGEST_PUSH), _F(rules.STEP), _F(rules._BRAKE), _F(rules._TURN)
@@ -114,23 +112,19 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    stream = int32(settings[kernels.EPISODE_STREAM])
-    base, step = kernels.stream_key(settings[kernels.SEED], stream), kernels.stream_step(stream)
     max_steps, slides = settings[kernels.MAX_STEPS], settings[SLIDES] != 0.0
     latest = _F(max(max_steps - 1.0, 1.0))
     for row in range(len(mask)):
-        was_over = integers[_OUTCOME, row] != rules.GOING_ON
+        was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
-            action, steps = discrete[row], integers[_STEPS, row] + 1
+            action, steps = discrete[row], integers[STEPS_ROW, row] + 1
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
             outcome, rewards[row] = _act(floats, row, action, given, steps >= max_steps, slides)
-            integers[_STEPS, row], integers[_OUTCOME, row] = steps, outcome
+            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, outcome
         for reading in range(len(observations)):
-            if kernels.must_restart(mode, reading, was_over, integers[_OUTCOME, row], mask[row]):
-                integers[_EPISODE, row] += 1
-                integers[_STEPS, row], integers[_OUTCOME, row] = 0, rules.GOING_ON
-                bits = kernels.episode_key(base, int32(settings[kernels.FIRST_ENV]) + row, integers[_EPISODE, row])
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                bits, step = kernels.new_episode(integers, row, settings)
                 _start(floats, row, bits, step)
-            _observe(floats, row, _F(integers[_STEPS, row]) / latest, observations[reading, row])
-            kernels.report(integers[_OUTCOME, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+            _observe(floats, row, _F(integers[STEPS_ROW, row]) / latest, observations[reading, row])
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

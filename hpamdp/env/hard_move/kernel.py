@@ -8,15 +8,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import int32
 
 from hpamdp.env import kernels, point_kernel
 from hpamdp.env.hard_move import rules
-from hpamdp.env.kernels import ZERO, kernel
+from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW, ZERO, kernel
 
 MOTIONS = kernels.OWN  # from here on the settings are the motions of the sets, x and y in turn
-
-_STEPS, _OUTCOME, _EPISODE = range(3)
 
 _F = np.float32
 _FORCE = _F(rules._FORCE)
@@ -42,12 +39,10 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    stream = int32(settings[kernels.EPISODE_STREAM])
-    base, step = kernels.stream_key(settings[kernels.SEED], stream), kernels.stream_step(stream)
     for row in range(len(mask)):
-        was_over = integers[_OUTCOME, row] != rules.GOING_ON
+        was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
-            action, steps = discrete[row], integers[_STEPS, row] + 1
+            action, steps = discrete[row], integers[STEPS_ROW, row] + 1
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
             push = _FORCE * given
             motion_x, motion_y = _F(settings[MOTIONS + 2 * action]), _F(settings[MOTIONS + 2 * action + 1])
@@ -57,13 +52,11 @@ def advance(
             outcome = rules.REACHED if is_hit else rules.GOING_ON
             if outcome == rules.GOING_ON and steps >= settings[kernels.MAX_STEPS]:
                 outcome = rules.TIME_LIMIT
-            integers[_STEPS, row], integers[_OUTCOME, row] = steps, outcome
+            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, outcome
         for reading in range(len(observations)):
-            if kernels.must_restart(mode, reading, was_over, integers[_OUTCOME, row], mask[row]):
-                integers[_EPISODE, row] += 1
-                integers[_STEPS, row], integers[_OUTCOME, row] = 0, rules.GOING_ON
-                bits = kernels.episode_key(base, int32(settings[kernels.FIRST_ENV]) + row, integers[_EPISODE, row])
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                bits, step = kernels.new_episode(integers, row, settings)
                 point_kernel.start(floats, row, bits, step)
             point_kernel.observe(floats, row, observations[reading, row])
-            kernels.report(integers[_OUTCOME, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

@@ -10,16 +10,14 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import int32
 
 from hpamdp.env import kernels
-from hpamdp.env.kernels import ONE, TWO, ZERO, inlined, kernel, part
+from hpamdp.env.kernels import EPISODE_ROW, ONE, OUTCOME_ROW, STEPS_ROW, TWO, ZERO, inlined, kernel, part
 from hpamdp.env.platform import rules
 
 NOISE = kernels.OWN  # the problem's own setting
 
 _X, _SPEED, _ENEMY_X, _ENEMY_SPEED = range(4)
-_STEPS, _OUTCOME, _EPISODE = range(3)
 
 _F = np.float32
 _LEFT, _RIGHT = np.array(rules.LEFT, np.float32), np.array(rules.RIGHT, np.float32)
@@ -121,12 +119,10 @@ def _act(floats: Any, row: Any, action: Any, given: Any, first: Any, bits: Any, 
 
 
 @part
-def _start(floats: Any, integers: Any, row: Any) -> None:
-    """Start a new episode in a row: `rules.start`."""
+def _start(floats: Any, row: Any) -> None:
+    """Put agent and enemy where an episode begins: `rules.start`."""
     floats[_X, row], floats[_SPEED, row] = ZERO, ZERO
     floats[_ENEMY_X, row], floats[_ENEMY_SPEED, row] = _FIRST_START, -_ENEMY
-    integers[_STEPS, row], integers[_OUTCOME, row] = 0, rules.ON_THE_WAY
-    integers[_EPISODE, row] += 1
 
 
 @part
@@ -164,23 +160,22 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    stream = int32(settings[kernels.NOISE_STREAM])
-    base, step = kernels.stream_key(settings[kernels.SEED], stream), kernels.stream_step(stream)
     noise = _F(settings[NOISE])
     for row in range(len(mask)):
-        was_over = integers[_OUTCOME, row] != rules.ON_THE_WAY
+        was_over = integers[OUTCOME_ROW, row] != rules.ON_THE_WAY
         if mode != kernels.RESTART and mask[row] and not was_over:
-            action, steps, before = discrete[row], integers[_STEPS, row], floats[_X, row]
+            action, steps, before = discrete[row], integers[STEPS_ROW, row], floats[_X, row]
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
-            bits = kernels.episode_key(base, int32(settings[kernels.FIRST_ENV]) + row, integers[_EPISODE, row])
+            bits, step = kernels.noise_key(settings, row, integers[EPISODE_ROW, row])
             outcome = _act(floats, row, action, given, steps * rules._NUMBERS_PER_ACTION, bits, step, noise)
             if outcome == rules.ON_THE_WAY and steps + 1 >= settings[kernels.MAX_STEPS]:
                 outcome = rules.TIME_LIMIT
-            integers[_STEPS, row], integers[_OUTCOME, row] = steps + 1, outcome
+            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps + 1, outcome
             rewards[row] = (floats[_X, row] - before) / _END
         for reading in range(len(observations)):
-            if kernels.must_restart(mode, reading, was_over, integers[_OUTCOME, row], mask[row]):
-                _start(floats, integers, row)
+            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
+                kernels.new_episode(integers, row, settings)
+                _start(floats, row)
             _observe(floats, row, observations[reading, row])
-            kernels.report(integers[_OUTCOME, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
     return -1

@@ -19,7 +19,7 @@ product.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
@@ -45,14 +45,18 @@ PARAMETER_LOG_PROB = "parameter_log_prob"
 
 
 class HPPOPolicy(TensorDictModuleBase):
-    """Samples the action from the actor, or takes the most probable one when greedy; records its likelihood."""
+    """Samples the action from the actor, or takes the most probable one when greedy; records its likelihood.
 
-    def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
+    With `samples_when_greedy`, greedy discrete actions are sampled as well, and only their parameters are the means.
+    """
+
+    def __init__(self, actor: HybridActor, specs: PAMDPSpecs, samples_when_greedy: bool = False) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB]
         self.actor = actor
         self.specs = specs
+        self.samples_when_greedy = samples_when_greedy
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -60,7 +64,12 @@ class HPPOPolicy(TensorDictModuleBase):
         observation = td.get(keys.OBSERVATION)
         allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(observation, allowed)
-        discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
+        if not is_greedy():
+            discrete, raw = distribution.sample()
+        elif self.samples_when_greedy:
+            discrete, raw = distribution.sample_discrete()
+        else:
+            discrete, raw = distribution.mode()
         discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, raw)
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
         return td.update(
@@ -103,6 +112,7 @@ class HPPO(OnPolicy, Learner):
         entropy_final: Fraction,
         anneal_frames: PositiveInt,
         max_grad_norm: PositiveFloat,
+        greedy_discrete: Literal["most_probable", "sampled"],
     ) -> None:
         if not min_scale < initial_scale < max_scale:
             raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
@@ -127,14 +137,14 @@ class HPPO(OnPolicy, Learner):
         self.critic = nn.Sequential(
             encoder(specs.observation_dim, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
         )
-        self.policy = HPPOPolicy(self.actor, specs)
+        self.policy = HPPOPolicy(self.actor, specs, samples_when_greedy=greedy_discrete == "sampled")
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
 
     def portable(self) -> dict[str, Any] | None:
-        """Return the actor: see `hpamdp.policies.shared.portable`."""
-        return portable_actor(self.policy.actor, self.specs)
+        """Return the actor, unless it is to sample: see `hpamdp.policies.shared.portable`."""
+        return None if self.policy.samples_when_greedy else portable_actor(self.policy.actor, self.specs)
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.

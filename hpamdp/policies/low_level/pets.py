@@ -20,6 +20,7 @@ Differs from the sources:
 - entries of the state whose changes depend linearly on those of others, such as a target's offset on one's own place,
   are not predicted but derived from them;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
+- weight decay falls as steps come in, as the weight of a prior does;
 - the parameters of each sequence of discrete actions are searched by themselves (`policies.shared.planning`).
 """
 
@@ -48,7 +49,7 @@ from hpamdp.specs import PAMDPSpecs
 
 MEMBER = "member"  # which member an environment follows, int64 [*B]
 
-_CHUNK_ROWS = 8192  # states predicted at once when planning: fits the cache and bounds the memory
+_CHUNK_ROWS = 4096  # states predicted at once when planning: fits the cache and bounds the memory
 _LOG_VARIANCE_LOW, _LOG_VARIANCE_HIGH = -10.0, 1.0  # of a scaled change
 _LARGEST_COPIES = 16  # of a stored step under the problem's symmetries
 
@@ -65,12 +66,21 @@ class MemberNet(nn.Module):
             nn.init.zeros_(layer.bias)
         self.layers = nn.ModuleList(layers)
 
-    def forward(self, x: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
-        """Apply each member to its own slice of `x`, with this precision."""
+    def forward(self, x: Tensor, precision: torch.dtype = torch.float32, output_map: Tensor | None = None) -> Tensor:
+        """Apply each member to its own slice of `x`.
+
+        Args:
+            x: `[E, B, in]`.
+            precision: of the layers.
+            output_map: `[out, M]`, by which the output is multiplied; as part of the last layer, it costs nothing.
+        """
         x = x.mT.to(precision)  # [E, in, B]: see `joined`
         for place, layer in enumerate(self.layers):
             assert isinstance(layer, EnsembleLinear)
-            bias, weight = layer.bias.to(precision), layer.weight.to(precision)
+            terms: tuple[Tensor, Tensor] = layer.bias, layer.weight
+            if output_map is not None and place == len(self.layers) - 1:
+                terms = terms[0] @ output_map, terms[1] @ output_map
+            bias, weight = (term.to(precision) for term in terms)
             x = torch.baddbmm(bias.mT, weight.mT, x)
             if place < len(self.layers) - 1:
                 x = x.relu_()
@@ -164,8 +174,12 @@ class PETSModel(nn.Module):
         """
         direction = self.frame.direction(state, discrete)
         turned = self.frame.turn(state, direction)
-        action = self.action_inputs(self.frame.kind[discrete], own)
-        change, outcome = self.in_frame(turned, action, precision)[1:]
+        x = self._inputs(turned, self.action_inputs(self.frame.kind[discrete], own))
+        if self.is_probabilistic:
+            change = self._sampled(self.transition(x, precision)) @ self._change_map()
+        else:
+            change = self.transition(x, precision, self._change_map())
+        outcome = self._outcome(x, turned, turned + change, precision)
         logit, terminating, continuing = outcome.unbind(-1)
         mean, scale = self.reward_mean, self.reward_scale
         return Prediction(
@@ -185,32 +199,39 @@ class PETSModel(nn.Module):
         value = own[..., self.slot_number] * (kind.unsqueeze(-1) == self.slot_kind)
         return joined(F.one_hot(kind, self.frame.num_kinds).to(own.dtype), value, value.square())
 
-    def in_frame(
-        self, turned: Tensor, action: Tensor, precision: torch.dtype = torch.float32
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Predict a step in the canonical frame.
+    def in_frame(self, turned: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Predict a step in the canonical frame, to learn from it.
 
         Args:
             turned: states `[E, B, observation_dim]`.
             action: of `action_inputs`, `[E, B, *]`.
-            precision: of the networks.
 
         Returns:
-            What the transition networks say, the change of the state `[E, B, observation_dim]` and what the outcome
-            networks say: logit, scaled reward if the step terminates, and if it does not.
+            What the transition networks say, and what the outcome networks say: logit, scaled reward if the step
+            terminates, and if it does not. The loss of the latter does not reach the former.
         """
-        x = joined((turned - self.state_mean) / self.state_scale * self.is_input, action)
-        transition = self.transition(x, precision)
+        x = self._inputs(turned, action)
+        transition = self.transition(x)
         scaled = transition.detach()
-        if self.is_probabilistic:
-            mean, log_variance = self.moments(scaled)
-            scaled = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
-        derivation = (self.is_predicted * self.change_scale).unsqueeze(-1) * self.derivation
-        change = (derivation.mT @ scaled.mT).mT
-        next_turned = turned + change
-        next_x = (next_turned - self.state_mean) / self.state_scale * self.is_changing
-        features = (self.features(turned, next_turned) - self.feature_mean) / self.feature_scale
-        return transition, change, self.outcome(joined(x, next_x, features), precision)
+        change = (self._sampled(scaled) if self.is_probabilistic else scaled) @ self._change_map()
+        return transition, self._outcome(x, turned, turned + change, torch.float32)
+
+    def _inputs(self, turned: Tensor, action: Tensor) -> Tensor:
+        return joined(_scaled(turned, self.state_mean, self.state_scale, self.is_input), action)
+
+    def _outcome(self, x: Tensor, turned: Tensor, next_turned: Tensor, precision: torch.dtype) -> Tensor:
+        next_x = _scaled(next_turned, self.state_mean, self.state_scale, self.is_changing)
+        features = _scaled(self.features(turned, next_turned), self.feature_mean, self.feature_scale)
+        return self.outcome(joined(x, next_x, features), precision)
+
+    def _change_map(self) -> Tensor:
+        """Return what makes changes of the state of scaled changes, `[observation_dim, observation_dim]`."""
+        return (self.is_predicted * self.change_scale).unsqueeze(-1) * self.derivation
+
+    def _sampled(self, transition: Tensor) -> Tensor:
+        """Return scaled changes, sampled from what the transition networks say."""
+        mean, log_variance = self.moments(transition)
+        return mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
 
     def moments(self, transition: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and log-variance of the scaled change, from what the transition networks say."""
@@ -225,8 +246,8 @@ class PETSModel(nn.Module):
         lengths are made, `[*B, 2 observation_dim]`.
         """
         if not self.frame.num_vectors:
-            both = [(state - self.state_mean) / self.state_scale for state in (turned, next_turned)]
-            return joined(both[0], both[1] * self.is_changing).square()
+            mean, scale = self.state_mean, self.state_scale
+            return joined(_scaled(turned, mean, scale), _scaled(next_turned, mean, scale, self.is_changing)).square()
         x, y = self.frame.vectors(turned)
         next_x, next_y = self.frame.vectors(next_turned)
         way_x, way_y = next_x - x, next_y - y
@@ -284,6 +305,12 @@ class PETSModel(nn.Module):
         scale = self.change_scale.double()
         self.derivation.copy_(derivation * scale / scale.unsqueeze(-1))
         self.is_predicted.copy_(torch.tensor(is_predicted, device=change.device).float())
+
+
+def _scaled(rows: Tensor, mean: Tensor, scale: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return `(rows - mean) / scale * mask` in one pass."""
+    factor = 1.0 / scale if mask is None else mask / scale
+    return torch.addcmul(-mean * factor, rows, factor)
 
 
 def _scale_of(rows: Tensor) -> Tensor:
@@ -417,10 +444,12 @@ class PETSPolicy(TensorDictModuleBase):
     def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> Found:
         """Plan from states `[E, N, observation_dim]`: N plans by the mean of all members, or one for each state.
 
+        In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time.
         `allowed` is bool `[N, horizon, num_discrete]`, or `[E, N, horizon, num_discrete]`.
         """
-        rows = self.search.num_sequences * self.search.num_samples
-        size = max(1, _CHUNK_ROWS // rows)
+        search = self.search
+        num_sequences = min(search.num_kept, search.num_sequences) if is_mean else search.num_sequences
+        size = max(1, _CHUNK_ROWS // (num_sequences * search.num_samples))
         found = []
         for begin in range(0, state.shape[1], size):
             piece = state[:, begin : begin + size]
@@ -428,7 +457,8 @@ class PETSPolicy(TensorDictModuleBase):
             if own is not None:
                 own = own[begin : begin + size] if is_mean else own[:, begin : begin + size].flatten(0, 1)
             num_plans = piece.shape[1] if is_mean else piece.shape[:2].numel()
-            part = self.search(self._returns(piece, is_mean), num_plans, state.device, own)
+            first_returns = self._returns_of_single_members(piece[0]) if is_mean else None
+            part = search(self._returns(piece, is_mean), num_plans, state.device, own, first_returns)
             found.append(part if is_mean else Found(*(each.unflatten(0, piece.shape[:2]) for each in part)))
         joined_found = Found(*(torch.cat(part, 0 if is_mean else 1) for part in zip(*found, strict=True)))
         return joined_found if is_mean else Found(*(part.flatten(0, 1) for part in joined_found))
@@ -461,6 +491,21 @@ class PETSPolicy(TensorDictModuleBase):
 
         return returns
 
+    def _returns_of_single_members(self, state: Tensor) -> Returns:
+        """Return what maps sequences to the returns that a single member expects, from states `[N, observation_dim]`.
+
+        Each member serves as many of the states.
+        """
+        num_members, num_states = self.model.num_members, len(state)
+        num_places = -(-num_states // num_members)
+
+        def padded(part: Tensor) -> Tensor:
+            last = part[-1:].expand(num_members * num_places - num_states, *part.shape[1:])
+            return torch.cat([part, last])
+
+        returns = self._returns(padded(state).unflatten(0, (num_members, num_places)), is_mean=False)
+        return lambda steps: returns([SequenceStep(*map(padded, step)) for step in steps])[:num_states]
+
 
 def _each_repeated(rows: Tensor, times: int) -> Tensor:
     """Return `[..., Q, S]` with each of Q repeated, `[..., Q * times, S]`."""
@@ -487,6 +532,7 @@ class PETS(ReplayLearner):
         probabilistic: bool,
         lr: LearningRate,
         weight_decay: NonNegativeFloat,
+        weight_decay_frames: PositiveInt,
         transition_weight: PositiveFloat,
         warmup_frames: PositiveInt,
         updates_per_frame: PositiveFloat,
@@ -501,6 +547,7 @@ class PETS(ReplayLearner):
         num_elites: PositiveInt,
         num_iterations: PositiveInt,
         temperature: PositiveFloat,
+        first_min_deviation: NonNegativeFloat,
         min_deviation: NonNegativeFloat,
         planning_precision: Literal["float32", "bfloat16"],
     ) -> None:
@@ -518,6 +565,8 @@ class PETS(ReplayLearner):
             updates_per_frame=updates_per_frame,
             augment=specs.symmetries is not None if augment == "auto" else augment,
         )
+        self.weight_decay = weight_decay
+        self.weight_decay_frames = weight_decay_frames
         self.transition_weight = transition_weight
         self.model = PETSModel(
             specs,
@@ -536,6 +585,7 @@ class PETS(ReplayLearner):
             num_elites=num_elites,
             num_iterations=num_iterations,
             temperature=temperature,
+            first_min_deviation=first_min_deviation,
             min_deviation=min_deviation,
         )
         self.policy = PETSPolicy(
@@ -568,6 +618,9 @@ class PETS(ReplayLearner):
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples `[num_members, batch_size]` of all stored steps, each with all its mirror images or maps."""
+        decay = self.weight_decay * min(1.0, self.weight_decay_frames / len(self.buffer))
+        for group in self.optimizers["model"].param_groups:
+            group["weight_decay"] = decay
         rows = self.prepared()
         shape = num_batches, self.model.num_members, self.batch_size
         for places in torch.randint(len(rows), shape, device=rows.device):
@@ -616,7 +669,7 @@ class PETS(ReplayLearner):
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update every member from its own minibatch of a sample `[num_members, batch_size]`."""
         ends = sample["terminated"]
-        transition, _, outcome = self.model.in_frame(sample["turned"], sample["action"])
+        transition, outcome = self.model.in_frame(sample["turned"], sample["action"])
         change = sample["change"]
         if self.model.is_probabilistic:
             mean, log_variance = self.model.moments(transition)

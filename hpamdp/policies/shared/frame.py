@@ -105,7 +105,7 @@ class CanonicalFrame(nn.Module):
             return state
         relative = state - self.origin
         crossed = relative.mT.index_select(-2, self.partner).mT * self.partner_sign
-        return state + (cos - 1.0) * (relative * self.is_vector) + sin * crossed
+        return torch.addcmul(state, cos - 1.0, relative * self.is_vector).addcmul(sin, crossed)
 
     def mirror(self, state: Tensor) -> Tensor:
         """Return states mirrored at the x axis."""

@@ -51,6 +51,10 @@ class HybridDistribution(NamedTuple):
         """Return the most probable discrete action `[*B]` and the mean raw parameters `[*B, num_parameters]`."""
         return self.discrete_log_probs.argmax(-1), self.mean
 
+    def sample_discrete(self) -> tuple[Tensor, Tensor]:
+        """Sample discrete actions `[*B]`, with the mean raw parameters `[*B, num_parameters]`."""
+        return sample_index(self.discrete_log_probs), self.mean
+
     def sample_squashed(self) -> tuple[Tensor, Tensor]:
         """Sample squashed parameters in [-1, 1]; return them and their log-densities, each `[*B, num_parameters]`.
 

@@ -75,8 +75,11 @@ class SequenceSearch:
 
     At first, every sequence of discrete actions is tried with a few samples of the parameters, spread evenly over
     their bounds; if there are more than `max_sequences`, so many random ones, in which the first actions occur equally
-    often. Then the best `num_kept` of them are refined: in each iteration, samples from a Gaussian for every parameter,
-    whose mean and deviation are those of the elites of the iteration before.
+    often. Then the best `num_kept` of them are refined, and in each iteration but the first half as many: samples come
+    from a Gaussian for every parameter, whose mean and deviation are those of the elites of the iteration before. Its
+    deviation has a lower bound, which falls from iteration to iteration: where a return is a cliff, such as at the
+    shortest way into a target, the elites' own deviation shrinks before the edge is found. The best sample so far is
+    among the next ones, and the best of the last ones is the plan.
 
     A discrete action alone does not say what is done next: with a categorical distribution for each step, as in
     cross-entropy planning over mixed actions, sequences whose parameters should differ share one Gaussian.
@@ -88,15 +91,17 @@ class SequenceSearch:
         parameter_dims: number of parameters of each discrete action.
         horizon: number of steps in a sequence.
         max_sequences: largest number of discrete sequences tried.
-        num_kept: number of sequences that are refined.
+        num_kept: number of sequences in the second iteration; half as many in each one after it, down to 1.
         num_samples: parameter samples for each sequence in an iteration.
         num_elites: number of the best of them that define the next iteration's Gaussians.
         num_iterations: number of iterations, the first one included.
         temperature: of the elites' weights exp(return / temperature).
-        min_deviation: smallest standard deviation of a parameter, in [-1, 1] units.
+        first_min_deviation: smallest standard deviation of a parameter in the second iteration, in [-1, 1] units.
+        min_deviation: the same in the last iteration. In between it falls geometrically.
 
     Raises:
-        ValueError: more elites than samples, or a search that would try more than 1,000,000,000 actions.
+        ValueError: more elites than samples, deviations that rise, or a search that would try more than 1,000,000,000
+            actions.
     """
 
     def __init__(
@@ -110,10 +115,13 @@ class SequenceSearch:
         num_elites: int,
         num_iterations: int,
         temperature: float,
+        first_min_deviation: float,
         min_deviation: float,
     ) -> None:
         if num_elites > num_samples:
             raise ValueError(f"num_elites={num_elites}, but must be at most num_samples={num_samples}")
+        if min_deviation > first_min_deviation:
+            raise ValueError(f"min_deviation={min_deviation}, but must be at most {first_min_deviation=}")
         if horizon * max_sequences * num_samples * num_iterations > 1e9:
             raise ValueError(
                 f"horizon={horizon}, max_sequences={max_sequences}, num_samples={num_samples}, "
@@ -127,6 +135,7 @@ class SequenceSearch:
         self.num_elites = num_elites
         self.num_iterations = num_iterations
         self.temperature = temperature
+        self.first_min_deviation = first_min_deviation
         self.min_deviation = min_deviation
         own = torch.arange(max(parameter_dims)) < torch.tensor(parameter_dims).unsqueeze(-1)
         self.has_slot = own.float()  # [num_discrete, D]
@@ -168,7 +177,14 @@ class SequenceSearch:
             is_allowed &= is_step_allowed.repeat_interleave(self.num_sequences // step.discrete.shape[1], 1)
         return is_allowed
 
-    def __call__(self, returns: Returns, num_states: int, device: torch.device, allowed: Tensor | None = None) -> Found:
+    def __call__(
+        self,
+        returns: Returns,
+        num_states: int,
+        device: torch.device,
+        allowed: Tensor | None = None,
+        first_returns: Returns | None = None,
+    ) -> Found:
         """Search for `num_states` states at once.
 
         Args:
@@ -176,6 +192,8 @@ class SequenceSearch:
             num_states: N.
             device: where to search.
             allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
+            first_returns: the same as `returns`, but rougher and faster, for the first iteration, which only chooses
+                what is refined; None: `returns`.
         """
         has_slot = self.has_slot.to(device)
         steps = []
@@ -183,10 +201,11 @@ class SequenceSearch:
             mask = has_slot[number].unsqueeze(2)
             shape = *number.shape, self.num_samples, has_slot.shape[-1]
             steps.append(SequenceStep(number, (2.0 * _stratified(shape, device) - 1.0) * mask))
-        value = returns(steps)
+        is_last = self.num_iterations == 1
+        value = returns(steps) if first_returns is None or is_last else first_returns(steps)
         is_allowed = None if allowed is None else self._are_allowed(steps, allowed)
         value = _without_forbidden(value, is_allowed)
-        kept = value.amax(-1).topk(min(self.num_kept, value.shape[1]), -1).indices
+        kept = self._best_sequences(value, self.num_kept)
         value = value.take_along_dim(kept.unsqueeze(-1), 1)
         is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
         # From here on [N, Q, H] and [N, Q, S, H, D], with Q sequences kept.
@@ -195,27 +214,48 @@ class SequenceSearch:
         discrete = torch.stack([step.discrete.gather(1, prefix) for step, prefix in parts], -1)
         row = torch.arange(num_states, device=device)
         unit = torch.stack([step.own[row.unsqueeze(-1), prefix] for step, prefix in parts], -2)
-        mask = has_slot[discrete].unsqueeze(2)
-        mean, deviation = self._gaussians(value, unit)
-        for _ in range(self.num_iterations - 1):
+        for refinement in range(self.num_iterations - 1):
+            if refinement > 0:
+                kept = self._best_sequences(value, self.num_kept >> refinement)
+                value = value.take_along_dim(kept.unsqueeze(-1), 1)
+                is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
+                discrete = discrete.take_along_dim(kept.unsqueeze(-1), 1)
+                unit = unit.take_along_dim(kept[..., None, None, None], 1)
+            mean, deviation = self._gaussians(value, unit, self._lower_bound(refinement))
+            best = _best_samples(value, unit)
             normal = torch.special.ndtri(_stratified(unit.shape, device))
             unit = mean.unsqueeze(2) + deviation.unsqueeze(2) * normal
-            unit[:, :, 0] = mean
-            unit = unit.clamp_(-1.0, 1.0) * mask
+            unit[:, :, -1] = mean
+            unit[:, :, 0] = best
+            unit = unit.clamp_(-1.0, 1.0) * has_slot[discrete].unsqueeze(2)
             value = returns([SequenceStep(discrete[..., h], unit[..., h, :]) for h in range(self.horizon)])
             value = _without_forbidden(value, is_allowed)
-            mean, deviation = self._gaussians(value, unit)
-        best_value, best = value.amax(-1).max(-1)
-        return Found(discrete[row, best, 0], mean[row, best, 0], best_value)
+        best_value, place = value.amax(-1).max(-1)
+        return Found(discrete[row, place, 0], _best_samples(value, unit)[row, place, 0], best_value)
 
-    def _gaussians(self, value: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
+    @staticmethod
+    def _best_sequences(value: Tensor, num: int) -> Tensor:
+        """Return the places `[N, num]` of the sequences with the best samples, of returns `[N, Q, S]`; at least one."""
+        return value.amax(-1).topk(max(1, min(num, value.shape[1])), -1).indices
+
+    def _lower_bound(self, refinement: int) -> float:
+        """Return the smallest deviation in a refinement, counted from 0."""
+        share = refinement / max(1, self.num_iterations - 2)
+        return self.first_min_deviation ** (1.0 - share) * self.min_deviation**share
+
+    def _gaussians(self, value: Tensor, unit: Tensor, lower_bound: float) -> tuple[Tensor, Tensor]:
         """Return mean and deviation `[N, Q, H, D]` of the elites, of returns `[N, Q, S]` of `[N, Q, S, H, D]`."""
         place, weight = elite_weights(value, self.num_elites, self.temperature)
         elites = unit.take_along_dim(place[..., None, None], 2)
         weight = weight[..., None, None]
         mean = (weight * elites).sum(2)
         variance = (weight * (elites - mean.unsqueeze(2)).square()).sum(2)
-        return mean, variance.sqrt().clamp(min=self.min_deviation)
+        return mean, variance.sqrt().clamp(min=lower_bound)
+
+
+def _best_samples(value: Tensor, unit: Tensor) -> Tensor:
+    """Return each sequence's best sample `[N, Q, H, D]`, of returns `[N, Q, S]` of `[N, Q, S, H, D]`."""
+    return unit.take_along_dim(value.argmax(-1)[..., None, None, None], 2).squeeze(2)
 
 
 def _without_forbidden(value: Tensor, is_allowed: Tensor | None) -> Tensor:
@@ -224,6 +264,9 @@ def _without_forbidden(value: Tensor, is_allowed: Tensor | None) -> Tensor:
 
 
 def _stratified(shape: Sequence[int], device: torch.device) -> Tensor:
-    """Return uniform samples in (0, 1), `[N, Q, S, ...]`: for each place, one in each of S equal intervals."""
-    stratum = torch.rand(shape, device=device).argsort(2)
+    """Return uniform samples in (0, 1), `[N, Q, S, ...]`: for each place, one in each of S equal intervals.
+
+    The order of the intervals is the same for all N, since sorting takes longer than all else.
+    """
+    stratum = torch.rand(shape[1:], device=device).argsort(1)
     return ((stratum + torch.rand(shape, device=device)) / shape[2]).clamp_(1e-6, 1.0 - 1e-6)

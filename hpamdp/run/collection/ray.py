@@ -39,6 +39,8 @@ class RayCollection(WorkerCollection):
 
     def _start(self, shares: Sequence[EnvShard], config: Config) -> RayCollector:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        # The learner waits for its actors, to which a local Ray would give niceness 15.
+        os.environ.setdefault("RAY_worker_niceness", "0")
         # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
         own = {"address": "local", "num_cpus": len(shares), "include_dashboard": False}
         init = own if self.address is None else {"address": self.address}

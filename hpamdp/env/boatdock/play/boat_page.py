@@ -24,7 +24,14 @@ from hpamdp.env.page import EpisodeError
 BLOCK, NUM_BLOCKS = 60, 6  # as people had them
 _PRACTICE, _FREE = 10, 120
 # Options of an agent's environment that the page's boats do not have.
-_PLAIN = {"observation": "scaled", "motor_noise": 0.0, "sensor_noise": 0.0, "slip": 0.0}
+_PLAIN = {
+    "observation": "scaled",
+    "motor_noise": 0.0,
+    "sensor_noise": 0.0,
+    "slip": 0.0,
+    "boats": None,
+    "switch_cost": None,
+}
 
 
 class BoatPage:

@@ -1,0 +1,70 @@
+"""Train agents on other boats than people's, and on boats that may be changed inside an episode.
+
+python experiments/options/boats.py WORDS    trains with these words of the command line, and adds a row to boats.csv
+python experiments/options/boats.py          tabulates boats.csv
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+FILE = Path(__file__).resolve().parent / "boats.csv"
+FIGURES = (
+    "score",
+    "success",
+    "steps",
+    "oracle_agreement",
+    "oracle_agreement_weighted",
+    "option_changes",
+    "frames",
+    "cpu_s",
+)
+COLUMNS = ("words", "seed", "score", "ceiling", "share", *FIGURES[1:])
+COMMON = ["film=false", "eval.every=500000"]
+
+
+def train(words: Sequence[str]) -> dict[str, Any]:
+    """Train one agent and return its row."""
+    with tempfile.TemporaryDirectory() as folder:
+        run = [sys.executable, "-m", "hpamdp.cli", *COMMON, *words, f"hydra.run.dir={folder}", "overwrite=true"]
+        subprocess.run(run, check=True)
+        return row_of(json.loads((Path(folder) / "summary.json").read_text()), words)
+
+
+def row_of(summary: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """Return the row of a finished run."""
+    ceiling = summary["references"]["ceiling"]["score"]
+    figures = {name: round(summary[name], 4) for name in FIGURES if name in summary}
+    share = round(summary["score"] / ceiling, 4)
+    return {"words": " ".join(words), "seed": summary["seed"], "ceiling": round(ceiling, 4), "share": share, **figures}
+
+
+def add(row: Mapping[str, Any]) -> None:
+    """Write a row at the end of the file."""
+    is_new = not FILE.exists()
+    with FILE.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, COLUMNS, restval="")
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def main(words: Sequence[str]) -> None:
+    """Train if there are words, and print the table."""
+    if words:
+        add(train(words))
+    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
+    with FILE.open(newline="") as stream:
+        for row in csv.DictReader(stream):
+            print("| " + " | ".join(row[name] for name in COLUMNS) + " |")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
