@@ -18,8 +18,8 @@ PLAYERS = {
     "hard_goal": ["agents/pdqn_hard_goal"],
     "catch_point": ["agents/hppo_catch_point"],
     "hard_move": ["agents/hppo_hard_move_4"],
-    "moving": ["env=moving", "high=none", "low=planner"],
-    "sliding": ["env=sliding", "high=none", "low=planner"],
+    "moving": ["agents/hppo_moving"],
+    "sliding": ["agents/hppo_sliding"],
     "rooms": ["agents/meta_critic_hppo_rooms"],
 }
 

@@ -15,7 +15,7 @@ from hpamdp.run.resume import resolve
 from hpamdp.run.train import run
 
 FOLDER = Path(__file__).resolve().parent.parent / "agents"
-# Those of others have no agents; the released rules are those of the paper's code, for comparisons.
+# Those of others have none, and the released rules are there for comparisons.
 PROBLEMS = {*choices("env")} - {"gymnasium", "boatdock_released"}
 AGENTS = sorted(folder.name for folder in FOLDER.iterdir() if folder.is_dir())
 

@@ -103,7 +103,7 @@ def test_runs_of_a_setting_are_one_row_with_their_mean_and_spread(hooks, tmp_pat
 
 def test_every_domain_has_a_moving_picture_and_none_is_large():
     for name in {*choices("env")} - {"gymnasium", "boatdock_released"}:
-        picture = DOCS / "domains" / f"{name}.gif"
+        picture = page("env", name).with_suffix(".gif")
         assert f"]({picture.name})" in page("env", name).read_text()
         assert picture.stat().st_size < 400_000
 

@@ -31,6 +31,8 @@ AGENTS = {
     "hppo_hard_move_4": [*HARD_MOVE, "env.n=4"],
     "hppo_hard_move_6": [*HARD_MOVE, "env.n=6"],
     "hppo_hard_move_8": [*HARD_MOVE, "env.n=8"],
+    "hppo_moving": ["high=none", "low=hppo", "env=moving"],
+    "hppo_sliding": ["high=none", "low=hppo", "env=sliding"],
     # Its options change inside an episode.
     "meta_critic_hppo_rooms": [
         *("high=meta_critic", "high.hidden_dims=[64,64]", "low=hppo", "env=rooms", "low.gamma=0.97"),

@@ -16,26 +16,26 @@ from omegaconf import OmegaConf
 AGENTS = Path(__file__).resolve().parents[2] / "agents"
 # What of a problem's settings tells one agent from another.
 TOLD = ("controller", "n")
-HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success", "length", "trained for", "CPU")
+HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success", "length", "trained for", "CPU, s")
 
 
 def row(folder: Path) -> list[str]:
     """Return an agent's cells."""
     summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
     env = OmegaConf.load(folder / "config.yaml").env
-    told = [f"env.{name}={env[name]}" for name in TOLD if name in env and env[name] != "choose"]
+    told = [f"{name}={env[name]}" for name in TOLD if name in env and env[name] != "choose"]
     ceiling = summary.get("ceiling")
     return [
         f"`{folder.name}`",
-        f"`{' '.join([f'env={env.name}', *told])}`",
+        ", ".join([env.name, *told]),
         summary["high"],
         summary["low"],
         f"{summary['score']:.3f}",
         "" if ceiling is None else f"{ceiling:.3f}",
         f"{100.0 * summary['success']:.1f} %",
-        f"{summary['steps']:.2f} steps",
-        f"{summary['frames']:,} steps",
-        f"{summary['cpu_s']:.0f} s",
+        f"{summary['steps']:.2f}",
+        f"{summary['frames']:,}",
+        f"{summary['cpu_s']:.0f}",
     ]
 
 
