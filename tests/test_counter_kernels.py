@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import njit
 
 from hpamdp import keys
+from hpamdp.env import counter_rng, kernels
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
@@ -134,3 +137,25 @@ def test_a_subclass_with_rules_of_its_own_has_no_kernel():
 
     env = Level(2)
     assert (env.reset()["observation"] == 0.0).all()
+
+
+def test_a_new_episode_is_counted_and_has_the_keys_of_the_tensor_functions():
+    @njit
+    def begin(integers, settings, bits, steps):
+        for row in range(integers.shape[1]):
+            bits[0, row], steps[0] = kernels.new_episode(integers, row, settings)
+            bits[1, row], steps[1] = kernels.noise_key(settings, row, integers[-1, row])
+
+    seed, first_env, num = 2**35 + 3, 7, 50
+    streams = (counter_rng.EVALUATION, counter_rng.EVALUATION_NOISE)
+    episode = np.arange(num, dtype=np.int32) - 1
+    # A row of the problem's own, then steps, outcome and episode.
+    integers = np.stack([np.full(num, 9, np.int32), np.full(num, 4, np.int32), np.full(num, 2, np.int32), episode])
+    bits, steps = np.zeros((2, num), np.uint32), np.zeros(2, np.uint32)
+    begin(integers, np.array([float(kernels.folded(seed)), *streams, first_env, 100.0]), bits, steps)
+    assert (integers[0] == 9).all() and (integers[1:3] == 0).all() and (integers[3] == episode + 1).all()
+    environment = torch.arange(first_env, first_env + num, dtype=torch.int32)
+    for i, stream in enumerate(streams):
+        key = counter_rng.key_for(counter_rng.seed_tensor(seed), stream, environment, torch.from_numpy(integers[3]))
+        assert np.array_equal(bits[i].view(np.int32), key.bits.numpy())
+        assert steps[i] == key.step & 0xFFFFFFFF

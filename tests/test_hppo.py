@@ -244,3 +244,21 @@ def test_too_few_rows_wait_for_more_and_are_part_of_the_state_dict():
 def test_a_scale_outside_its_range_is_refused():
     with pytest.raises(ValueError, match=r"initial_scale=2.0: must lie between min_scale=0.05 and max_scale=1.0"):
         make(initial_scale=2.0)
+
+
+def test_each_pass_hands_every_gathered_row_to_one_minibatch():
+    learner = make(epochs=2, minibatch_size=4)
+    seen = []
+
+    def update(minibatch):
+        assert all(
+            torch.equal(minibatch["number"], column) for name, column in minibatch.items() if name != "advantage"
+        )
+        seen.append(minibatch["number"])
+        return {"size": torch.tensor(float(len(minibatch["number"])))}
+
+    number = torch.arange(11)
+    rows = TensorDict({"number": number, "same": number.clone(), "advantage": torch.randn(11)}, [11])
+    assert learner.make_passes(rows, update) == {"size": 5.5}
+    for half in (seen[:2], seen[2:]):
+        assert torch.cat(half).sort().values.equal(number)

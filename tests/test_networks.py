@@ -7,7 +7,15 @@ import torch
 from torch import Tensor
 
 from hpamdp.policies.shared import networks
-from hpamdp.policies.shared.networks import EnsembleMLP, HybridCritics, InitialLayer, sample_index, with_clipped_noise
+from hpamdp.policies.shared.networks import (
+    EnsembleMLP,
+    HybridCritics,
+    InitialLayer,
+    mlp,
+    polyak_update,
+    sample_index,
+    with_clipped_noise,
+)
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -118,3 +126,19 @@ def test_clipped_noise_keeps_to_its_bound_and_to_the_actions_and_no_noise_draws_
     before = torch.get_rng_state()
     assert with_clipped_noise(unit, 0.0, 0.2) is unit
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_target_network_moves_the_fraction_tau_of_the_way_and_has_no_gradient():
+    source, target = mlp(3, [5], 2), mlp(3, [5], 2).requires_grad_(False)
+    before = [parameter.clone() for parameter in target.parameters()]
+    polyak_update(target, source, 0.1)
+    for old, parameter, aim in zip(before, target.parameters(), source.parameters(), strict=True):
+        torch.testing.assert_close(parameter, old + 0.1 * (aim - old))
+        assert parameter.grad_fn is None and not aim.equal(parameter)
+
+
+def test_a_network_leaves_its_input_as_it_is():
+    state = -torch.rand(4, 3)
+    kept = state.clone()
+    mlp(3, [5, 5], 2)(state).sum().backward()
+    assert state.equal(kept)

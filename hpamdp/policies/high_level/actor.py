@@ -19,6 +19,7 @@ takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 ti
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -132,7 +133,7 @@ class Actor(OnPolicy, Selector):
             rows["allowed"] = decisions.get(ALLOWED)
         return TensorDict(rows, batch_size=decisions.shape)
 
-    def _update(self, rows: TensorDictBase) -> dict[str, Tensor]:
+    def _update(self, rows: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Make one update from decisions `[B]`; return scalars to log."""
         log_probs = masked_logits(self.logits(rows["state"]), rows.get("allowed", None)).log_softmax(-1)
         log_prob = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)

@@ -19,6 +19,7 @@ product.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import torch
@@ -220,7 +221,7 @@ class HPPO(OnPolicy, Learner):
             batch_size=[int(mask.sum())],
         )
 
-    def _update(self, rows: TensorDictBase, entropy_weight: float) -> dict[str, Tensor]:
+    def _update(self, rows: Mapping[str, Tensor], entropy_weight: float) -> dict[str, Tensor]:
         """Make one optimisation step of actors and critic from a minibatch `[B]`; return scalars."""
         allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION], allowed)

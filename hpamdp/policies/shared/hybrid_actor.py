@@ -88,7 +88,7 @@ class HybridDistribution(NamedTuple):
         probs = self.discrete_log_probs.exp()
         discrete_entropy = -(probs * self.discrete_log_probs).sum(-1)
         gaussian_entropy = self.log_scale + 0.5 * math.log(2 * math.pi * math.e)
-        return discrete_entropy, (probs[..., self.owner] * gaussian_entropy).sum(-1)
+        return discrete_entropy, (probs.index_select(-1, self.owner) * gaussian_entropy).sum(-1)
 
     def sum_of_own(self, values: Tensor) -> Tensor:
         """Return the sums over each discrete action's own parameters, `[*B, num_discrete]`, of values of all of them.
@@ -184,7 +184,7 @@ def encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
         linear = nn.Linear(layer_in, layer_out)
         nn.init.orthogonal_(linear.weight, math.sqrt(2.0))
         nn.init.zeros_(linear.bias)
-        layers += [linear, nn.ReLU()]
+        layers += [linear, nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
 
 

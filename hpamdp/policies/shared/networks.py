@@ -64,7 +64,7 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     dims = [in_dim, *hidden_dims]
     layers: list[nn.Module] = []
     for size, next_size in pairwise(dims):
-        layers += [nn.Linear(size, next_size), nn.ReLU()]
+        layers += [nn.Linear(size, next_size), nn.ReLU(inplace=True)]
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim))
 
 
@@ -92,8 +92,9 @@ def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
 
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move a target network's parameters the fraction `tau` of the way towards the source network's."""
-    for target_parameter, parameter in zip(target.parameters(), source.parameters(), strict=True):
-        target_parameter.lerp_(parameter.detach(), tau)
+    targets, sources = list(target.parameters()), list(source.parameters())
+    with torch.no_grad():
+        torch._foreach_lerp_(targets, sources, tau)
 
 
 class InvertingGradients(torch.autograd.Function):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from torch import Tensor, nn
 
 from hpamdp.specs import PAMDPSpecs
@@ -64,7 +64,9 @@ class OnPolicy(nn.Module):
         self.waiting = []
         return gathered
 
-    def make_passes(self, rows: TensorDict, update: Callable[[TensorDictBase], dict[str, Tensor]]) -> dict[str, float]:
+    def make_passes(
+        self, rows: TensorDict, update: Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
+    ) -> dict[str, float]:
         """Normalise `advantage` over the gathered rows, then make `epochs` passes over them in random minibatches.
 
         Args:
@@ -77,11 +79,12 @@ class OnPolicy(nn.Module):
         advantage = rows["advantage"]
         rows["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
         num_minibatches = len(rows) // self.minibatch_size
+        columns = dict(rows.items())
         scalars: list[dict[str, Tensor]] = []
         for _ in range(self.epochs):
             order = torch.randperm(len(rows), device=rows.device)
             for indices in order.tensor_split(num_minibatches):
-                scalars.append(update(rows[indices]))
+                scalars.append(update({name: column.index_select(0, indices) for name, column in columns.items()}))
         return {name: torch.stack([step[name] for step in scalars]).mean().item() for name in scalars[0]}
 
     def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
