@@ -187,20 +187,19 @@ def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequenc
     optimum = evaluation["optimum"]
     is_best = optimum == optimum.max(1, keepdims=True)
     for boat, name in enumerate(names):
-        chosen: dict[str, Any] = {"label": name, "linewidth": 2.0, "marker": "o", "markersize": 5}
-        best: dict[str, Any] = {"linewidth": 1.1, "linestyle": "--"}
-        for weights, line in (
-            (evaluation["option"] == boat, chosen),
-            (is_best[:, boat] / is_best.sum(1), best),
-        ):
+        shown: list[tuple[np.ndarray, dict[str, Any]]] = [
+            (evaluation["option"] == boat, {"label": name, "linewidth": 2.0, "marker": "o", "markersize": 5}),
+            (is_best[:, boat] / is_best.sum(1), {"linewidth": 1.1, "linestyle": "--"}),
+        ]
+        for weights, line in shown:
             share = np.bincount(bins, weights=weights, minlength=len(centres))[filled] / num[filled]
             axes.plot(centres[filled], share, color=f"C{boat}", **line)
     agreement = is_best[np.arange(len(bins)), evaluation["option"].astype(int)].mean()
-    axes.set(xlim=(0, 360), ylim=(-0.03, 1.03), xticks=edges[::2])
+    axes.set(xlim=(0, 360), ylim=(-0.03, 1.2), xticks=edges[::2], yticks=np.linspace(0.0, 1.0, 6))
     axes.set_xlabel("the goal's bearing, degrees (0 to the right, 90 down); dashed: oracle")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_title(f"Boat chosen (best one in {agreement:.0%})")
-    axes.legend(frameon=False, fontsize=8.5)
+    axes.legend(frameon=False, fontsize=8.5, loc="upper center", ncols=min(len(names), 3))
 
 
 def _draw_outcomes(axes: Axes, outcomes: np.ndarray, people: Mapping[str, float]) -> None:
