@@ -19,6 +19,7 @@ PLAYERS = {
     "catch_point": ["agents/hppo_catch_point"],
     "hard_move": ["agents/hppo_hard_move_4"],
     "moving": ["agents/hppo_moving"],
+    "sliding": ["agents/hppo_sliding"],
     "rooms": ["agents/meta_critic_hppo_rooms"],
 }
 
