@@ -39,8 +39,6 @@ AGENTS = {
         *("agent.termination=learned", "agent.sharing=shared", "low.minibatch_size=512"),
         *("num_envs=128", "steps_per_batch=16", "total_frames=400000", "eval.every=100000"),
     ],
-    # The last layer has three rows for each of 1,024 discrete actions.
-    "hppo_hard_move_10": [*HARD_MOVE, "env.n=10", "low.hidden_dims=[128,40]", SMALL, "total_frames=100000"],
 }
 
 
