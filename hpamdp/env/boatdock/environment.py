@@ -189,7 +189,9 @@ class BoatDockEnv(PAMDPEnv):
     @property
     def _state(self) -> BoatState:
         """The boats as they are; where the kernel moves them, the columns change with them."""
-        return self._columns if self._fleet is None else from_arrays(BoatState, self._fleet.columns())
+        if self._fleet is None:
+            return self._columns
+        return from_arrays(BoatState, (*self._fleet.floats, *self._fleet.integers))
 
     def _put(self, state: BoatState) -> None:
         if self._fleet is None:
