@@ -92,7 +92,7 @@ def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
 
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move a target network's parameters the fraction `tau` of the way towards the source network's."""
-    targets, sources = list(target.parameters()), list(source.parameters())
+    targets, sources = tuple(target.parameters()), tuple(source.parameters())
     with torch.no_grad():
         torch._foreach_lerp_(targets, sources, tau)
 
