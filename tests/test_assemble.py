@@ -57,7 +57,8 @@ def crossing(*words: str) -> Config:
         ),
         (
             "high=ucb agent.termination=steps agent.option_length=3",
-            "agent.termination=steps: env=boatdock keeps an option for an episode; use agent.termination=episode",
+            "agent.termination=steps: env=boatdock keeps an option for an episode; use agent.termination=episode or "
+            "env.switch_cost=0.2",
         ),
         (
             "high=none env=platform agent.termination=steps agent.option_length=3",

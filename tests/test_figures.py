@@ -185,3 +185,17 @@ def test_a_problem_that_draws_nothing_gets_its_learning_curves(tmp_path):
     write_metrics(tmp_path)
     write_evaluation(tmp_path)
     assert [path.name for path in draw_all(tmp_path, PlatformEnv)] == ["learning_curves.png"]
+
+
+def test_the_choice_of_other_boats_is_drawn_by_their_names(tmp_path):
+    rng = np.random.default_rng(1)
+    write_evaluation(tmp_path, option=rng.integers(0, 3, 30), optimum=rng.uniform(2, 4, (30, 3)))
+    write_metrics(tmp_path, ("eval/score", "eval/option_a", "eval/option_b", "eval/option_c"))
+    (tmp_path / "summary.json").write_text(json.dumps({"boats": ["a", "b", "c"], "references": {}}))
+    assert names(tmp_path) == ALL
+    assert [metric.name for metric in BoatDockEnv.curves({"boats": ["a", "b"]})][-2:] == ["option_a", "option_b"]
+    with np.load(tmp_path / "evaluation.npz") as arrays:
+        evaluation = dict(arrays)
+    figure = boats.draw(evaluation, {"boats": ["a", "b", "c"]})["choices.png"]
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["a", "b", "c"]
+    assert boats._episode_title(evaluation, 0, ("a", "b", "c")).endswith(("  a", "  b", "  c"))

@@ -104,7 +104,7 @@ def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int
     axes.set_title(_episode_title(evaluation, episode, names), fontsize=8.5, fontweight="normal", loc="center", pad=2)
 
 
-def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...]) -> str:
+def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...] = ()) -> str:
     title = f"{evaluation['score'][episode]:.2f}"
     boat = int(evaluation["controller"][episode]) if "controller" in evaluation else NOT_CHOSEN
     if "optimum" in evaluation:
