@@ -49,7 +49,7 @@ from hpamdp.specs import PAMDPSpecs
 
 MEMBER = "member"  # which member an environment follows, int64 [*B]
 
-_CHUNK_ROWS = 4096  # states predicted at once when planning: fits the cache and bounds the memory
+_CHUNK_ROWS = 8192  # states predicted at once when planning: fits the cache and bounds the memory
 _LOG_VARIANCE_LOW, _LOG_VARIANCE_HIGH = -10.0, 1.0  # of a scaled change
 _LARGEST_COPIES = 16  # of a stored step under the problem's symmetries
 
