@@ -1,0 +1,161 @@
+"""Time an update of every learner beside its matrix products alone.
+
+python experiments/speed/study.py            prints the table of results.csv
+python experiments/speed/study.py run        measures all learners with one thread, renews results.csv, prints the table
+python experiments/speed/study.py run hppo   measures some learners alone
+
+The products are those that the very updates made, forward and backward: they are noted as PyTorch runs them, and made
+again on other numbers of the same shapes and strides. Both are timed in turns, in CPU time, which leaves out the turns
+of other processes; the fastest turn of each counts.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra import compose, initialize_config_dir
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.collectors import Collector
+
+from hpamdp.analysis.study import Rows, read_csv, write_tables
+from hpamdp.config import conf_dir, read
+from hpamdp.policies.base import Learner
+from hpamdp.run.assemble import Parts, assemble
+
+HERE = Path(__file__).resolve().parent
+LEARNERS = ["hppo", "pdqn", "hyar", "hsac", "paddpg", "dlpa", "pets", "iql", "td3_bc"]
+# So many updates a turn that whatever is done every few updates is done in each: HyAR's codec every 10.
+UPDATES = 20
+TURNS = 6
+STORED = 20_000  # steps before the first turn; fewer where the learner's budget is small
+ATEN = torch.ops.aten
+PRODUCTS = {ATEN.mm.default, ATEN.addmm.default, ATEN.bmm.default, ATEN.baddbmm.default}
+
+Product = tuple[Callable[..., Tensor], list[Any], dict[str, Any]]
+
+
+class Products(TorchDispatchMode):
+    """Notes the matrix products that are made under it, with random numbers in the place of their own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.made: list[Product] = []
+        self._same: dict[Any, Tensor] = {}
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run an operation; note it if it is a product."""
+        kwargs = kwargs or {}
+        if func in PRODUCTS:
+            self.made.append((func, [self._like(each) for each in args], kwargs))
+        return func(*args, **kwargs)
+
+    def _like(self, each: Any) -> Any:
+        if not isinstance(each, Tensor):
+            return each
+        place = (each.dtype, each.shape, each.stride())
+        if place not in self._same:
+            self._same[place] = torch.randn_like(each)  # keeps the strides of what fills its memory
+        return self._same[place]
+
+
+def make(name: str, folder: Path) -> tuple[Parts, Learner, int]:
+    """Return the parts of a run on the congruent boat with its defaults, the learner, and the steps of a batch."""
+    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        words = ["high=none", f"low={name}", "env.controller=congruent", "eval.layouts=10"]
+        config = read(compose("config", [*words, *_of(name)], return_hydra_config=True))
+    torch.manual_seed(0)
+    parts = assemble(config, folder)
+    return parts, parts.agent.learners[0], config.run.num_envs * config.run.steps_per_batch
+
+
+def _of(name: str) -> list[str]:
+    """Return settings that keep the time before the first update short and change nothing of an update."""
+    return ["low.codec_pretrain_updates=10"] if name == "hyar" else []
+
+
+def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int]:
+    """Return what makes updates, and how many it makes: with H-PPO the optimisation steps of a batch."""
+    parts, learner, batch_size = make(name, folder)
+    collector = Collector(
+        parts.env, parts.policy, frames_per_batch=batch_size, total_frames=-1, auto_register_policy_transforms=False
+    )
+    batches = iter(collector)
+    batch = next(batches)
+    mask = torch.ones(batch.shape, dtype=torch.bool)
+    if name == "hppo":
+        return lambda: learner.learn(batch, mask), learner.epochs * (batch.numel() // learner.minibatch_size)
+    stored = 0
+    while stored < min(STORED, 20 * batch_size):
+        learner.add_demonstrations(batch, mask)
+        stored += batch.numel()
+        batch = next(batches)
+    return lambda: learner.update(UPDATES), UPDATES
+
+
+def measure(name: str) -> dict[str, Any]:
+    """Return a row of the table: CPU ms of an update and of its products."""
+    with tempfile.TemporaryDirectory() as folder:
+        update, num_updates = updates_of(name, Path(folder))
+    update()
+    with Products() as products:
+        update()
+    made = products.made
+
+    def floor() -> None:
+        for func, args, kwargs in made:
+            func(*args, **kwargs)
+
+    best = [float("inf"), float("inf")]
+    for _ in range(TURNS):
+        for i, run in enumerate((update, floor)):
+            with torch.set_grad_enabled(i == 0):
+                started = time.process_time()
+                run()
+                best[i] = min(best[i], time.process_time() - started)
+    update_ms, floor_ms = (1_000.0 * seconds / num_updates for seconds in best)
+    return {
+        "learner": name,
+        "update_ms": round(update_ms, 3),
+        "products_ms": round(floor_ms, 3),
+        "ratio": round(update_ms / floor_ms, 2),
+        "products": round(len(made) / num_updates, 1),
+    }
+
+
+def table(rows: Rows) -> str:
+    """Return a line for each learner."""
+    lines = ["| learner | ms an update | ms of its products | ratio | products |", "|---|---|---|---|---|"]
+    for row in rows:
+        lines.append(
+            f"| {row['learner']} | {row['update_ms']:.2f} | {row['products_ms']:.2f} | {row['ratio']:.2f} | "
+            f"{row['products']:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(words: Sequence[str]) -> None:
+    """Measure if asked, tabulate."""
+    if not words:
+        print(table(read_csv(HERE / "results.csv")))
+        return
+    unknown = set(words[1:]) - set(LEARNERS)
+    if words[0] != "run" or unknown:
+        raise SystemExit(f"{' '.join(words)}: the arguments are run and, after it, any of {', '.join(LEARNERS)}")
+    torch.set_num_threads(1)
+    names = words[1:] or LEARNERS
+    rows = {row["learner"]: row for row in read_csv(HERE / "results.csv")}
+    for name in names:
+        rows[name] = measure(name)
+        write_tables(HERE, {"results": [rows[each] for each in LEARNERS if each in rows]})
+    print(table([rows[name] for name in names]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
