@@ -105,6 +105,7 @@ def test_consecutive_presses_use_different_keys(plans: Plan) -> None:
     assert not (repeated & (plans.durations[..., 1:] > 0.0)).any()
 
 
+@pytest.mark.slow
 def test_the_mean_ceiling_has_its_documented_values() -> None:
     score = best_plans(fixed_layouts(2000, seed=0), filled(1, 2000)).score
     assert score[:, CONGRUENT].mean().item() == pytest.approx(3.42, abs=0.03)

@@ -166,6 +166,7 @@ def lines_of(printed: IO[str]) -> list[str]:
     return [line for line in printed.read().splitlines() if line]
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_when_the_reader_of_its_output_is_gone(tmp_path):
     read, write = os.pipe()
     process = started(tmp_path / "run", output=write, start=interpreter)
@@ -177,6 +178,7 @@ def test_ctrl_c_saves_when_the_reader_of_its_output_is_gone(tmp_path):
     assert not json.loads((tmp_path / "run/summary.json").read_text())["finished"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_run_whose_output_is_full_goes_on_and_saves(tmp_path):
     with open("/dev/full", "w") as full:
