@@ -10,7 +10,6 @@ from conftest import make_config
 from PIL import Image
 
 from hpamdp.analysis import film
-from hpamdp.cli import main
 from hpamdp.env.boatdock import film as boat_film
 from hpamdp.env.boatdock import physics
 from hpamdp.run.players import load_player, split_words
@@ -115,18 +114,11 @@ def test_a_path_is_told_from_settings(tmp_path):
     assert split_words([str(tmp_path)]) == (str(tmp_path), [])
 
 
-def watch(monkeypatch, capsys, *words):
-    monkeypatch.setattr("sys.argv", ["hpamdp", "watch", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    return stopped.value.code, capsys.readouterr()
-
-
-def test_watch_writes_a_film(tmp_path, monkeypatch, capsys):
+def test_watch_writes_a_film(tmp_path, hpamdp_command):
     file = tmp_path / "a.gif"
     words = ["high=uniform", "low=random", "--to", str(file), "--episodes", "2", "--size", "60", "--fps", "5"]
-    code, printed = watch(monkeypatch, capsys, *words)
-    assert code == 0 and "2 episodes, scores" in printed.out
+    code, out, _ = hpamdp_command("watch", *words)
+    assert code == 0 and "2 episodes, scores" in out
     with Image.open(file) as image:
         assert image.size == (120, 60)
 
@@ -144,6 +136,6 @@ def test_watch_writes_a_film(tmp_path, monkeypatch, capsys):
         (["low=random", "high=none"], "needs a selector"),
     ],
 )
-def test_watch_tells_a_mistake_in_one_line(monkeypatch, capsys, words, said):
-    code, printed = watch(monkeypatch, capsys, *words)
-    assert code == 2 and said in printed.err and printed.err.count("\n") == 1 and not printed.out
+def test_watch_tells_a_mistake_in_one_line(hpamdp_command, words, said):
+    code, out, err = hpamdp_command("watch", *words)
+    assert code == 2 and said in err and err.count("\n") == 1 and not out

@@ -10,7 +10,6 @@ from contextlib import contextmanager
 import pytest
 from play_players import docked
 
-from hpamdp.cli import main
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.page import EpisodeError
 from hpamdp.run import page_server
@@ -255,17 +254,10 @@ def test_a_disk_that_is_full_is_told_and_the_episode_can_be_sent_again(tmp_path,
         assert send(server, EPISODES[0])[0] == 201
 
 
-def play(monkeypatch, capsys, *words):
-    monkeypatch.setattr("sys.argv", ["hpamdp", "play", *words])
-    with pytest.raises(SystemExit) as stopped:
-        main()
-    return stopped.value.code, capsys.readouterr()
-
-
-def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch, capsys):
+def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch, hpamdp_command):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 1)
-    code, printed = play(monkeypatch, capsys, "--export", str(tmp_path / "site"), "--agent", "none")
-    assert code == 0 and "index.html" in printed.out
+    code, out, _ = hpamdp_command("play", "--export", str(tmp_path / "site"), "--agent", "none")
+    assert code == 0 and "index.html" in out
     assert {file.name for file in (tmp_path / "site").iterdir()} == {*BoatPage.files, "data.js"}
     script = (tmp_path / "site" / "data.js").read_text()
     data = json.loads(script.removeprefix("window.HPAMDP_DATA = ").rstrip(";\n"))
@@ -283,10 +275,10 @@ def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch,
         (["--agent", "none", "--host", "256.1.1.1"], "--host 256.1.1.1"),
     ],
 )
-def test_play_tells_a_mistake_in_one_line(monkeypatch, capsys, words, said):
+def test_play_tells_a_mistake_in_one_line(monkeypatch, hpamdp_command, words, said):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
-    code, printed = play(monkeypatch, capsys, *words)
-    assert code == 2 and said in printed.err and printed.err.count("\n") == 1
+    code, _, err = hpamdp_command("play", *words)
+    assert code == 2 and said in err and err.count("\n") == 1
 
 
 def test_the_page_may_send_episodes_through_a_web_server_that_encrypts(tmp_path):

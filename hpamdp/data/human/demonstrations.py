@@ -101,7 +101,7 @@ class PlayedDemonstrations(Demonstrations):
 def _boats(env: object) -> BoatDockEnv:
     if not isinstance(env, BoatDockEnv):
         raise ValueError("people docked boats; use env=boatdock or data=none")
-    if env.rules.boats is not None or env.rules.switch_cost is not None:
+    if not env.rules.are_peoples:
         raise ValueError(
             "people kept one of their two boats; use data=none, or leave out env.boats and env.switch_cost"
         )

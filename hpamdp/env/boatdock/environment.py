@@ -28,7 +28,7 @@ from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
-from hpamdp.env.boatdock.task import check_arguments, chosen_boats, invalid_press, noise_of_each
+from hpamdp.env.boatdock.task import check_arguments, invalid_press, make_rules
 from hpamdp.env.columns import cloned, from_arrays, overwrite, where
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
@@ -155,9 +155,18 @@ class BoatDockEnv(PAMDPEnv):
         seed: int = 0,
         first_env: int = 0,
     ) -> None:
-        chosen = chosen_boats(boats, controllers)
-        noise = (noise_of_each(motor_noise, chosen), sensor_noise, slip)
-        rules = Rules(controller, keymap, reward, observation, *noise, chosen, switch_cost)
+        rules = make_rules(
+            controller=controller,
+            keymap=keymap,
+            reward=reward,
+            observation=observation,
+            motor_noise=motor_noise,
+            sensor_noise=sensor_noise,
+            slip=slip,
+            boats=boats,
+            controllers=controllers,
+            switch_cost=switch_cost,
+        )
         check_arguments(num_envs, rules)
         if human or recording is not None:
             _check_people(rules, "human" if human else f"recording={recording}")
@@ -571,12 +580,9 @@ class BoatDockEnv(PAMDPEnv):
 
 def _check_people(rules: Rules, what: str) -> None:
     """Refuse what people did where they could not have done it."""
-    if rules.boats is not None:
-        given = f"boats={list(rules.names)}"
-    elif rules.switch_cost is not None:
-        given = f"switch_cost={rules.switch_cost}"
-    else:
+    if rules.are_peoples:
         return
+    given = f"switch_cost={rules.switch_cost}" if rules.boats is None else f"boats={list(rules.names)}"
     raise ValueError(f"BoatDockEnv: {given}: people kept one of their two boats; leave it out, or leave out {what}")
 
 

@@ -136,54 +136,70 @@ def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -
     return figure
 
 
+class _Bins:
+    """Episodes sorted by a value into bins, of which those without an episode are left out.
+
+    Args:
+        values: of the episodes, `[N]`.
+        edges: of the bins.
+
+    Attributes:
+        all_centres: of all bins.
+        centres: of the bins with episodes.
+        num: how many episodes each of them has.
+    """
+
+    def __init__(self, values: np.ndarray, edges: np.ndarray) -> None:
+        self.edges = edges
+        self.all_centres = (edges[:-1] + edges[1:]) / 2.0
+        self._bin = np.clip(np.digitize(values, edges) - 1, 0, len(self.all_centres) - 1)
+        num = np.bincount(self._bin, minlength=len(self.all_centres))
+        self._filled = num > 0
+        self.centres = self.all_centres[self._filled]
+        self.num = num[self._filled]
+
+    def sums(self, weights: np.ndarray) -> np.ndarray:
+        """Return the sum of the episodes' weights `[N]` in each bin with episodes."""
+        return np.bincount(self._bin, weights=weights, minlength=len(self.all_centres))[self._filled]
+
+
 def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: bool) -> None:
-    edges = np.array(OFFSET_EDGES, dtype=float)
-    centres = (edges[:-1] + edges[1:]) / 2.0
-    bins = np.clip(np.digitize(evaluation["bearing_offset"], edges) - 1, 0, len(centres) - 1)
-    num = np.bincount(bins, minlength=len(centres))
-    filled = num > 0
-
-    def shares(is_congruent: np.ndarray) -> np.ndarray:
-        return np.bincount(bins, weights=is_congruent, minlength=len(centres))[filled] / num[filled]
-
+    bins = _Bins(evaluation["bearing_offset"], np.array(OFFSET_EDGES, dtype=float))
     labels = []
-    optimum = evaluation.get("optimum", np.full((len(bins), 2), np.nan))
+    optimum = evaluation.get("optimum", np.full((len(evaluation["option"]), 2), np.nan))
     congruent = evaluation["option"] == CONGRUENT
     title = "Congruent boat chosen"
     if np.isfinite(optimum).all():
         better = optimum[:, CONGRUENT] > optimum[:, INCONGRUENT]
-        oracle = shares(better)
-        axes.plot(centres[filled], oracle, color=INK, linewidth=1.1, marker="s", markersize=4)
+        oracle = bins.sums(better) / bins.num
+        axes.plot(bins.centres, oracle, color=INK, linewidth=1.1, marker="s", markersize=4)
         labels.append((oracle[-1], "oracle", INK))
         title += f" (better boat in {(better == congruent).mean():.0%})"
     if has_people:
         label, colour, dashes = REFERENCES["human"]
-        axes.plot(centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
+        axes.plot(bins.all_centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
         labels.append((HUMAN_CONGRUENT_BY_OFFSET[-1], label, colour))
-    share = shares(congruent)
-    chosen = np.bincount(bins, weights=congruent, minlength=len(centres))[filled].round().astype(int)
+    chosen = bins.sums(congruent)
+    share = chosen / bins.num
     intervals = [
-        binomtest(int(k), int(n)).proportion_ci(0.95, method="wilson") for k, n in zip(chosen, num[filled], strict=True)
+        binomtest(int(k), int(n)).proportion_ci(0.95, method="wilson")
+        for k, n in zip(chosen.round(), bins.num, strict=True)
     ]
     errors = np.maximum([share - [i.low for i in intervals], [i.high for i in intervals] - share], 0.0)
-    axes.errorbar(centres[filled], share, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
+    axes.errorbar(bins.centres, share, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
     labels.append((share[-1], "this agent", AGENT))
-    axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=edges)
+    axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=bins.edges)
     axes.set_xlabel("degrees between the goal's bearing and the congruent boat's nearest key")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_title(title)
-    label_ends(axes, labels, ends=centres[filled][-1] / edges[-1])
+    label_ends(axes, labels, ends=bins.centres[-1] / bins.edges[-1])
 
 
 def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
     """Draw the share of each boat by the goal's bearing; equally good boats share what the planner would choose."""
     to_goal = evaluation["goal"] - evaluation["start"]
     bearing = np.degrees(np.arctan2(to_goal[:, 1], to_goal[:, 0])) % 360.0
-    edges = np.arange(0.0, 361.0, 30.0)
-    centres = (edges[:-1] + edges[1:]) / 2.0
-    bins = np.clip(np.digitize(bearing, edges) - 1, 0, len(centres) - 1)
-    num = np.bincount(bins, minlength=len(centres))
-    filled = num > 0
+    bins = _Bins(bearing, np.arange(0.0, 361.0, 30.0))
     optimum = evaluation["optimum"]
     is_best = optimum == optimum.max(1, keepdims=True)
     for boat, name in enumerate(names):
@@ -192,10 +208,9 @@ def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequenc
             (is_best[:, boat] / is_best.sum(1), {"linewidth": 1.1, "linestyle": "--"}),
         ]
         for weights, line in shown:
-            share = np.bincount(bins, weights=weights, minlength=len(centres))[filled] / num[filled]
-            axes.plot(centres[filled], share, color=f"C{boat}", **line)
-    agreement = is_best[np.arange(len(bins)), evaluation["option"].astype(int)].mean()
-    axes.set(xlim=(0, 360), ylim=(-0.03, 1.2), xticks=edges[::2], yticks=np.linspace(0.0, 1.0, 6))
+            axes.plot(bins.centres, bins.sums(weights) / bins.num, color=f"C{boat}", **line)
+    agreement = is_best[np.arange(len(is_best)), evaluation["option"].astype(int)].mean()
+    axes.set(xlim=(0, 360), ylim=(-0.03, 1.2), xticks=bins.edges[::2], yticks=np.linspace(0.0, 1.0, 6))
     axes.set_xlabel("the goal's bearing, degrees (0 to the right, 90 down); dashed: oracle")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_title(f"Boat chosen (best one in {agreement:.0%})")

@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from hpamdp.env.boatdock.numpy_boats import ActionFormat, NumpyBoats
-from hpamdp.env.boatdock.task import Rules, chosen_boats, noise_of_each
+from hpamdp.env.boatdock.task import make_rules
 from hpamdp.env.faces import Face, VectorFace
 
 
@@ -54,9 +54,18 @@ class BoatDock(Face):
         action_format: ActionFormat = "dict",
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
-        chosen = chosen_boats(boats, controllers)
-        noise = (noise_of_each(motor_noise, chosen), sensor_noise, slip)
-        rules = Rules(controller, keymap, reward, observation, *noise, chosen, switch_cost)
+        rules = make_rules(
+            controller=controller,
+            keymap=keymap,
+            reward=reward,
+            observation=observation,
+            motor_noise=motor_noise,
+            sensor_noise=sensor_noise,
+            slip=slip,
+            boats=boats,
+            controllers=controllers,
+            switch_cost=switch_cost,
+        )
         super().__init__(NumpyBoats(rules, (), action_format), render_mode)
         self._rules = rules
 
@@ -117,9 +126,18 @@ class BoatDockVector(VectorFace):
         compile_rules: bool = False,
         device: Any = "cpu",
     ) -> None:
-        chosen = chosen_boats(boats, controllers)
-        noise = (noise_of_each(motor_noise, chosen), sensor_noise, slip)
-        rules = Rules(controller, keymap, reward, observation, *noise, chosen, switch_cost)
+        rules = make_rules(
+            controller=controller,
+            keymap=keymap,
+            reward=reward,
+            observation=observation,
+            motor_noise=motor_noise,
+            sensor_noise=sensor_noise,
+            slip=slip,
+            boats=boats,
+            controllers=controllers,
+            switch_cost=switch_cost,
+        )
         make_fleet = None
         if compile_rules or str(device) != "cpu":
             # It brings torch along.

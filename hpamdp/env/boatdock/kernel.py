@@ -246,20 +246,23 @@ def _switch(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
             scratch[FUEL * _BLOCK + j] = max(scratch[FUEL * _BLOCK + j] - cost, ZERO)
 
 
+@inlined
+def _controller(numbers: Any, j: Any) -> Any:
+    """Return the held controller of a row, or the chosen one where it holds none."""
+    held = numbers[CONTROLLER * _BLOCK + j]
+    return numbers[_OPTION * _BLOCK + j] if held == task.NOT_CHOSEN else held
+
+
 @part
 def _aim(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
     """Write the directions of the keys to two columns that are free at this moment."""
     if settings[HAS_KEYMAPS] != 0.0:
         for j in range(count):
-            held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
-            controller = option if held == task.NOT_CHOSEN else held
-            dir_x, dir_y = _direction(controller, numbers[KEYMAP * _BLOCK + j], numbers[_KEY * _BLOCK + j])
+            dir_x, dir_y = _direction(_controller(numbers, j), numbers[KEYMAP * _BLOCK + j], numbers[_KEY * _BLOCK + j])
             scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j] = dir_x, dir_y
         return
     for j in range(count):
-        held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
-        controller = option if held == task.NOT_CHOSEN else held
-        place = NUM_SETTINGS + controller * NUM_BOAT_SETTINGS + 1 + 2 * numbers[_KEY * _BLOCK + j]
+        place = NUM_SETTINGS + _controller(numbers, j) * NUM_BOAT_SETTINGS + 1 + 2 * numbers[_KEY * _BLOCK + j]
         scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j] = _F(settings[place]), _F(settings[place + 1])
 
 
@@ -278,9 +281,7 @@ def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
             drawn = uniform(bits, step, index + task.SLIPPED_KEY) * _F(task.NUM_KEYS)
             numbers[_KEY * _BLOCK + j] = int32(drawn)
         if has_motor_noise:
-            held = numbers[CONTROLLER * _BLOCK + j]
-            controller = numbers[_OPTION * _BLOCK + j] if held == task.NOT_CHOSEN else held
-            deviation = _F(settings[NUM_SETTINGS + controller * NUM_BOAT_SETTINGS])
+            deviation = _F(settings[NUM_SETTINGS + _controller(numbers, j) * NUM_BOAT_SETTINGS])
             factor = _F(math.exp(deviation * normal(bits, step, index // 2 + task.MOTOR)))
             scratch[_DURATION * _BLOCK + j] = min(scratch[_DURATION * _BLOCK + j] * factor, _LONGEST)
 
@@ -294,11 +295,10 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
         goal_x, goal_y = scratch[GOAL_X * _BLOCK + j], scratch[GOAL_Y * _BLOCK + j]
         start_x, start_y = scratch[START_X * _BLOCK + j], scratch[START_Y * _BLOCK + j]
         old_vx, old_vy = scratch[VELOCITY_X * _BLOCK + j], scratch[VELOCITY_Y * _BLOCK + j]
-        held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
+        held = numbers[CONTROLLER * _BLOCK + j]
         presses, old_outcome = numbers[PRESSES * _BLOCK + j], numbers[OUTCOME * _BLOCK + j]
         moves = (numbers[_MOVES * _BLOCK + j] != 0) & (old_outcome == task.SAILING)
 
-        controller = option if held == task.NOT_CHOSEN else held
         dir_x, dir_y = scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j]
         new_x, new_y, left, speed, outcome = _press(
             x, y, fuel, goal_x, goal_y, dir_x, dir_y, scratch[_DURATION * _BLOCK + j]
@@ -318,7 +318,7 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
         scratch[VELOCITY_Y * _BLOCK + j] = speed * dir_y if moves else old_vy
         scratch[FUEL * _BLOCK + j] = left if moves else fuel
         scratch[_REWARD * _BLOCK + j] = reward if moves else ZERO
-        numbers[CONTROLLER * _BLOCK + j] = controller if moves else held
+        numbers[CONTROLLER * _BLOCK + j] = _controller(numbers, j) if moves else held
         numbers[PRESSES * _BLOCK + j] = int32(presses + 1) if moves else presses
         numbers[OUTCOME * _BLOCK + j] = outcome if moves else old_outcome
     for j in range(count):

@@ -286,7 +286,7 @@ def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
     """
     position = state.x, state.y, state.goal_x, state.goal_y, state.fuel
     has_choice = rules.controller == "choose"
-    if rules.boats is not None or rules.switch_cost is not None:
+    if not rules.are_peoples:
         plans = _plans_with_boats(rules, *position, state.controller, state.keymap)
         if has_choice:
             return plans
@@ -307,7 +307,7 @@ def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
 
     With a `switch_cost` it is the best one that begins with the boat.
     """
-    if rules.boats is None and rules.switch_cost is None:
+    if rules.are_peoples:
         return best_plans(layout, keymap).score
     fuel = torch.full_like(layout.start_x, TANK)
     return _plans_with_boats(rules, *layout, fuel, torch.full_like(keymap, NOT_CHOSEN), keymap).score

@@ -117,6 +117,11 @@ class Rules(NamedTuple):
         """The names of the boats, in the order of their numbers."""
         return CONTROLLERS if self.boats is None else self.boats.names
 
+    @property
+    def are_peoples(self) -> bool:
+        """Whether the boats are people's two, of which one is kept for the episode."""
+        return self.boats is None and self.switch_cost is None
+
 
 class BoatState(NamedTuple):
     """Columns `[N]`; px from the harbour's centre, fuel in seconds, integers int32.
@@ -179,6 +184,29 @@ def noise_of_each(motor_noise: float | Sequence[float], boats: Boats | None) -> 
         allowed = "one number or two" if num == 2 else f"one number or {num}, one for each boat"
         raise ValueError(f"BoatDockEnv: motor_noise={list(noises)}, but must be {allowed}")
     return noises
+
+
+def make_rules(
+    *,
+    controller: str,
+    keymap: Literal[1, 2, "random"],
+    reward: RewardForm,
+    observation: ObservationForm,
+    motor_noise: float | Sequence[float],
+    sensor_noise: float,
+    slip: float,
+    boats: Sequence[str] | None,
+    controllers: Mapping[str, Sequence[float]] | None,
+    switch_cost: float | None,
+) -> Rules:
+    """Return the settings that a user gives, as BoatDockEnv explains them.
+
+    Raises:
+        ValueError: as `chosen_boats` and `noise_of_each`.
+    """
+    chosen = chosen_boats(boats, controllers)
+    noise = noise_of_each(motor_noise, chosen)
+    return Rules(controller, keymap, reward, observation, noise, sensor_noise, slip, chosen, switch_cost)
 
 
 def check_arguments(num_envs: int, rules: Rules) -> None:
