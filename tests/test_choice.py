@@ -145,6 +145,7 @@ def planned(num_envs: int, seed: int = 0) -> OptionChoiceEnv:
     return OptionChoiceEnv(PlannerPolicy(PAMDPSpecs.from_env(boats)), boats)
 
 
+@pytest.mark.slow
 def test_a_stock_dqn_learns_the_choice_and_beats_either_boat_alone():
     torch.manual_seed(0)
     env = planned(50, seed=5)

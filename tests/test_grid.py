@@ -129,13 +129,19 @@ def test_learners_work_for_each_option_and_shared(sharing, tmp_path):
     assert run(compose_config([*words("ucb", "hyar"), f"agent.sharing={sharing}"]), tmp_path) == 0
 
 
-@pytest.mark.parametrize(
-    ("high", "low"),
-    [
-        *((high, "hppo" if high == "value" else "random") for high in choices("high")),
-        *(("uniform", low) for low in TRAINED),
-    ],
-)
+# Quick: each selector, and a learner of each kind.
+RELOADED = [
+    *((high, "hppo" if high == "value" else "random") for high in choices("high")),
+    *(("uniform", low) for low in ("hppo", "hyar", "pets", "qpamdp")),
+    *(
+        pytest.param("uniform", low, marks=[pytest.mark.slow])
+        for low in TRAINED
+        if low not in ("hppo", "hyar", "pets", "qpamdp")
+    ),
+]
+
+
+@pytest.mark.parametrize(("high", "low"), RELOADED)
 def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(high, low, tmp_path):
     parts = make(high, low, tmp_path)
     collected = parts.env.rollout(20, parts.agent.policy, break_when_any_done=False).contiguous()
