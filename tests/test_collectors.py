@@ -222,7 +222,8 @@ def test_when_a_worker_dies_the_run_names_it_and_saves_its_agent_and_leaves_no_p
     others = multiprocessing.active_children()
 
     def take(self, batch, scalars):
-        os.kill(next(child.pid for child in multiprocessing.active_children() if child not in others), signal.SIGKILL)
+        first = min(child.pid for child in multiprocessing.active_children() if child not in others)
+        os.kill(first, signal.SIGKILL)
 
     monkeypatch.setattr(Recorder, "take", take)
     assert run(compose_config([*SMALL, "collector=multi", "total_frames=4096"]), tmp_path) == 1
