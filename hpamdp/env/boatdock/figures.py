@@ -223,7 +223,7 @@ def _draw_outcomes(axes: Axes, outcomes: np.ndarray, people: Mapping[str, float]
     for row, name in enumerate(names):
         share = (outcomes == OUTCOMES.index(name)).mean()
         axes.barh(row, share, color=_OUTCOME_COLOURS[name], height=0.62)
-        axes.annotate(f"{share:.1%}", (1.16, row), ha="right", va="center", fontsize=8.5, annotation_clip=False)
+        axes.annotate(f"{share:.1%}", (1.19, row), ha="right", va="center", fontsize=8.5, annotation_clip=False)
         if people.get(name) is not None:
             for edge, width in (("white", 4.5), (colour, 2.0)):  # the white edge keeps it apart from the bar
                 axes.plot([people[name]] * 2, [row - 0.38, row + 0.38], color=edge, linewidth=width)
