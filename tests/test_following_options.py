@@ -11,7 +11,7 @@ from toy_options import Toll, steppers
 
 from hpamdp import keys
 from hpamdp.env.decisions import with_decisions
-from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.agent import HierarchicalAgent, with_option
 from hpamdp.policies.base import Selector
 from hpamdp.policies.high_level.fixed import Fixed
 from hpamdp.policies.high_level.uniform import Uniform
@@ -98,6 +98,24 @@ def test_an_option_is_worth_the_discounted_value_of_the_option_that_follows_it(l
     observation = torch.rand(500, 2) * 2 - 1
     assert value(agent, 1, observation) == pytest.approx(1.0, abs=0.15)
     assert value(agent, 0, observation) == pytest.approx(GAMMA, abs=0.15)
+
+
+@pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
+def test_the_advantages_of_hppo_count_what_the_options_earn_that_follow(is_shared):
+    agent = make_agent("hppo", Fixed(SPECS, option="second"), is_shared=is_shared)
+    batch = torch.cat([two_options(agent, 4)] * 2, 1)  # first, second, end of the episode, first, second
+    batch["next", keys.REWARD] = torch.tensor([1.0, 2.0, 4.0, 8.0]).expand(4, 4).unsqueeze(-1).clone()
+    batch = agent.next_options.with_next_option(batch)
+    seen = with_option(batch, 2) if is_shared else batch
+    of_option = [agent.next_options.value(seen[keys.OBSERVATION][:, t], batch[keys.OPTION][:, t]) for t in range(4)]
+    is_mine = torch.ones(4, 4, dtype=torch.bool) if is_shared else batch[keys.OPTION] == 0
+    advantage, target = agent.learners[0].advantages(seen, is_mine)
+    for t in (0, 2):
+        first, second = batch["next", keys.REWARD][:, t : t + 2].squeeze(-1).unbind(1)
+        after = agent.next_options.value(seen["next", keys.OBSERVATION][:, t], torch.ones(4).long())
+        expected = first + GAMMA * after - of_option[t] + GAMMA * 0.95 * (second - of_option[t + 1])
+        torch.testing.assert_close(advantage[:, t], expected)
+        torch.testing.assert_close(target[:, t], expected + of_option[t])
 
 
 def changing_options(option_length: int | None = 2) -> tuple[HierarchicalAgent, TensorDict]:

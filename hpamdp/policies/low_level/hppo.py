@@ -31,7 +31,7 @@ from torch.nn import functional as F
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, is_greedy, option_ends
+from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
@@ -170,21 +170,18 @@ class HPPO(OnPolicy, Learner):
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the generalised advantages and the targets of V, each `[*B, T]`; only the rows in `mask` are valid.
 
-        Bootstrapping stops where the episode terminates. Where an option ends inside its episode, what follows is worth
-        what it is worth under the option chosen next. The trace also stops at truncations and where an option ends,
-        since the next row may be another learner's; the rows of other learners are treated as zeros.
+        Bootstrapping stops where the episode terminates, and the trace at truncations, too. Where options end inside
+        their episodes, the trace goes on through the rows of the options that follow, each with the value of its own
+        learner; where they last as long as their episodes, the rows of other learners are treated as zeros.
         """
         with torch.no_grad():
-            value = torch.zeros(*mask.shape, 1, device=mask.device)
-            next_value = torch.zeros_like(value)
-            reward = torch.zeros_like(value)
-            value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
-            next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
-            next_value = self._with_following(next_value, batch, mask)
-            reward[mask] = batch.get(("next", keys.REWARD))[mask]
-            terminated = batch.get(("next", keys.TERMINATED))
+            if ("next", keys.OPTION_ENDED) in batch.keys(include_nested=True):
+                value, next_value, reward = self._of_all_options(batch)
+            else:
+                value, next_value, reward = self._of_own_option(batch, mask)
+            done, terminated = batch.get(("next", keys.DONE)), batch.get(("next", keys.TERMINATED))
             advantage, target = generalized_advantage_estimate(
-                self.gamma, self.gae_lambda, value, next_value, reward, option_ends(batch), terminated
+                self.gamma, self.gae_lambda, value, next_value, reward, done, terminated
             )
         return advantage.squeeze(-1), target.squeeze(-1)
 
@@ -192,16 +189,27 @@ class HPPO(OnPolicy, Learner):
         """Return V(s), `[N]`."""
         return self.critic(observation).squeeze(-1)
 
-    def _with_following(self, next_value: Tensor, batch: TensorDictBase, mask: Tensor) -> Tensor:
-        """Return the values `[*B, T, 1]` of the next states, with those under the next option where one has ended."""
-        option_ended = batch.get(("next", keys.OPTION_ENDED), None)
-        if option_ended is None:
-            return next_value
-        is_ended = option_ended.squeeze(-1) & mask
-        next_observation = batch.get(("next", keys.OBSERVATION))[is_ended]
-        masks = [batch.get(("next", keys.ACTION_MASK))[is_ended]] if self.specs.has_action_mask else []
-        value = self.following.value(next_observation, batch.get(keys.NEXT_OPTION)[is_ended], *masks)
-        return next_value.index_put((is_ended,), value.unsqueeze(-1))
+    def _of_own_option(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the values of the states and of the next states and the rewards, `[*B, T, 1]`, 0 outside `mask`."""
+        value = torch.zeros(*mask.shape, 1, device=mask.device)
+        next_value = torch.zeros_like(value)
+        reward = torch.zeros_like(value)
+        value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
+        next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
+        reward[mask] = batch.get(("next", keys.REWARD))[mask]
+        return value, next_value, reward
+
+    def _of_all_options(self, batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the values of the states and of the next states, each under its option, and the rewards."""
+        value = self._under(batch.get(keys.OPTION), batch)
+        next_value = self._under(batch.get(keys.NEXT_OPTION), batch.get("next"))
+        return value, next_value, batch.get(("next", keys.REWARD))
+
+    def _under(self, option: Tensor, states: TensorDictBase) -> Tensor:
+        """Return the values `[*B, T, 1]` of states `[*B, T]` under options `[*B, T]`."""
+        observation = states.get(keys.OBSERVATION).flatten(0, -2)
+        masks = [states.get(keys.ACTION_MASK).flatten(0, -2)] if self.specs.has_action_mask else []
+        return self.following.value(observation, option.flatten(), *masks).reshape(*option.shape, 1)
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what an update needs of the rows in `mask`, `[N]`."""
