@@ -8,6 +8,7 @@ import threading
 from contextlib import contextmanager
 
 import pytest
+import torch
 from play_players import docked
 
 from hpamdp.env.boatdock.play.boat_page import BoatPage
@@ -262,6 +263,14 @@ def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch,
     script = (tmp_path / "site" / "data.js").read_text()
     data = json.loads(script.removeprefix("window.HPAMDP_DATA = ").rstrip(";\n"))
     assert data["has_server"] is False and len(data["layouts"]["round"]) == 60
+
+
+def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, monkeypatch, hpamdp_command):
+    monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
+    monkeypatch.setattr(torch, "set_num_threads", (given := []).append)
+    site = str(tmp_path / "site")
+    assert hpamdp_command("play", "--export", site, "--agent", "none", "threads=3")[0] == 0 and given == [3]
+    assert hpamdp_command("play", "--export", site, "--agent", "none")[0] == 0 and given == [3, 1]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
 from hpamdp.env.page import EpisodeError, Page
 from hpamdp.messages import first_line, say, warn
@@ -67,6 +69,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
 
 
 def _page(config: Config, seed: int) -> Page:
+    torch.set_num_threads(config.run.threads)
     check_classes(config)
     env = make_env(config, 1, config.run.resolve_device(), 0)
     page = env.page(seed)
