@@ -364,7 +364,7 @@ class BoatDockEnv(PAMDPEnv):
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return the figures of the ceiling and, with people's two boats, of people and the best, or of a recording."""
-        ceiling = {**super().references(measured)["ceiling"], "success": 1.0}
+        ceiling = {**super().references(measured)["ceiling"], "success": measured.get("ceiling_success", 1.0)}
         if self.has_choice:
             ceiling["oracle_agreement"] = 1.0
         if self.rules.boats is not None:
