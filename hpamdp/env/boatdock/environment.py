@@ -171,7 +171,7 @@ class BoatDockEnv(PAMDPEnv):
         if human or recording is not None:
             _check_people(rules, "human" if human else f"recording={recording}")
         self.option_names = rules.names
-        self.can_change_option = switch_cost is not None
+        self.can_change_option = self.plans_change_options = switch_cost is not None
         self._played = None if recording is None else _figures_of(recording, controller)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
