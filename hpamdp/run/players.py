@@ -13,7 +13,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_choice, check_classes, make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
-from hpamdp.run.resume import resolve, saved_choices
+from hpamdp.run.resume import check_saved_options, resolve, saved_choices
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -63,6 +63,7 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     check_choice(config, env)
     agent = make_agent(config, PAMDPSpecs.from_env(env), device)
     if source is not None:
+        check_saved_options(config, env)
         saved = checkpoint.load(source, agent, device, with_training=False)
         env.set_statistics(saved.states["collection"].get("env", {}))
     return Player(config, agent, make_evaluation(config, env, num_filmed=config.run.eval.layouts))
