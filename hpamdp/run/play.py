@@ -72,7 +72,10 @@ def _page(config: Config, seed: int) -> Page:
     torch.set_num_threads(config.run.threads)
     check_classes(config)
     env = make_env(config, 1, config.run.resolve_device(), 0)
-    page = env.page(seed)
+    try:
+        page = env.page(seed)
+    except ValueError as error:
+        raise ConfigError(f"env: {first_line(error)}") from error
     if page is None:
         raise ConfigError(f"{config.env}: there is no page to play it on")
     return page

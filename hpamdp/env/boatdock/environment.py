@@ -401,10 +401,14 @@ class BoatDockEnv(PAMDPEnv):
         return film.film(track, fps, size, self.rules)
 
     def page(self, seed: int) -> BoatPage:
-        """Return the page on which people dock boats."""
+        """Return the page on which people dock boats.
+
+        Raises:
+            ValueError: the settings are not those of the page, which has people's two boats without noise.
+        """
         from hpamdp.env.boatdock.play.boat_page import BoatPage
 
-        return BoatPage(seed)
+        return BoatPage(seed, self.rules)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
