@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,6 +43,17 @@ def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
     if len(paths) > 1:
         raise ConfigError(f"{' '.join(paths)}: several agents; give one, and settings as KEY=VALUE")
     return (paths[0] if paths else None), [word for word in words if word not in paths]
+
+
+def whole_number(least: int, most: int) -> Callable[[str], int]:
+    """Return what reads a whole number in this range from a command line, for `argparse`."""
+
+    def read_number(text: str) -> int:
+        if not text.isdecimal() or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text}: must be a whole number from {least} to {most}")
+        return int(text)
+
+    return read_number
 
 
 def load_player(path: str | None, settings: Sequence[str]) -> Player:
