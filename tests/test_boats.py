@@ -300,6 +300,25 @@ def test_other_boats_are_not_compared_with_people():
     assert env.measure({**played, "option": equally_good})["oracle_agreement"] == 1.0
 
 
+def test_a_choice_between_equally_good_boats_is_worth_all_that_it_can_be():
+    played = {
+        "outcome": np.ones(3, dtype=int),
+        "score": np.full(3, 3.0),
+        "optimum": np.full((3, 2), 3.5),
+        "option": np.array([0, 1, 1]),
+    }
+    assert BoatDockEnv(1, boats=["incongruent1", "incongruent2"]).measure(played)["oracle_agreement_weighted"] == 1.0
+
+
+def test_the_ceiling_succeeds_where_a_plan_docks_and_nowhere_else():
+    sideways = BoatDockEnv(50, boats=["flat"], controllers={"flat": [0.0, 180.0, 0.0]}, controller="flat")
+    sideways.reset()
+    known = {name: value.numpy() for name, value in sideways.describe().items()}
+    means = sideways.measure({"outcome": np.ones(50, dtype=int), "score": np.full(50, 3.0), **known})
+    docks = (known["optimum"][:, 0] > -1.0).mean()
+    assert 0.0 < docks < 1.0 and sideways.references(means)["ceiling"]["success"] == pytest.approx(docks)
+
+
 def test_the_maps_of_other_boats_are_those_that_their_directions_share():
     assert len(BoatDockEnv(1, boats=THREE).symmetries) == 6
     assert len(BoatDockEnv(1, boats=["congruent", "incongruent2"]).symmetries) == 12

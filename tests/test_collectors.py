@@ -255,6 +255,47 @@ def test_a_terminals_ctrl_c_stops_all_processes_and_the_run_goes_on_in_one(colle
     assert run(compose_config(overrides), tmp_path / "resumed", overrides) == 0 and frames > 3
 
 
+SLEEPER = """
+import multiprocessing
+import pathlib
+import time
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+
+class Sleeper(gymnasium.Env):
+    observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = spaces.Tuple((spaces.Discrete(1), spaces.Tuple((spaces.Box(-1.0, 1.0, (1,)),))))
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        if multiprocessing.parent_process() is not None:
+            pathlib.Path("asleep").touch()
+            time.sleep(1000.0)
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+"""
+
+
+@pytest.mark.slow
+def test_workers_in_the_middle_of_a_step_end_when_the_run_is_killed(tmp_path):
+    (tmp_path / "sleeper.py").write_text(SLEEPER)
+    problem = ["env=gymnasium", "env.entry_point=sleeper:Sleeper", "env.max_steps=4", "high=none"]
+    command = [sys.executable, str(CONF.parent / "run.py"), "collector=multi", *SMALL, *problem]
+    process = subprocess.Popen(command, start_new_session=True, cwd=tmp_path)
+    try:
+        wait_until((tmp_path / "asleep").exists, seconds=240)
+        process.kill()
+        process.wait()
+        wait_until(lambda: not processes_of(process.pid), seconds=20)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
 def wait_until(condition, seconds):
     deadline = time.monotonic() + seconds
     while not condition():

@@ -109,6 +109,14 @@ def test_nothing_is_filmed_where_it_is_turned_off(played):
     assert not config.run.film and make_config(["film=true"]).run.film
 
 
+def test_a_gif_shows_its_pictures_for_as_long_as_they_are_meant_to_in_hundredths_of_a_second(tmp_path):
+    pictures = [np.full((4, 4, 3), shade, np.uint8) for shade in (0, 100, 200)]
+    for fps, milliseconds in ((25.0, 40), (30.0, 30), (40.0, 20), (60.0, 20)):
+        film.write(tmp_path / "a.gif", pictures, fps)
+        with Image.open(tmp_path / "a.gif") as image:
+            assert image.info["duration"] == milliseconds
+
+
 def test_a_path_is_told_from_settings(tmp_path):
     assert split_words(["low=random", "outputs/x"]) == ("outputs/x", ["low=random"])
     assert split_words([str(tmp_path)]) == (str(tmp_path), [])
@@ -131,6 +139,8 @@ def test_watch_writes_a_film(tmp_path, hpamdp_command):
         (["a", "b"], "several agents"),
         (["low=planner", "--to", "film.avi"], r"must end in .gif or .mp4"),
         (["low=planner", "--episodes", "0"], "must be a whole number"),
+        (["low=planner", "--size", "19"], "19: must be a whole number from 20 to 4096"),
+        (["low=planner", "--fps", "60"], "--fps 60: a GIF shows at most 50 pictures a second; write an .mp4"),
         (["low=planner", "--colour", "red"], "--help"),
         (["low=nobody"], "nobody"),
         (["low=random", "high=none"], "needs a selector"),

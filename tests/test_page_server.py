@@ -8,6 +8,7 @@ import threading
 from contextlib import contextmanager
 
 import pytest
+import torch
 from play_players import docked
 
 from hpamdp.env.boatdock.play.boat_page import BoatPage
@@ -264,10 +265,21 @@ def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch,
     assert data["has_server"] is False and len(data["layouts"]["round"]) == 60
 
 
+def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, monkeypatch, hpamdp_command):
+    monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
+    monkeypatch.setattr(torch, "set_num_threads", (given := []).append)
+    site = str(tmp_path / "site")
+    assert hpamdp_command("play", "--export", site, "--agent", "none", "threads=3")[0] == 0 and given == [3]
+    assert hpamdp_command("play", "--export", site, "--agent", "none")[0] == 0 and given == [3, 1]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["env=platform"], "there is no page"),
+        (["env.slip=0.5"], "env: BoatDockEnv: slip=0.5, but the page has 0.0"),
+        (["env.boats=[congruent,incongruent1]"], "boats=['congruent', 'incongruent1'], but the page has none"),
+        (["env.keymap=2"], "keymap=2, but the page has 1"),
         (["--agent", "nowhere"], "no checkpoint there"),
         (["somewhere"], "--agent somewhere"),
         (["--port", "99999"], "whole number"),

@@ -13,6 +13,7 @@ from hpamdp import memory
 from hpamdp.config import GROUPS, ConfigError, read
 from hpamdp.run import assemble as assemble_module
 from hpamdp.run.assemble import assemble
+from hpamdp.run.resume import check_saved_options
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "eval.every=0"]
@@ -105,6 +106,7 @@ REFUSED = [
     ("env.boats=[congruent,incongruent1] high=human", "people kept one of their two boats; leave it out, or leave "),
     ("env.switch_cost=7", "switch_cost=7.0, but must lie between 0 and 6 seconds of fuel"),
     ("env.switch_cost=0.2 env.controller=random high=none", "switch_cost=0.2: controller=random never changes boats"),
+    ("env.switch_cost=0.2 high=oracle low=planner", "low=planner: its plans on env=boatdock change options, but"),
     ("env.switch_cost=0.2 high=human", "switch_cost=0.2: people kept one of their two boats"),
     ("env.switch_cost=0.2 agent.termination=steps agent.option_length=1", "high=ucb is a bandit, which counts what "),
     (
@@ -205,6 +207,45 @@ def saved(tmp_path_factory):
 def test_errors_of_a_resumed_run_name_its_own_parts(word, line, saved, command):
     code, _, err = command(f"resume={saved}", word)
     assert code == 2 and err.count("\n") == 1 and line in err
+
+
+def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
+    first = "env.boats=[congruent,incongruent1]"
+    assert run(config_of(f"{first} high=uniform low=random film=false"), tmp_path / "saved") == 0
+
+    def check(words, setting="low.checkpoint"):
+        config = read(config_of(f"{words} high=uniform low=random {setting}={tmp_path / 'saved'}"))
+        check_saved_options(config, config.env.build(num_envs=1))
+
+    for setting in ("mode=eval checkpoint", "resume", "low.checkpoint"):
+        with pytest.raises(ConfigError, match=r"=.*saved: its agent .* incongruent1, congruent; keep the order$"):
+            check("env.boats=[incongruent1,congruent]", setting)
+    with pytest.raises(ConfigError, match=r"congruent, incongruent1, but env=boatdock has .*2, congruent$"):
+        check("env.boats=[incongruent1,incongruent2,congruent]")
+    capsys.readouterr()
+    check(first)
+    check(f"{first} env.slip=0.5")
+    assert capsys.readouterr().err == ""
+    check("")
+    assert "but env=boatdock has incongruent, congruent, which take their places" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_all_commands_tell_when_the_options_of_a_saved_agent_are_others(command, hpamdp_command):
+    first = "env.boats=[congruent,incongruent1]"
+    assert command(*SMALL, "film=false", first, "high=uniform", "low=random", "hydra.run.dir=saved")[0] == 0
+    chosen = "saved: its agent chooses among congruent, incongruent1, but env=boatdock has"
+    for words in (["mode=eval", "checkpoint=saved"], ["resume=saved"], ["low.checkpoint=saved", "low=random"]):
+        code, _, err = command(*words, "env.boats=[incongruent1,congruent]")
+        assert code == 2 and f"{chosen} incongruent1, congruent; keep the order" in err and err.count("\n") == 1
+    code, _, err = command("mode=eval", "checkpoint=saved", "env.boats=[congruent,incongruent1,incongruent2]")
+    assert code == 2 and err == f"checkpoint={chosen} congruent, incongruent1, incongruent2\n"
+    code, _, err = command("mode=eval", "checkpoint=saved", "env.boats=[incongruent1,incongruent2]")
+    assert code == 0 and f"{chosen} incongruent1, incongruent2, which take their places" in err
+    code, _, err = command("mode=eval", "checkpoint=saved", "env.slip=0.5", "hydra.run.dir=again")
+    assert code == 0 and "take their places" not in err
+    code, _, err = hpamdp_command("watch", "saved", "env.boats=[incongruent1,congruent]")
+    assert code == 2 and "keep the order" in err
 
 
 def test_a_resumed_run_keeps_the_saved_options_of_the_choices_that_it_does_not_change(saved, command, tmp_path):

@@ -16,6 +16,7 @@ from torch import Tensor
 from hpamdp.env.base import PAMDPEnv
 
 SUFFIXES = (".gif", ".mp4")
+GIF_FPS = 50  # the most pictures a second that a GIF shows
 COLUMNS = 3
 # For how long the last picture stays, s.
 _PAUSE = 1.5
@@ -91,7 +92,9 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     samples = [np.asarray(pictures[i]) for i in (0, len(pictures) // 2, -1)]
     palette = Image.fromarray(np.concatenate(samples)).quantize(_GIF_COLOURS)
     indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=round(1000.0 / fps), loop=0)
+    # A GIF counts in hundredths of a second, and viewers show a picture for a tenth of one if it says a hundredth.
+    hundredths = round(100.0 / min(fps, GIF_FPS))
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=10 * hundredths, loop=0)
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:

@@ -67,6 +67,7 @@ class PAMDPEnv(EnvBase):
     discrete_names: tuple[str, ...] = ()  # of the discrete actions, where they have names
     option_actions: tuple[tuple[bool, ...], ...] | None = None  # what `group_actions` has made of the options
     can_change_option: bool = True  # whether an option may end before its episode
+    plans_change_options: bool = False  # whether the planned actions under `oracle` count on that
     parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads

@@ -308,7 +308,6 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
     Raises:
         ConfigError: with the settings to change.
     """
-    termination, freeze = config.run.agent.termination, config.run.low.freeze
     has_selector = config.high.cls is not None
     if has_selector and not env.option_names:
         raise ConfigError(f"{config.high}: {config.env} has no options to choose; use high=none")
@@ -319,28 +318,45 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
     if not has_selector and env.has_choice:
         without = f" or {env.no_choice_setting}" if env.no_choice_setting else ""
         raise ConfigError(f"high=none: {config.env} needs a selector; use another high{without}")
-    if termination != "episode" and not (env.has_choice and env.can_change_option):
-        why = "keeps an option for an episode" if env.has_choice else "has no options"
-        change = f" or {env.change_setting}" if env.has_choice and env.change_setting else ""
-        raise ConfigError(f"agent.termination={termination}: {config.env} {why}; use agent.termination=episode{change}")
-    if freeze and not env.has_choice:
+    if config.run.low.freeze and not env.has_choice:
         raise ConfigError("low.freeze=true: there is no choice left to learn; use low.freeze=false")
-    if freeze and termination != "episode":
-        raise ConfigError(
-            f"agent.termination={termination}: low.freeze=true plays whole episodes; use agent.termination=episode"
-        )
-    if termination != "episode" and getattr(config.high.cls, "is_bandit", False):
-        raise ConfigError(
-            f"agent.termination={termination}: {config.high} is a bandit, which counts what an option pays and nothing "
-            "of what follows it; use agent.termination=episode, high=meta_critic or high=actor"
-        )
-    if termination == "learned" and not getattr(config.high.cls, "ends_options", False):
-        raise ConfigError(
-            f"agent.termination=learned: {config.high} does not decide where options end; use high=option_critic, "
-            "high=meta_critic or agent.termination=steps"
-        )
+    if config.run.agent.termination == "episode":
+        _check_plans(config, env)
+    else:
+        _check_ends(config, env)
     if getattr(config.high.cls, "asks_learners", False) and getattr(config.low.cls, "value", None) is Learner.value:
         raise ConfigError(f"{config.high}: {config.low} has no value to compare; use another low or another high")
+
+
+def _check_plans(config: Config, env: PAMDPEnv) -> None:
+    """Refuse plans that change options where an option lasts for its episode."""
+    for low in config.learners:
+        if env.plans_change_options and "oracle" in getattr(low.cls, "needs", ()):
+            raise ConfigError(
+                f"{low}: its plans on {config.env} change options, but agent.termination=episode keeps them; use "
+                "agent.termination=steps agent.option_length=1"
+            )
+
+
+def _check_ends(config: Config, env: PAMDPEnv) -> None:
+    """Refuse options that end inside their episodes where the problem, the selector or the run has no use for that."""
+    given = f"agent.termination={config.run.agent.termination}"
+    if not (env.has_choice and env.can_change_option):
+        why = "keeps an option for an episode" if env.has_choice else "has no options"
+        change = f" or {env.change_setting}" if env.has_choice and env.change_setting else ""
+        raise ConfigError(f"{given}: {config.env} {why}; use agent.termination=episode{change}")
+    if config.run.low.freeze:
+        raise ConfigError(f"{given}: low.freeze=true plays whole episodes; use agent.termination=episode")
+    if getattr(config.high.cls, "is_bandit", False):
+        raise ConfigError(
+            f"{given}: {config.high} is a bandit, which counts what an option pays and nothing of what follows it; use "
+            "agent.termination=episode, high=meta_critic or high=actor"
+        )
+    if config.run.agent.termination == "learned" and not getattr(config.high.cls, "ends_options", False):
+        raise ConfigError(
+            f"{given}: {config.high} does not decide where options end; use high=option_critic, high=meta_critic or "
+            "agent.termination=steps"
+        )
 
 
 def check_learners_of_options(config: Config, env: PAMDPEnv) -> None:

@@ -188,7 +188,8 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
     own = {name.removeprefix(prefix): value for name, value in members["agent"].items() if name.startswith(prefix)}
     saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
     if own and saved_num != num:
-        raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} learners, but this agent has {num}")
+        learners = "learner" if saved_num == 1 else "learners"
+        raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} {learners}, but this agent has {num}")
     try:
         for i, learner in enumerate(agent.learners):
             assert isinstance(learner, Learner)

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
 from hpamdp.env.page import EpisodeError, Page
 from hpamdp.messages import first_line, say, warn
@@ -18,7 +20,7 @@ from hpamdp.run.assemble import check_classes, make_env
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.folder import POLICY_NAME, SUMMARY_NAME
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
-from hpamdp.run.players import Player, load_player, split_words
+from hpamdp.run.players import Player, load_player, split_words, whole_number
 
 _DESCRIPTION = """\
 Play a problem yourself, beside agents.
@@ -43,9 +45,9 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         "--agent", action="append", metavar="FOLDER", help="an agent to play beside you; none: no agent"
     )
     parser.add_argument("--to", type=Path, default=Path("played.jsonl"), help="file that episodes are added to")
-    parser.add_argument("--seed", type=_seed, default=0, help="of the episodes that people get")
+    parser.add_argument("--seed", type=whole_number(0, 2**31 - 1), default=0, help="of the episodes that people get")
     parser.add_argument("--host", default=_LOOPBACK, help=f"address to listen on ({_LOOPBACK}: this computer alone)")
-    parser.add_argument("--port", type=_port, default=8750, help="0: any that is free (8750)")
+    parser.add_argument("--port", type=whole_number(0, 65535), default=8750, help="0: any that is free (8750)")
     parser.add_argument("--no-browser", action="store_true", help="do not open the browser")
     parser.add_argument("--export", type=Path, metavar="FOLDER", help="write the page as files and serve nothing")
     options = parser.parse_intermixed_args(words)
@@ -67,9 +69,13 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
 
 
 def _page(config: Config, seed: int) -> Page:
+    torch.set_num_threads(config.run.threads)
     check_classes(config)
     env = make_env(config, 1, config.run.resolve_device(), 0)
-    page = env.page(seed)
+    try:
+        page = env.page(seed)
+    except ValueError as error:
+        raise ConfigError(f"env: {first_line(error)}") from error
     if page is None:
         raise ConfigError(f"{config.env}: there is no page to play it on")
     return page
@@ -166,17 +172,3 @@ def serve(page: Page, data: dict[str, Any], options: argparse.Namespace) -> int:
         except KeyboardInterrupt:
             say(f"{options.to}: {episodes.num_added} episodes added")
     return 0
-
-
-def _whole(text: str, largest: int) -> int:
-    if not text.isdecimal() or int(text) > largest:
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 0 to {largest}")
-    return int(text)
-
-
-def _seed(text: str) -> int:
-    return _whole(text, 2**31 - 1)
-
-
-def _port(text: str) -> int:
-    return _whole(text, 65535)

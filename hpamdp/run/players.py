@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_choice, check_classes, make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
-from hpamdp.run.resume import resolve, saved_choices
+from hpamdp.run.resume import check_saved_options, resolve, saved_choices
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -44,6 +45,17 @@ def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
     return (paths[0] if paths else None), [word for word in words if word not in paths]
 
 
+def whole_number(least: int, most: int) -> Callable[[str], int]:
+    """Return what reads a whole number in this range from a command line, for `argparse`."""
+
+    def read_number(text: str) -> int:
+        if not text.isdecimal() or not least <= int(text) <= most:
+            raise argparse.ArgumentTypeError(f"{text}: must be a whole number from {least} to {most}")
+        return int(text)
+
+    return read_number
+
+
 def load_player(path: str | None, settings: Sequence[str]) -> Player:
     """Build a player.
 
@@ -63,6 +75,7 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     check_choice(config, env)
     agent = make_agent(config, PAMDPSpecs.from_env(env), device)
     if source is not None:
+        check_saved_options(config, env)
         saved = checkpoint.load(source, agent, device, with_training=False)
         env.set_statistics(saved.states["collection"].get("env", {}))
     return Player(config, agent, make_evaluation(config, env, num_filmed=config.run.eval.layouts))

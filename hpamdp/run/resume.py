@@ -6,10 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
 from hpamdp.config import GROUPS, Config, ConfigError, chosen_names, compose_saved, read
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.messages import warn
 from hpamdp.run import checkpoint
+from hpamdp.run.assemble import make_env
 
 # Parts of the config that make the agent what it is.
 _AGENT = ("high", "low", "agent", "experiment", "search")
@@ -64,6 +68,46 @@ def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str
     saved = checkpoint.progress_of(file)["config"]
     _anew(overrides, saved, file, where)
     return {group: saved[group]["name"] for group in GROUPS}
+
+
+def check_saved_options(config: Config, env: PAMDPEnv) -> None:
+    """Refuse a saved agent of other options in number or order, and warn where its options have other names.
+
+    An agent knows its options by number alone.
+
+    Args:
+        config: of the run, whose `resume`, `checkpoint` or `low.checkpoint` has the agent.
+        env: the environment of the run.
+
+    Raises:
+        ConfigError: with the options of both.
+    """
+    run = config.run
+    sources = {"resume": run.resume, "checkpoint": run.checkpoint, "low.checkpoint": run.low.checkpoint}
+    where, source = next(((name, path) for name, path in sources.items() if path is not None), ("", None))
+    if source is None:
+        return
+    saved = checkpoint.progress_of(checkpoint.find(source, where))["config"]
+    if saved["env"] == config.to_dict()["env"]:
+        return
+    before, now = _option_names(saved), env.option_names if env.has_choice else ()
+    if not before or not now or before == now:
+        return
+    both = f"{where}={source}: its agent chooses among {', '.join(before)}, but {config.env} has {', '.join(now)}"
+    if len(before) != len(now):
+        raise ConfigError(both)
+    if set(before) == set(now):
+        raise ConfigError(f"{both}; keep the order")
+    warn(f"{both}, which take their places")
+
+
+def _option_names(saved: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the options that a saved run's agent chose among; none where its environment is no longer to be had."""
+    try:
+        env = make_env(read(*compose_saved({**saved, "resume": None, "checkpoint": None})), 1, torch.device("cpu"), 0)
+    except ConfigError:
+        return ()
+    return env.option_names if env.has_choice else ()
 
 
 def _anew(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:

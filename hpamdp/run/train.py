@@ -23,7 +23,7 @@ from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
 from hpamdp.run.collection.base import Collection, WorkerDiedError
 from hpamdp.run.folder import POLICY_NAME, check_unused
 from hpamdp.run.recorder import Recorder
-from hpamdp.run.resume import resolve
+from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
@@ -84,6 +84,7 @@ def _run(
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
     parts = assemble(config, output_dir)
+    check_saved_options(config, parts.env.base_env)
     trainer = Trainer(config, parts, output_dir)
     if source is not None:
         trainer.restore(source)

@@ -11,7 +11,7 @@ from torch import Tensor
 from hpamdp.analysis import film
 from hpamdp.config import ConfigError
 from hpamdp.messages import say
-from hpamdp.run.players import load_player, split_words
+from hpamdp.run.players import load_player, split_words, whole_number
 
 _DESCRIPTION = """\
 Film an agent at its problem.
@@ -32,13 +32,17 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     parser.description = _DESCRIPTION
     parser.add_argument("player", nargs="*", metavar="AGENT or GROUP=CHOICE", help="who plays, and at what")
     parser.add_argument("--to", type=Path, default=Path("episodes.gif"), help="file to write, .gif or .mp4")
-    parser.add_argument("--episodes", type=_positive, default=6, help="how many, side by side (6)")
+    parser.add_argument("--episodes", type=whole_number(1, 10_000), default=6, help="how many, side by side (6)")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes; those of evaluations have seed 0")
-    parser.add_argument("--fps", type=_positive, default=25, help="pictures a second (25)")
-    parser.add_argument("--size", type=_positive, default=320, help="px of an episode, from edge to edge (320)")
+    parser.add_argument("--fps", type=whole_number(1, 10_000), default=25, help="pictures a second (25)")
+    parser.add_argument(
+        "--size", type=whole_number(20, 4096), default=320, help="px of an episode, from edge to edge (320)"
+    )
     options = parser.parse_intermixed_args(words)
     if options.to.suffix not in film.SUFFIXES:
         raise ConfigError(f"--to {options.to}: must end in {' or '.join(film.SUFFIXES)}")
+    if options.to.suffix == ".gif" and options.fps > film.GIF_FPS:
+        raise ConfigError(f"--fps {options.fps}: a GIF shows at most {film.GIF_FPS} pictures a second; write an .mp4")
     path, settings = split_words(options.player)
     if path is None and not settings:
         raise ConfigError("watch: nobody to watch; give a run's folder, or a player such as low=planner high=oracle")
@@ -59,9 +63,3 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     scores = ", ".join(f"{score:.2f}" for score in played["score"])
     say(f"{options.to}: {len(played['score'])} episodes, scores {scores}")
     return 0
-
-
-def _positive(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) <= 10_000:
-        raise argparse.ArgumentTypeError(f"{text}: must be a whole number from 1 to 10000")
-    return int(text)

@@ -171,7 +171,7 @@ class BoatDockEnv(PAMDPEnv):
         if human or recording is not None:
             _check_people(rules, "human" if human else f"recording={recording}")
         self.option_names = rules.names
-        self.can_change_option = switch_cost is not None
+        self.can_change_option = self.plans_change_options = switch_cost is not None
         self._played = None if recording is None else _figures_of(recording, controller)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
@@ -364,7 +364,7 @@ class BoatDockEnv(PAMDPEnv):
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return the figures of the ceiling and, with people's two boats, of people and the best, or of a recording."""
-        ceiling = {**super().references(measured)["ceiling"], "success": 1.0}
+        ceiling = {**super().references(measured)["ceiling"], "success": measured.get("ceiling_success", 1.0)}
         if self.has_choice:
             ceiling["oracle_agreement"] = 1.0
         if self.rules.boats is not None:
@@ -401,10 +401,14 @@ class BoatDockEnv(PAMDPEnv):
         return film.film(track, fps, size, self.rules)
 
     def page(self, seed: int) -> BoatPage:
-        """Return the page on which people dock boats."""
+        """Return the page on which people dock boats.
+
+        Raises:
+            ValueError: the settings are not those of the page, which has people's two boats without noise.
+        """
         from hpamdp.env.boatdock.play.boat_page import BoatPage
 
-        return BoatPage(seed)
+        return BoatPage(seed, self.rules)
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""

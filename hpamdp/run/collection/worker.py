@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import multiprocessing
+import os
+import threading
 import time
 from dataclasses import dataclass
 
@@ -81,6 +84,7 @@ class EnvShard:
 
     def make_env(self) -> TransformedEnv:
         """Build the environments, with their decisions tracked."""
+        _end_with_parent()
         torch.set_num_threads(1)
         agent = self._make_agent()
         if self.low is not None:
@@ -96,3 +100,19 @@ class EnvShard:
 
     def _make_agent(self) -> HierarchicalAgent:
         return make_agent(self.config, self.specs, _CPU)
+
+
+def _end_with_parent() -> None:
+    """End this process when the run's own is killed, be it in the middle of a step.
+
+    By itself TorchRL's worker notices that only when it waits for the next command. Ray ends its actors itself.
+    """
+    parent = multiprocessing.parent_process()
+    if parent is None:
+        return
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -19,19 +19,15 @@ from hpamdp.env.boatdock.reference import (
     HUMAN_SUCCESS_BY_BLOCK,
     OFFSET_EDGES,
 )
+from hpamdp.env.boatdock.task import Boats
 from hpamdp.env.page import EpisodeError
 
 BLOCK, NUM_BLOCKS = 60, 6  # as people had them
 _PRACTICE, _FREE = 10, 120
-# Options of an agent's environment that the page's boats do not have.
-_PLAIN = {
-    "observation": "scaled",
-    "motor_noise": 0.0,
-    "sensor_noise": 0.0,
-    "slip": 0.0,
-    "boats": None,
-    "switch_cost": None,
-}
+# The page's own boats, in the words of an environment's settings.
+_PLAIN = {"boats": None, "switch_cost": None, "motor_noise": 0.0, "sensor_noise": 0.0, "slip": 0.0}
+_OF_PEOPLE = {**_PLAIN, "controller": "choose", "keymap": 1}  # both are chosen on the page
+_OF_AGENTS = {**_PLAIN, "observation": "scaled"}
 
 
 class BoatPage:
@@ -39,12 +35,19 @@ class BoatPage:
 
     Args:
         seed: of the layouts.
+        rules: of the environment.
+
+    Raises:
+        ValueError: the rules are not those of the page.
     """
 
     folder = Path(__file__).resolve().parent / "page"
     files: Sequence[str] = ("index.html", "style.css", "physics.js", "network.js", "game.js")
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, rules: Rules | None = None) -> None:
+        other = _other_setting({} if rules is None else rules._asdict(), _OF_PEOPLE)
+        if other is not None:
+            raise ValueError(f"BoatDockEnv: {other}")
         self.seed = seed
 
     def data(self, agents: Sequence[Mapping[str, Any]], *, has_server: bool) -> dict[str, Any]:
@@ -145,8 +148,16 @@ def _check_agent(agent: Mapping[str, Any]) -> None:
     Raises:
         EpisodeError: with the setting that differs.
     """
-    settings = {**Rules()._asdict(), **agent["env"]}
-    for name, value in _PLAIN.items():
-        given = settings[name]
+    other = _other_setting(agent["env"], _OF_AGENTS)
+    if other is not None:
+        raise EpisodeError(f"{agent['name']}: was trained with env.{other}")
+
+
+def _other_setting(settings: Mapping[str, Any], of_page: Mapping[str, Any]) -> str | None:
+    """Return in words the first setting that differs from the page's; those that are missing do not."""
+    for name, value in of_page.items():
+        given = settings.get(name, value)
         if given != value and given != [value, value] and given != (value, value):
-            raise EpisodeError(f"{agent['name']}: was trained with env.{name}={given}, but the page has {value}")
+            named = list(given.names) if isinstance(given, Boats) else given
+            return f"{name}={named}, but the page has {'none' if value is None else value}"
+    return None
