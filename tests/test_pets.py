@@ -24,7 +24,7 @@ OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False, lr=2e-3,
     weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0, warmup_frames=64, updates_per_frame=2.0,
     batch_size=32, buffer_size=4000,
-    parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
+    posterior_sampling=True, parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 
@@ -395,7 +395,7 @@ def with_opinions(learner: PETS, rewards: list[float]) -> PETS:
     return learner
 
 
-def test_exploring_plans_with_the_environments_own_member_and_greedy_ones_with_all():
+def test_exploring_plans_with_the_environments_own_member_greedy_ones_and_without_posterior_sampling_with_all():
     learner = with_opinions(make(num_members=3), [1.0, 2.0, 6.0])
     state, member = torch.randn(6, 4), torch.tensor([2, 0, 2, 2, 0, 0])
     two_steps = 1.0 + learner.gamma
@@ -410,7 +410,9 @@ def test_exploring_plans_with_the_environments_own_member_and_greedy_ones_with_a
     acting(learner, td.clone())
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acting(learner, td.clone())
-    assert torch.equal(asked[0], member) and asked[1] is None
+    learner.policy.samples_posterior = False
+    acting(learner, td.clone())
+    assert torch.equal(asked[0], member) and asked[1:] == [None, None]
 
 
 @pytest.mark.parametrize("num_states", [1, 7, 10])

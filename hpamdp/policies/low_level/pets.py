@@ -336,6 +336,7 @@ class PETSPolicy(TensorDictModuleBase):
         *,
         gamma: float,
         noise: float,
+        samples_posterior: bool,
         precision: str,
     ) -> None:
         super().__init__()
@@ -347,6 +348,7 @@ class PETSPolicy(TensorDictModuleBase):
         self.specs = specs
         self.gamma = gamma
         self.noise = noise
+        self.samples_posterior = samples_posterior
         self.precision: torch.dtype = getattr(torch, precision)
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
@@ -369,7 +371,7 @@ class PETSPolicy(TensorDictModuleBase):
             is_planned = is_planned & ~done.flatten()
         if is_planned.any():
             allowed = None if allowed is None else allowed[is_planned]
-            found = self.plan(state[is_planned], None if is_greedy() else member[is_planned], allowed)
+            found = self.plan(state[is_planned], member[is_planned] if self._follows_member else None, allowed)
             own = found.own
             if not is_greedy():
                 own = (own + self.noise * torch.randn_like(own)).clamp(-1.0, 1.0)
@@ -394,15 +396,20 @@ class PETSPolicy(TensorDictModuleBase):
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
 
-        Greedily that is by the mean of all members; exploring, by a random member for each observation, so that what
-        members disagree on is tried. As long as nothing is planned, it is 0, and exploring infinite.
+        Greedily that is by the mean of all members; exploring by posterior sampling, by a random member for each
+        observation, so that what members disagree on is tried. As long as nothing is planned, it is 0, and exploring
+        infinite.
         """
         num = len(observation)
         if not bool(self.is_trained):
             return torch.full((num,), 0.0 if is_greedy() else torch.inf, device=observation.device)
         member = torch.randint(self.model.num_members, (num,), device=observation.device)
         allowed = self._allowed(observation, action_mask)
-        return self.plan(observation[:, self.entries], None if is_greedy() else member, allowed).value
+        return self.plan(observation[:, self.entries], member if self._follows_member else None, allowed).value
+
+    @property
+    def _follows_member(self) -> bool:
+        return self.samples_posterior and not is_greedy()
 
     def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> Found:
         """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all.
@@ -538,6 +545,7 @@ class PETS(ReplayLearner):
         updates_per_frame: PositiveFloat,
         batch_size: PositiveInt,
         buffer_size: PositiveInt,
+        posterior_sampling: bool,
         parameter_noise: NonNegativeFloat,
         gamma: PositiveFraction,
         horizon: PositiveInt,
@@ -589,7 +597,14 @@ class PETS(ReplayLearner):
             min_deviation=min_deviation,
         )
         self.policy = PETSPolicy(
-            self.model, search, specs, self.entries, gamma=gamma, noise=parameter_noise, precision=planning_precision
+            self.model,
+            search,
+            specs,
+            self.entries,
+            gamma=gamma,
+            noise=parameter_noise,
+            samples_posterior=posterior_sampling,
+            precision=planning_precision,
         )
         self.to(device)
         self.optimizers = {
