@@ -1,8 +1,9 @@
 """Draw and tabulate how many presses PETS needs to play as well as people, beside people's own learning.
 
 python experiments/few_steps/study.py FOLDER...    gathers the runs of experiment=few_steps in these folders into
-                                                   curves.csv, then draws and tabulates
-python experiments/few_steps/study.py              draws and tabulates the stored csv file
+                                                   curves.csv, those of other learners into augment.csv, then draws
+                                                   and tabulates
+python experiments/few_steps/study.py              draws and tabulates the stored csv files
 """
 
 from __future__ import annotations
@@ -31,22 +32,46 @@ SETTINGS = {
     ("auto", "sparse"): "symmetry declared, sparse reward",
     ("False", "shaped"): "told nothing of symmetry",
 }
+# What an ablation changes, its value otherwise, and what that means.
+ABLATED = {"num_members": 5, "posterior_sampling": True, "updates_per_frame": 10.0, "horizon": 2}
+VARIANTS = {
+    "": "as above",
+    "posterior_sampling=False": "explores by the mean of the members",
+    "num_members=1": "one member",
+    "updates_per_frame=3.0": "3 updates for each press, not 10",
+    "horizon=1": "plans of one press",
+    "horizon=3": "plans of three presses",
+}
+ABLATION_SEEDS = (0, 1, 2)
 COLUMNS = {"frames": "presses", "eval/score": "score", "eval/success": "success", "wall_s": "wall_s"}
 
 
 def gather(runs: Sequence[Run]) -> dict[str, Rows]:
-    """Return a row of `curves` for each evaluation."""
+    """Return a row of `curves` for each evaluation of PETS, and a row of `augment` for each run of another learner."""
     curves: Rows = []
+    augment: Rows = []
     for run in runs:
-        name = {
+        evaluations = [{short: round(row[column], 4) for column, short in COLUMNS.items()} for row in run.evaluations()]
+        name = {"augment": str(run.config.low.augment), "seed": run.summary["seed"]}
+        if run.summary["low"] != "pets":
+            presses = first_at(evaluations, HUMAN_SCORE)
+            augment.append(
+                {"learner": run.summary["low"], **name, "presses": presses, "cpu_s": round(run.summary["cpu_s"], 1)}
+            )
+            continue
+        name |= {
             "boat": run.summary["controller"],
             "reward": "sparse" if run.config.env.reward == "sparse" else "shaped",
-            "augment": str(run.config.low.augment),
-            "seed": run.summary["seed"],
+            "variant": variant(run),
         }
-        for row in run.evaluations():
-            curves.append({**name, **{short: round(row[column], 4) for column, short in COLUMNS.items()}})
-    return {"curves": curves}
+        curves += [name | row for row in evaluations]
+    return {"curves": curves, "augment": augment}
+
+
+def variant(run: Run) -> str:
+    """Return what an ablation changed."""
+    values = {name: getattr(run.config.low, name) for name in ABLATED}
+    return " ".join(f"{name}={value}" for name, value in values.items() if value != ABLATED[name])
 
 
 def first_at(rows: Rows, score: float) -> float:
@@ -64,24 +89,51 @@ def _presses(counts: Sequence[float], statistic: str) -> str:
 
 def table(curves: Rows) -> str:
     """Return a line for each setting and boat."""
-    lines = [
-        "| | boat | seeds | presses to 1.97, median | slowest | to 3.02, median | score after 256 | after 384 |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    lines = _head("| | boat |")
     for (augment, reward), label in SETTINGS.items():
         for boat, task in TASKS.items():
             rows = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == (augment, reward, boat)]
-            if not rows:
-                continue
-            runs = list(groups(rows, "seed").values())
-            human = [first_at(run, HUMAN_SCORE) for run in runs]
-            best = [first_at(run, BEST_SCORE) for run in runs]
-            after = [[row["score"] for row in rows if row["presses"] == presses] for presses in (256, 384)]
-            scores = " | ".join(spread(score) if len(score) == len(runs) else "" for score in after)
-            lines.append(
-                f"| {label} | {task} | {len(runs)} | {_presses(human, 'median')} | {_presses(human, 'slowest')} | "
-                f"{_presses(best, 'median')} | {scores} |"
-            )
+            if rows:
+                lines.append(f"| {label} | {task} {_figures(rows)}")
+    return "\n".join(lines)
+
+
+def ablation_table(curves: Rows) -> str:
+    """Return a line for each variant, on the congruent boat with the seeds that all variants have."""
+    rows = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == ("auto", "shaped", "congruent")]
+    rows = [row for row in rows if row["seed"] in ABLATION_SEEDS]
+    cells = {name: of_name for (name,), of_name in groups(rows, "variant").items()}
+    return "\n".join(
+        [*_head("| |"), *(f"| {label} {_figures(cells[name])}" for name, label in VARIANTS.items() if name in cells)]
+    )
+
+
+def _head(first: str) -> list[str]:
+    columns = ("seeds", "presses to 1.97, median", "slowest", "to 3.02, median", "score after 256", "after 384")
+    return [f"{first} {' | '.join(columns)} |", "|---" * (first.count("|") - 1 + len(columns)) + "|"]
+
+
+def _figures(rows: Rows) -> str:
+    """Return the number of runs, their presses to people's scores, and their scores after 256 and 384 presses."""
+    runs = list(groups(rows, "seed").values())
+    human = [first_at(run, HUMAN_SCORE) for run in runs]
+    best = [first_at(run, BEST_SCORE) for run in runs]
+    after = [[row["score"] for row in rows if row["presses"] == presses] for presses in (256, 384)]
+    scores = " | ".join(spread(score) if len(score) == len(runs) else "" for score in after)
+    return (
+        f"| {len(runs)} | {_presses(human, 'median')} | {_presses(human, 'slowest')} | {_presses(best, 'median')} "
+        f"| {scores} |"
+    )
+
+
+def augment_table(augment: Rows) -> str:
+    """Return a line for each learner: presses to people's score without and with mapped steps."""
+    lines = ["| | seeds | without | `low.augment=true` | CPU of a run with it |", "|---|---|---|---|---|"]
+    for (learner,), rows in groups(augment, "learner").items():
+        cells = {name: of_name for (name,), of_name in groups(rows, "augment").items()}
+        presses = {name: ", ".join(f"{row['presses']:,.0f}" for row in of_name) for name, of_name in cells.items()}
+        cpu = f"{np.mean([row['cpu_s'] for row in cells['True']]):.0f} s"
+        lines.append(f"| {learner} | {len(cells['True'])} | {presses['False']} | {presses['True']} | {cpu} |")
     return "\n".join(lines)
 
 
@@ -95,6 +147,7 @@ def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 
 def draw(curves: Rows, path: Path) -> None:
     """Draw score against presses, a line for each seed, with people's own learning beside them."""
+    curves = [row for row in curves if not row["variant"]]
     figure = Figure(figsize=(11.0, 4.2), layout="constrained")
     for boat, axes in zip(BOATS, figure.subplots(1, 2, sharey=True), strict=True):
         chosen = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == ("auto", "shaped", boat)]
@@ -119,7 +172,8 @@ def main(folders: Sequence[str]) -> None:
         write_tables(HERE, gather(finished(folders)))
     curves = read_csv(HERE / "curves.csv")
     draw(curves, HERE / "curves.png")
-    print(table(curves))
+    plain = [row for row in curves if not row["variant"]]
+    print(table(plain), ablation_table(curves), augment_table(read_csv(HERE / "augment.csv")), sep="\n\n")
 
 
 if __name__ == "__main__":
