@@ -360,13 +360,10 @@ class HyAR(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
-        latent, is_corrected = self.corrected_latent(sample)
-        q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
-        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
-        self.optimizer_step("critics", critic_loss)
-        scalars = {"critic": critic_loss, "redone": is_corrected.float().mean(), "epsilon": self.policy.epsilon}
+        scalars = self.minimise("critics", self._critic_loss, sample)
+        scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(sample["state"], self.allowed(sample))
+            scalars |= self.minimise("actor", self._actor_loss, sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         if self.updates % self.codec_every == 0:
@@ -374,6 +371,13 @@ class HyAR(ReplayLearner):
             if self.updates % (100 * self.codec_every) == 0:
                 self._fit_latent_range()
         return scalars
+
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance from the targets, and scalars."""
+        latent, is_corrected = self.corrected_latent(sample)
+        q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
+        loss = (q - self._target(sample)).square().mean(-1).sum()
+        return loss, {"critic": loss, "redone": is_corrected.float().mean()}
 
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return latents that the codec still decodes to the executed actions, and which of them were corrected, `[B]`.
@@ -422,32 +426,32 @@ class HyAR(ReplayLearner):
         """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
         return batch["reward"] + batch["discount"] * self.next_value(batch)
 
-    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> Tensor:
-        """Update the actor towards higher values of its allowed proposals by the first critic; return the loss."""
-        self.critics.requires_grad_(False)
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""
         proposals = self.actor(state, self.codec.embeddings.detach())
         if not self.actor.is_greedy:
             proposals = self.codec.of_allowed(proposals, allowed)
         q = self.critics(state, proposals, num_members=1)
         loss = -(q if allowed is None or not self.actor.is_greedy else q * allowed).sum(-1).mean()
-        self.optimizer_step("actor", loss)
-        self.critics.requires_grad_(True)
-        return loss
+        return loss, {"actor": loss}
 
-    def _update_codec(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the codec; return the parts of its loss."""
-        mean, log_variance = self.codec.encode(batch["state"], batch["discrete"], batch["unit"])
+        scalars = self.minimise("codec", self._codec_loss, sample)
+        self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
+        return scalars
+
+    def _codec_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the codec's loss and its parts."""
+        state, discrete, executed = sample["state"], sample["discrete"], sample["unit"]
+        mean, log_variance = self.codec.encode(state, discrete, executed)
         z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
-        unit, change = self.codec.decode(batch["state"], batch["discrete"], z)
-        own = self.codec.mask[batch["discrete"]]
-        reconstruction = ((unit - batch["unit"]).square() * own).sum(-1).mean()
+        unit, change = self.codec.decode(state, discrete, z)
+        reconstruction = ((unit - executed).square() * self.codec.mask[discrete]).sum(-1).mean()
         divergence = -0.5 * (1.0 + log_variance - mean.square() - log_variance.exp()).sum(-1).mean()
-        target = (batch["next_state"] - batch["state"]) / self.codec.change_scale
-        dynamics = F.mse_loss(change, target)
+        dynamics = F.mse_loss(change, (sample["next_state"] - state) / self.codec.change_scale)
         loss = reconstruction + self.kl_weight * divergence + self.dynamics_weight * dynamics
-        self.optimizer_step("codec", loss)
-        self.dynamics_error.lerp_(dynamics.detach(), 0.01)
-        return {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
+        return loss, {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
 
     def _fit_latent_range(self) -> None:
         """Set the range of z to the central `latent_coverage` of the encoded stored actions."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -14,6 +14,10 @@ from hpamdp import keys
 from hpamdp.policies.base import Learner
 from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.specs import PAMDPSpecs
+
+Inputs: TypeAlias = Tensor | Mapping[str, Tensor] | TensorDictBase | None
+# Maps what an update sees to the loss and to scalars to log.
+LossFunction = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 
 
 class ReplayLearner(Learner):
@@ -196,15 +200,39 @@ class ReplayLearner(Learner):
         """Make one update from a sample of `sample_batches`; return scalars to log."""
         raise NotImplementedError
 
-    def optimizer_step(self, name: str, loss: Tensor, max_grad_norm: float | None = None) -> None:
-        """Take one step of the named optimizer, with the gradient's norm clipped to `max_grad_norm` if it is given."""
+    def minimise(
+        self, name: str, loss_of: LossFunction, *inputs: Inputs, max_grad_norm: float | None = None
+    ) -> dict[str, Tensor]:
+        """Take one step of the named optimizer down the gradient of a loss; return the scalars of the loss.
+
+        Nothing but the parameters of this optimizer changes, whatever else the loss depends on.
+
+        Args:
+            name: of the optimizer.
+            loss_of: maps the inputs to the loss and to scalars to log.
+            inputs: tensors, tensors by name, or None.
+            max_grad_norm: largest norm of the gradient; None: no limit.
+        """
         optimizer = self.optimizers[name]
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        parameters = [
+            parameter for group in optimizer.param_groups for parameter in group["params"] if parameter.requires_grad
+        ]
+        scalars, gradients = gradients_of(loss_of, parameters, *inputs)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
         if max_grad_norm is not None:
-            parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
             nn.utils.clip_grad_norm_(parameters, max_grad_norm)
         optimizer.step()
+        return scalars
+
+
+def gradients_of(
+    loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs
+) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
+    """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
+    loss, scalars = loss_of(*inputs)
+    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+    return {name: value.detach() for name, value in scalars.items()}, gradients
 
 
 def set_learning_rates(
