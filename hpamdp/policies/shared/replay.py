@@ -232,7 +232,9 @@ def gradients_of(
     """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
     loss, scalars = loss_of(*inputs)
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-    return {name: value.detach() for name, value in scalars.items()}, gradients
+    # A fused optimizer takes it for granted that gradients lie in memory as their parameters do.
+    in_order = tuple(None if gradient is None else gradient.contiguous() for gradient in gradients)
+    return {name: value.detach() for name, value in scalars.items()}, in_order
 
 
 def set_learning_rates(
