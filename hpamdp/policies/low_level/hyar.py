@@ -119,8 +119,15 @@ class HybridCodec(nn.Module):
 
     def decode(self, state: Tensor, discrete: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the parameters `[B, num_parameters]` in [-1, 1] and the predicted change of the state, scaled."""
-        hidden = self.decoder(torch.cat([z, state, self.embeddings[discrete]], -1))
+        hidden = self._hidden(state, discrete, z)
         return self.parameter_head(hidden).tanh(), self.dynamics_head(hidden)
+
+    def change(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
+        """Return the predicted change of the state alone, scaled, `[B, observation_dim]`."""
+        return self.dynamics_head(self._hidden(state, discrete, z))
+
+    def _hidden(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
+        return self.decoder(torch.cat([z, state, self.embeddings[discrete]], -1))
 
     def z_from_unit(self, unit: Tensor) -> Tensor:
         """Map the actor's [-1, 1] onto the central range of the encoded z."""
@@ -245,6 +252,7 @@ class HyARPolicy(TensorDictModuleBase):
 class HyAR(ReplayLearner):
     """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
+    has_compiled_updates = True
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
 
     policy: HyARPolicy
@@ -393,21 +401,23 @@ class HyAR(ReplayLearner):
         discrete = batch["discrete"]
         with torch.no_grad():
             e, z = batch[LATENT].split([self.codec.table.shape[-1], self.codec.latent_dim], -1)
-            _, change = self.codec.decode(state, discrete, self.codec.z_from_unit(z))
+            change = self.codec.change(state, discrete, self.codec.z_from_unit(z))
             target = (batch["next_state"] - state) / self.codec.change_scale
             # A random action's latent is NaN; comparisons with it are false, so it is always encoded anew.
             threshold = self.correction_factor * self.dynamics_error
             is_same_change = (change - target).square().mean(-1) <= threshold
             is_same_discrete = (self.codec.nearest_discrete(e.nan_to_num()) == discrete) & ~e.isnan().any(-1)
             new_e = self.codec.embeddings[discrete]
+            if self.actor.is_greedy:
+                e = new_e  # the critics are asked about these alone
+            else:
+                if self.relabels_with_noise:
+                    new_e = with_clipped_noise(new_e, 0.1, 0.5)
+                e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
             new_z, log_variance = self.codec.encode(state, discrete, batch["unit"])
             if self.relabels_with_noise:
-                new_e = with_clipped_noise(new_e, 0.1, 0.5)
                 new_z = new_z + (0.5 * log_variance).exp() * torch.randn_like(new_z)
-            e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
             z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(new_z))
-            if self.actor.is_greedy:
-                e = self.codec.embeddings[discrete]  # the critics are asked about these alone
         return torch.cat([e, z], -1), ~(is_same_discrete & is_same_change)
 
     @torch.no_grad()
