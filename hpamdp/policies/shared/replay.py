@@ -12,6 +12,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
+from hpamdp.policies.shared.compiling import compiled
 from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.specs import PAMDPSpecs
 
@@ -30,6 +31,9 @@ class ReplayLearner(Learner):
     - `start` and `explore`: what happens at the end of the warm-up, and with every batch after it;
     - `updates_due`: when updates are made.
 
+    Losses that are given to `minimise` as methods can be compiled, see `compile_updates`. A subclass with
+    `has_compiled_updates` promises that `torch.compile` can trace all of them in one piece.
+
     The target of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
     Attributes:
@@ -38,6 +42,7 @@ class ReplayLearner(Learner):
             where there are many; samples then have 0 for the others.
     """
 
+    has_compiled_updates: ClassVar[bool] = False
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     stores_own_parameters: bool = False
 
@@ -74,6 +79,7 @@ class ReplayLearner(Learner):
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+        self._gradients_of = gradients_of
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizers and the replay buffer."""
@@ -94,6 +100,12 @@ class ReplayLearner(Learner):
             self.start()
         self.explore(frames - self.warmup_frames)
         return self._make_updates(self.updates_due(before, frames))
+
+    def compile_updates(self) -> None:
+        """Compile what `minimise` does but for the optimizer's step, each loss at the first update that needs it."""
+        if not self.has_compiled_updates:
+            super().compile_updates()
+        self._gradients_of = compiled(gradients_of)
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Store the transitions in `mask`."""
@@ -217,7 +229,7 @@ class ReplayLearner(Learner):
         parameters = [
             parameter for group in optimizer.param_groups for parameter in group["params"] if parameter.requires_grad
         ]
-        scalars, gradients = gradients_of(loss_of, parameters, *inputs)
+        scalars, gradients = self._gradients_of(loss_of, parameters, *inputs)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         if max_grad_norm is not None:
