@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function that is compiled at its first call for each loss, in some ten seconds of CPU time.
+    """Return a function that is compiled at its first call for each loss, in a few seconds of CPU time.
 
     What was compiled is kept on disk by PyTorch (`TORCHINDUCTOR_CACHE_DIR`), so that the same losses compile faster in
     later runs. Compiled code draws other random numbers from the same seed, and sums in another order.
@@ -32,7 +32,7 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     except InvalidCxxCompiler as error:
         raise ValueError("there is no C++ compiler; install g++ or name one in the variable CXX") from error
     config.trace_autograd_ops = True
-    # Each option's learner has losses of its own.
+    # Each loss of each kind of learner is another version of the same function.
     config.recompile_limit = max(config.recompile_limit, 64)
     fast = torch.compile(function, dynamic=False, fullgraph=True)
 
