@@ -161,7 +161,9 @@ class RunConfig(BaseModel):
     checkpoint: str | None
     resume: str | None
     overwrite: bool
-    film: bool = True  # runs of earlier versions did not save it
+    # Runs of earlier versions did not save these.
+    film: bool = True
+    compile_updates: bool = False
 
     @property
     def num_frames(self) -> int:

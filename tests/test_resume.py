@@ -3,6 +3,7 @@
 import csv
 import itertools
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ import torch
 from conftest import TRAINED, compose_config, forked
 from test_grid import SHORT
 
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.run import checkpoint
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
@@ -111,6 +113,20 @@ def test_every_signal_that_stops_a_run_saves_it(number, tmp_path, monkeypatch):
 def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
     stop_and_resume(words_of(high, low), tmp_path, monkeypatch, *numbers)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("low", ["pdqn", "hyar"])
+def test_a_run_with_compiled_updates_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
+    compile_updates = ReplayLearner.compile_updates
+
+    def compile_afresh(self) -> None:
+        torch.compiler.reset()  # as in another process
+        compile_updates(self)
+
+    monkeypatch.setattr(ReplayLearner, "compile_updates", compile_afresh)
+    stop_and_resume([*words_of("ucb", low), "compile_updates=true"], tmp_path, monkeypatch, signal.SIGINT)
 
 
 def test_a_killed_run_resumes_from_its_last_checkpoint_to_the_last_bit(tmp_path, monkeypatch):

@@ -30,7 +30,8 @@ from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import Parts, assemble
 
 HERE = Path(__file__).resolve().parent
-LEARNERS = ["hppo", "pdqn", "hyar", "hsac", "paddpg", "dlpa", "pets", "iql", "td3_bc"]
+COMPILED = "_compiled"  # ends the names of learners with compile_updates=true
+LEARNERS = ["hppo", "pdqn", "hyar", "hsac", "paddpg", "dlpa", "pets", "iql", "td3_bc", "pdqn_compiled", "hyar_compiled"]
 # So many updates a turn that whatever is done every few updates is done in each: HyAR's codec every 10.
 UPDATES = 20
 TURNS = 6
@@ -80,8 +81,8 @@ def _of(name: str) -> list[str]:
     return ["low.codec_pretrain_updates=10"] if name == "hyar" else []
 
 
-def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int]:
-    """Return what makes updates, and how many it makes: with H-PPO the optimisation steps of a batch."""
+def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int, Learner]:
+    """Return what makes updates, how many it makes (with H-PPO the optimisation steps of a batch), and the learner."""
     parts, learner, batch_size = make(name, folder)
     collector = Collector(
         parts.env, parts.policy, frames_per_batch=batch_size, total_frames=-1, auto_register_policy_transforms=False
@@ -90,23 +91,26 @@ def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int]:
     batch = next(batches)
     mask = torch.ones(batch.shape, dtype=torch.bool)
     if name == "hppo":
-        return lambda: learner.learn(batch, mask), learner.epochs * (batch.numel() // learner.minibatch_size)
+        return lambda: learner.learn(batch, mask), learner.epochs * (batch.numel() // learner.minibatch_size), learner
     stored = 0
     while stored < min(STORED, 20 * batch_size):
         learner.add_demonstrations(batch, mask)
         stored += batch.numel()
         batch = next(batches)
-    return lambda: learner.update(UPDATES), UPDATES
+    return lambda: learner.update(UPDATES), UPDATES, learner
 
 
 def measure(name: str) -> dict[str, Any]:
     """Return a row of the table: CPU ms of an update and of its products."""
     with tempfile.TemporaryDirectory() as folder:
-        update, num_updates = updates_of(name, Path(folder))
+        update, num_updates, learner = updates_of(name.removesuffix(COMPILED), Path(folder))
     update()
     with Products() as products:
         update()
     made = products.made
+    if name.endswith(COMPILED):
+        learner.compile_updates()
+        update()
 
     def floor() -> None:
         for func, args, kwargs in made:

@@ -374,6 +374,14 @@ class Learner(nn.Module):
         """
         raise NotImplementedError
 
+    def compile_updates(self) -> None:
+        """Make updates by code that `torch.compile` compiles. Override it if the learner can.
+
+        Raises:
+            ValueError: it cannot, or this machine cannot.
+        """
+        raise ValueError("its updates cannot be compiled")
+
     def load_networks(self, state: Mapping[str, Tensor]) -> None:
         """Take over what an earlier run's learner has learned, but not how far its run had come (`progress`).
 

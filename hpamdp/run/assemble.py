@@ -77,6 +77,8 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     specs = PAMDPSpecs.from_env(env)
     check_agent_memory(config, specs, device)
     agent = make_agent(config, specs, device)
+    if config.run.compile_updates and config.run.mode != "eval":
+        compile_updates(config, agent)
     is_new = config.run.mode != "eval" and config.run.resume is None
     data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and config.run.low.checkpoint is not None:
@@ -159,6 +161,22 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
         selector_ends_options=config.run.agent.termination == "learned" and selector is not None,
     )
     return agent.to(device)
+
+
+def compile_updates(config: Config, agent: HierarchicalAgent) -> None:
+    """Let the learners compile their updates.
+
+    Raises:
+        ConfigError: one of them cannot, or what follows an option decides what an update computes.
+    """
+    termination = config.run.agent.termination
+    if termination != "episode":
+        raise ConfigError(f"compile_updates=true: goes with agent.termination=episode only, not with {termination}")
+    for low, learner in zip(_learners_of(config, agent.specs), agent.learners, strict=False):
+        try:
+            learner.compile_updates()
+        except ValueError as error:
+            raise ConfigError(f"compile_updates=true: {low}: {error}") from error
 
 
 def _learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:

@@ -70,7 +70,10 @@ class BC(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Make one step up the log-likelihood of transitions `[batch_size]`; return scalars."""
-        distribution: HybridDistribution = self.actor(sample["state"], self.allowed(sample))
+        return self.minimise("actor", self._loss, sample, self.allowed(sample))
+
+    def _loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        distribution: HybridDistribution = self.actor(sample["state"], allowed)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
-        self.optimizer_step("actor", -(discrete_log_prob + parameter_log_prob).mean())
-        return {"discrete_log_prob": discrete_log_prob.mean(), "parameter_log_prob": parameter_log_prob.mean()}
+        scalars = {"discrete_log_prob": discrete_log_prob.mean(), "parameter_log_prob": parameter_log_prob.mean()}
+        return -(discrete_log_prob + parameter_log_prob).mean(), scalars

@@ -442,9 +442,11 @@ class DLPA(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the model from windows `[batch_size, horizon]`."""
-        parts = self.losses(sample)
+        return self.minimise("model", self._loss, sample)
+
+    def _loss(self, windows: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        parts = self.losses(windows)
         loss = torch.zeros((), device=self.frames.device)
         for name, part in parts.items():
             loss = loss + self.loss_weights[name] * part
-        self.optimizer_step("model", loss)
-        return parts
+        return loss, parts

@@ -220,21 +220,19 @@ class HSAC(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the temperatures. Return scalars."""
-        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
-        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
-        self.optimizer_step("critics", critic_loss)
-        discrete_temperature, parameter_temperature = self.temperatures()
-        scalars = {
-            "critic": critic_loss,
-            "q": q.mean(),
-            "discrete_temperature": discrete_temperature,
-            "parameter_temperature": parameter_temperature,
-        }
+        scalars = self.minimise("critics", self._critic_loss, sample)
+        scalars["discrete_temperature"], scalars["parameter_temperature"] = self.temperatures()
         if self.updates % self.policy_delay == 0:
             scalars |= self._update_actor(sample["state"], self.allowed(sample))
             self._update_temperatures(scalars["discrete_excess"], scalars["parameter_excess"])
         polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
+
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance from the targets, and scalars."""
+        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
+        loss = (q - self._target(sample)).square().mean(-1).sum()
+        return loss, {"critic": loss, "q": q.mean()}
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
@@ -248,17 +246,19 @@ class HSAC(ReplayLearner):
 
     def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
         """Update the actor to increase the soft value; return the loss and the mean entropies minus their targets."""
-        self.critics.requires_grad_(False)
+        return self.minimise("actor", self._actor_loss, state, allowed)
+
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed)
         loss = -value.mean()
-        self.optimizer_step("actor", loss)
-        self.critics.requires_grad_(True)
-        return {"actor": loss, "discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
+        excesses = {"discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
+        return loss, {"actor": loss, **excesses}
 
     def _update_temperatures(self, discrete_excess: Tensor, parameter_excess: Tensor) -> None:
         """Lower each temperature where its entropy exceeds the target, raise it where the entropy falls short."""
-        discrete_loss = self.log_discrete_temperature * discrete_excess.detach()
-        parameter_loss = self.log_parameter_temperature * parameter_excess.detach()
-        loss = discrete_loss + parameter_loss
-        if loss.requires_grad:  # not if both temperatures are fixed
-            self.optimizer_step("temperatures", loss)
+        if self.log_discrete_temperature.requires_grad or self.log_parameter_temperature.requires_grad:
+            self.minimise("temperatures", self._temperature_loss, discrete_excess, parameter_excess)
+
+    def _temperature_loss(self, discrete_excess: Tensor, parameter_excess: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        discrete_loss = self.log_discrete_temperature * discrete_excess
+        return discrete_loss + self.log_parameter_temperature * parameter_excess, {}

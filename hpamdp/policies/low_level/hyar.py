@@ -119,8 +119,15 @@ class HybridCodec(nn.Module):
 
     def decode(self, state: Tensor, discrete: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the parameters `[B, num_parameters]` in [-1, 1] and the predicted change of the state, scaled."""
-        hidden = self.decoder(torch.cat([z, state, self.embeddings[discrete]], -1))
+        hidden = self._hidden(state, discrete, z)
         return self.parameter_head(hidden).tanh(), self.dynamics_head(hidden)
+
+    def change(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
+        """Return the predicted change of the state alone, scaled, `[B, observation_dim]`."""
+        return self.dynamics_head(self._hidden(state, discrete, z))
+
+    def _hidden(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
+        return self.decoder(torch.cat([z, state, self.embeddings[discrete]], -1))
 
     def z_from_unit(self, unit: Tensor) -> Tensor:
         """Map the actor's [-1, 1] onto the central range of the encoded z."""
@@ -245,6 +252,7 @@ class HyARPolicy(TensorDictModuleBase):
 class HyAR(ReplayLearner):
     """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
+    has_compiled_updates = True
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
 
     policy: HyARPolicy
@@ -360,13 +368,10 @@ class HyAR(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
-        latent, is_corrected = self.corrected_latent(sample)
-        q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
-        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
-        self.optimizer_step("critics", critic_loss)
-        scalars = {"critic": critic_loss, "redone": is_corrected.float().mean(), "epsilon": self.policy.epsilon}
+        scalars = self.minimise("critics", self._critic_loss, sample)
+        scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(sample["state"], self.allowed(sample))
+            scalars |= self.minimise("actor", self._actor_loss, sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         if self.updates % self.codec_every == 0:
@@ -374,6 +379,13 @@ class HyAR(ReplayLearner):
             if self.updates % (100 * self.codec_every) == 0:
                 self._fit_latent_range()
         return scalars
+
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance from the targets, and scalars."""
+        latent, is_corrected = self.corrected_latent(sample)
+        q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
+        loss = (q - self._target(sample)).square().mean(-1).sum()
+        return loss, {"critic": loss, "redone": is_corrected.float().mean()}
 
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return latents that the codec still decodes to the executed actions, and which of them were corrected, `[B]`.
@@ -389,21 +401,23 @@ class HyAR(ReplayLearner):
         discrete = batch["discrete"]
         with torch.no_grad():
             e, z = batch[LATENT].split([self.codec.table.shape[-1], self.codec.latent_dim], -1)
-            _, change = self.codec.decode(state, discrete, self.codec.z_from_unit(z))
+            change = self.codec.change(state, discrete, self.codec.z_from_unit(z))
             target = (batch["next_state"] - state) / self.codec.change_scale
             # A random action's latent is NaN; comparisons with it are false, so it is always encoded anew.
             threshold = self.correction_factor * self.dynamics_error
             is_same_change = (change - target).square().mean(-1) <= threshold
             is_same_discrete = (self.codec.nearest_discrete(e.nan_to_num()) == discrete) & ~e.isnan().any(-1)
             new_e = self.codec.embeddings[discrete]
+            if self.actor.is_greedy:
+                e = new_e  # the critics are asked about these alone
+            else:
+                if self.relabels_with_noise:
+                    new_e = with_clipped_noise(new_e, 0.1, 0.5)
+                e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
             new_z, log_variance = self.codec.encode(state, discrete, batch["unit"])
             if self.relabels_with_noise:
-                new_e = with_clipped_noise(new_e, 0.1, 0.5)
                 new_z = new_z + (0.5 * log_variance).exp() * torch.randn_like(new_z)
-            e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
             z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(new_z))
-            if self.actor.is_greedy:
-                e = self.codec.embeddings[discrete]  # the critics are asked about these alone
         return torch.cat([e, z], -1), ~(is_same_discrete & is_same_change)
 
     @torch.no_grad()
@@ -422,32 +436,32 @@ class HyAR(ReplayLearner):
         """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
         return batch["reward"] + batch["discount"] * self.next_value(batch)
 
-    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> Tensor:
-        """Update the actor towards higher values of its allowed proposals by the first critic; return the loss."""
-        self.critics.requires_grad_(False)
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""
         proposals = self.actor(state, self.codec.embeddings.detach())
         if not self.actor.is_greedy:
             proposals = self.codec.of_allowed(proposals, allowed)
         q = self.critics(state, proposals, num_members=1)
         loss = -(q if allowed is None or not self.actor.is_greedy else q * allowed).sum(-1).mean()
-        self.optimizer_step("actor", loss)
-        self.critics.requires_grad_(True)
-        return loss
+        return loss, {"actor": loss}
 
-    def _update_codec(self, batch: TensorDictBase) -> dict[str, Tensor]:
+    def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the codec; return the parts of its loss."""
-        mean, log_variance = self.codec.encode(batch["state"], batch["discrete"], batch["unit"])
+        scalars = self.minimise("codec", self._codec_loss, sample)
+        self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
+        return scalars
+
+    def _codec_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the codec's loss and its parts."""
+        state, discrete, executed = sample["state"], sample["discrete"], sample["unit"]
+        mean, log_variance = self.codec.encode(state, discrete, executed)
         z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
-        unit, change = self.codec.decode(batch["state"], batch["discrete"], z)
-        own = self.codec.mask[batch["discrete"]]
-        reconstruction = ((unit - batch["unit"]).square() * own).sum(-1).mean()
+        unit, change = self.codec.decode(state, discrete, z)
+        reconstruction = ((unit - executed).square() * self.codec.mask[discrete]).sum(-1).mean()
         divergence = -0.5 * (1.0 + log_variance - mean.square() - log_variance.exp()).sum(-1).mean()
-        target = (batch["next_state"] - batch["state"]) / self.codec.change_scale
-        dynamics = F.mse_loss(change, target)
+        dynamics = F.mse_loss(change, (sample["next_state"] - state) / self.codec.change_scale)
         loss = reconstruction + self.kl_weight * divergence + self.dynamics_weight * dynamics
-        self.optimizer_step("codec", loss)
-        self.dynamics_error.lerp_(dynamics.detach(), 0.01)
-        return {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
+        return loss, {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
 
     def _fit_latent_range(self) -> None:
         """Set the range of z to the central `latent_coverage` of the encoded stored actions."""

@@ -93,26 +93,35 @@ class IQL(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update V, then Q, then the policy from transitions `[batch_size]`; return scalars."""
-        state = sample["state"]
-        discrete = sample["discrete"]
-        unit = sample["unit"]
-
         with torch.no_grad():
-            q = self.target_critics.of_discrete(state, discrete, unit).amin(0)
-        excess = q - self.value(state)
-        value_loss = (torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile) * excess.square()).mean()
-        self.optimizer_step("state_value", value_loss)
-
-        with torch.no_grad():
-            advantage = q - self.value(state)
-            target = sample["reward"] + sample["discount"] * self.next_value(sample)
-        critics_q = self.critics.of_discrete(state, discrete, unit)
-        critic_loss = F.mse_loss(critics_q, target.expand_as(critics_q))
-        self.optimizer_step("critics", critic_loss)
+            q = self.target_critics.of_discrete(sample["state"], sample["discrete"], sample["unit"]).amin(0)
+        of_value = self.minimise("state_value", self._value_loss, sample["state"], q)
+        scalars = self.minimise("critics", self._critic_loss, sample) | of_value | {"q": q.mean()}
         polyak_update(self.target_critics, self.critics, self.tau)
+        return scalars | self.minimise("actor", self._actor_loss, sample, self.allowed(sample), q)
 
-        weight = (self.temperature * advantage).exp().clamp(max=self.max_weight)
-        distribution: HybridDistribution = self.actor(state, self.allowed(sample))
-        discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, unit)
-        self.optimizer_step("actor", -(weight * (discrete_log_prob + parameter_log_prob)).mean())
-        return {"critic": critic_loss, "value": value_loss, "q": q.mean(), "advantage_weight": weight.mean()}
+    def _value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the distance of V from the expectile of the values `[B]` of the data's actions."""
+        excess = q - self.value(state)
+        loss = (torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile) * excess.square()).mean()
+        return loss, {"value": loss}
+
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance from the targets."""
+        with torch.no_grad():
+            target = sample["reward"] + sample["discount"] * self.next_value(sample)
+        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
+        loss = F.mse_loss(q, target.expand_as(q))
+        return loss, {"critic": loss}
+
+    def _actor_loss(
+        self, sample: TensorDictBase, allowed: Tensor | None, q: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the negative log-likelihood of the data's actions, weighted by their advantages."""
+        with torch.no_grad():
+            advantage = q - self.value(sample["state"])
+            weight = (self.temperature * advantage).exp().clamp(max=self.max_weight)
+        distribution: HybridDistribution = self.actor(sample["state"], allowed)
+        discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
+        loss = -(weight * (discrete_log_prob + parameter_log_prob)).mean()
+        return loss, {"advantage_weight": weight.mean()}

@@ -187,28 +187,29 @@ class PADDPG(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
-        state = sample["state"]
-        q = self._q(self.critics, state, torch.cat([sample[SCORES], sample["unit"]], -1))
-        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
-        self.optimizer_step("critics", critic_loss, self.max_grad_norm)
-        scalars = {"critic": critic_loss, "q": q.mean(), "epsilon": self.policy.epsilon}
+        scalars = self.minimise("critics", self._critic_loss, sample, max_grad_norm=self.max_grad_norm)
+        scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(state, self.allowed(sample))
+            inputs = sample["state"], self.allowed(sample)
+            scalars |= self.minimise("actor", self._actor_loss, *inputs, max_grad_norm=self.max_grad_norm)
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
 
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance from the targets, and scalars."""
+        q = self._q(self.critics, sample["state"], torch.cat([sample[SCORES], sample["unit"]], -1))
+        loss = (q - self._target(sample)).square().mean(-1).sum()
+        return loss, {"critic": loss, "q": q.mean()}
+
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls with the value of the actor's output by the first critic."""
+        loss = -self._q(self.critics, state, with_lowest_scores(self.actor(state), allowed))[0].mean()
+        return loss, {"actor": loss}
+
     def _q(self, critics: EnsembleMLP, state: Tensor, output: Tensor) -> Tensor:
         """Return the critics' values `[E, B]` of an actor's outputs `[B, num_discrete + num_parameters]`."""
         return critics(torch.cat([state, output], -1)).squeeze(-1)
-
-    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> Tensor:
-        """Update the actor towards higher values of the first critic; return the loss."""
-        self.critics.requires_grad_(False)
-        loss = -self._q(self.critics, state, with_lowest_scores(self.actor(state), allowed))[0].mean()
-        self.optimizer_step("actor", loss, self.max_grad_norm)
-        self.critics.requires_grad_(True)
-        return loss
 
     def _target(self, batch: TensorDictBase) -> Tensor:
         """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""

@@ -104,6 +104,8 @@ class PDQNPolicy(TensorDictModuleBase):
 class PDQN(ReplayLearner):
     """Q-learning over discrete actions and gradient ascent on their parameters, from a replay buffer of its own."""
 
+    has_compiled_updates = True
+
     policy: PDQNPolicy
     episodes: Tensor
 
@@ -215,26 +217,28 @@ class PDQN(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
-        state = sample["state"]
-        q = self.critics.of_discrete(state, sample["discrete"], sample["unit"])
-        critic_loss = (q - self._target(sample)).square().mean(-1).sum()
-        self.optimizer_step("critics", critic_loss, self.max_grad_norm)
-        scalars = {"critic": critic_loss, "q": q.mean(), "epsilon": self.policy.epsilon}
+        scalars = self.minimise("critics", self._critic_loss, sample, max_grad_norm=self.max_grad_norm)
+        scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(state, self.allowed(sample))
+            scalars |= self._update_actor(sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.actor_tau)
             polyak_update(self.target_critics, self.critics, self.critic_tau)
         return scalars
 
-    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> Tensor:
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance from the targets, and scalars."""
+        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
+        loss = (q - self._target(sample)).square().mean(-1).sum()
+        return loss, {"critic": loss, "q": q.mean()}
+
+    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
         """Update the actor to increase the sum of the allowed discrete actions' values; return the loss."""
-        self.critics.requires_grad_(False)
+        return self.minimise("actor", self._actor_loss, state, allowed, max_grad_norm=self.max_grad_norm)
+
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         q = self.critics(state, self.actor(state)).amin(0)
         loss = -(q if allowed is None else q * allowed).sum(-1).mean()
-        if loss.requires_grad:  # not if no discrete action has parameters
-            self.optimizer_step("actor", loss, self.max_grad_norm)
-        self.critics.requires_grad_(True)
-        return loss
+        return loss, {"actor": loss}
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:

@@ -683,6 +683,10 @@ class PETS(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update every member from its own minibatch of a sample `[num_members, batch_size]`."""
+        return self.minimise("model", self._loss, sample)
+
+    def _loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the sum of the members' losses, and the mean of each part of it."""
         ends = sample["terminated"]
         transition, outcome = self.model.in_frame(sample["turned"], sample["action"])
         change = sample["change"]
@@ -701,5 +705,4 @@ class PETS(ReplayLearner):
             "reward": (reward - sample["reward"]).square().mean(),
         }
         loss = self.transition_weight * parts["change"] + parts["termination"] + parts["reward"]
-        self.optimizer_step("model", loss * self.model.num_members)
-        return parts
+        return loss * self.model.num_members, parts

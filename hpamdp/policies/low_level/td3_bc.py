@@ -154,35 +154,38 @@ class TD3BC(ReplayLearner):
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update critics and behaviour; every `policy_delay` updates, also actor and targets. Return scalars."""
-        state = sample["state"]
-        discrete = sample["discrete"]
-        unit = sample["unit"]
-        q = self.critics.of_discrete(state, discrete, unit)
-        critic_loss = F.mse_loss(q, self._target(sample).expand_as(q))
-        self.optimizer_step("critics", critic_loss)
         allowed = self.allowed(sample)
-        behaviour_loss = F.cross_entropy(masked_logits(self.behaviour(state), allowed), discrete)
-        self.optimizer_step("behaviour", behaviour_loss)
-        scalars = {"critic": critic_loss, "q": q.mean(), "behaviour": behaviour_loss}
+        scalars = self.minimise("critics", self._critic_loss, sample)
+        scalars |= self.minimise("behaviour", self._behaviour_loss, sample, allowed)
         if self.updates % self.policy_delay == 0:
-            scalars["actor"] = self._update_actor(state, discrete, unit, allowed)
+            scalars |= self.minimise("actor", self._actor_loss, sample, allowed)
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         return scalars
 
-    def _update_actor(self, state: Tensor, discrete: Tensor, unit: Tensor, allowed: Tensor | None) -> Tensor:
-        """Update the actor towards higher values and towards the data; return the loss."""
-        own_unit = self.actor(state)
-        self.critics.requires_grad_(False)
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance from the targets, and scalars."""
+        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
+        loss = F.mse_loss(q, self._target(sample).expand_as(q))
+        return loss, {"critic": loss, "q": q.mean()}
+
+    def _behaviour_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the negative log-likelihood of the data's discrete actions."""
+        loss = F.cross_entropy(masked_logits(self.behaviour(sample["state"]), allowed), sample["discrete"])
+        return loss, {"behaviour": loss}
+
+    def _actor_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls towards higher values and towards the data."""
+        state = sample["state"]
+        unit = self.actor(state)
         with torch.no_grad():
             frequency = masked_logits(self.behaviour(state), allowed).softmax(-1)
-        q = (self.critics(state, own_unit).amin(0) * frequency).sum(-1)
-        distance = ((own_unit - unit).square() * (self.owner == discrete.unsqueeze(-1))).sum(-1)
+        q = (self.critics(state, unit).amin(0) * frequency).sum(-1)
+        is_own = self.owner == sample["discrete"].unsqueeze(-1)
+        distance = ((unit - sample["unit"]).square() * is_own).sum(-1)
         # Values are divided by their mean size, so that the weight does not depend on the scale of the reward.
         loss = (self.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
-        self.optimizer_step("actor", loss)
-        self.critics.requires_grad_(True)
-        return loss
+        return loss, {"actor": loss}
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:

@@ -33,9 +33,13 @@ class EnsembleLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply each member to its own slice of `x`; if there are fewer slices, apply the first members alone."""
-        if len(x) == len(self.weight):
-            return torch.baddbmm(self.bias, x, self.weight)
-        return torch.baddbmm(self.bias[: len(x)], x, self.weight[: len(x)])
+        weight, bias = self.weight, self.bias
+        if len(x) < len(weight):
+            weight, bias = weight[: len(x)], bias[: len(x)]
+        if weight.shape[-1] == 1:
+            # A batched product with one column takes two to four times as long on the CPU.
+            return (x * weight.mT).sum(-1, keepdim=True) + bias
+        return torch.baddbmm(bias, x, weight)
 
 
 class EnsembleMLP(nn.Module):
@@ -218,4 +222,5 @@ class HybridCritics(nn.Module):
         x = x.flatten(1, 2)
         for layer in self.net.layers[1:-1]:
             x = layer(x).relu_()
-        return torch.einsum("ebkh,ehk->ebk", x.unflatten(1, shape), last.weight) + last.bias
+        # One column for each pass, so no product either: see EnsembleLinear.
+        return (x.unflatten(1, shape) * last.weight.mT.unsqueeze(1)).sum(-1) + last.bias

@@ -1,0 +1,130 @@
+"""Updates from a replay buffer: what a step of an optimizer changes, and updates that are compiled."""
+
+import copy
+import shutil
+from functools import partial
+
+import pytest
+import test_hyar
+import test_pdqn
+import torch
+from conftest import make_config
+from torch import Tensor, nn
+from toy_steps import SPECS, sample
+
+from hpamdp.config import ConfigError
+from hpamdp.policies.low_level.hyar import LATENT
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.run.assemble import assemble
+
+# Neither draws random numbers in a loss: compiled code draws others.
+MAKE = {
+    "pdqn": partial(test_pdqn.make, target_smoothing=0.0),
+    "hyar": partial(test_hyar.make, target_noise=0.0, relabelling="mean"),
+}
+LR = {"pdqn": test_pdqn.OPTIONS["critic_lr"], "hyar": test_hyar.OPTIONS["critic_lr"]}
+
+
+class TransposedLearner(ReplayLearner):
+    """Has one weight, which it uses transposed: so its gradient comes transposed, too."""
+
+    def __init__(self) -> None:
+        sizes = dict(gamma=0.9, warmup_frames=0, buffer_size=10, batch_size=2, updates_per_frame=1.0)
+        super().__init__(SPECS, torch.device("cpu"), **sizes)
+        self.weight = nn.Parameter(torch.randn(3, 5))
+        self.optimizers = {"weight": torch.optim.Adam([self.weight], lr=0.1, fused=True)}
+
+    def loss(self, x: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        loss = (x @ self.weight.T).square().sum()
+        return loss, {"loss": loss}
+
+
+def batch_for(name: str) -> dict[str, Tensor]:
+    """Return a random sample; half of HyAR's actions were random, and have no latent action."""
+    batch = sample(64)
+    if name == "hyar":
+        latent = torch.rand(64, MAKE[name]().critics.net.layers[0].weight.shape[1] - SPECS.observation_dim) * 2 - 1
+        batch[LATENT] = torch.where(torch.arange(64).unsqueeze(-1) % 2 == 0, latent, torch.nan)
+    return batch
+
+
+def test_a_step_is_that_of_plain_adam_however_the_gradient_lies_in_memory():
+    torch.manual_seed(0)
+    learner = TransposedLearner()
+    weight = learner.weight.detach().clone().requires_grad_()
+    plain = torch.optim.Adam([weight], lr=0.1, fused=False)
+    for _ in range(3):
+        x = torch.randn(4, 5)
+        (x @ weight.T).square().sum().backward()
+        plain.step()
+        plain.zero_grad()
+        learner.minimise("weight", learner.loss, x)
+    torch.testing.assert_close(learner.weight, weight)
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_the_critics_step_is_that_of_plain_adam_after_a_backward_pass(name):
+    torch.manual_seed(0)
+    learner, batch = MAKE[name](), batch_for(name)
+    learner.updates.fill_(2)  # the actor learns as well, HyAR's codec does not
+    reference = copy.deepcopy(learner)
+    plain = torch.optim.Adam(reference.critics.parameters(), lr=LR[name], fused=False)
+    reference._critic_loss(batch)[0].backward()
+    plain.step()
+    learner.train_step(batch)
+    for new, expected in zip(learner.critics.parameters(), reference.critics.parameters(), strict=True):
+        torch.testing.assert_close(new, expected)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("name", MAKE)
+def test_compiled_updates_are_the_same_up_to_rounding(name):
+    torch.manual_seed(0)
+    learner = MAKE[name]()
+    learner.updates.fill_(2)  # the actor learns as well, HyAR's codec does not
+    compiled = copy.deepcopy(learner)
+    compiled.compile_updates()
+    for _ in range(2):
+        batch = batch_for(name)
+        scalars, expected = compiled.train_step(batch), learner.train_step(batch)
+        assert list(scalars) == list(expected)
+    for key, value in learner.actor.state_dict().items():
+        torch.testing.assert_close(compiled.actor.state_dict()[key], value, rtol=1e-3, atol=1e-4)
+    for key, value in learner.critics.state_dict().items():
+        torch.testing.assert_close(compiled.critics.state_dict()[key], value, rtol=1e-3, atol=1e-4)
+
+
+SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "compile_updates=true"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["env=platform", "high=none", "low=hppo"], "compile_updates=true: low=hppo: its updates cannot be compiled"),
+        (["env=platform", "high=none", "low=hsac"], "compile_updates=true: low=hsac: its updates cannot be compiled"),
+        (
+            ["env=platform", "+env.options=default", "high=meta_critic", "low=pdqn", "agent.termination=steps",
+             "agent.option_length=3"],
+            "compile_updates=true: goes with agent.termination=episode only, not with steps",
+        ),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_compiled_is_refused_in_one_line(tmp_path, words, message):
+    with pytest.raises(ConfigError) as error:
+        assemble(make_config([*SMALL, *words]), tmp_path)
+    assert str(error.value) == message
+
+
+def test_a_missing_compiler_is_told_in_one_line(tmp_path, monkeypatch):
+    from torch._inductor import cpp_builder
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    def missing() -> str:
+        raise InvalidCxxCompiler
+
+    monkeypatch.setattr(cpp_builder, "get_cpp_compiler", missing)
+    with pytest.raises(
+        ConfigError, match=r"^compile_updates=true: low=pdqn: there is no C\+\+ compiler; install"
+    ):
+        assemble(make_config([*SMALL, "env=platform", "high=none", "low=pdqn"]), tmp_path)
