@@ -51,6 +51,14 @@ def test_a_mask_can_be_ignored():
             "gave an action_mask in its info; set env.action_mask=info to honour it, or env.action_mask=i",
         ),
         ({"action_mask": "info"}, "gave None as action_mask, which must be 2 numbers, 0 or 1"),
+        (
+            {"source": "info", "action_mask": "info", "mask": [0.0, -1e9]},
+            r"gave \[0\.0, -1000000000\.0\] as action_mask, ",
+        ),
+        (
+            {"source": "info", "action_mask": "info", "mask": [1, float("nan")]},
+            r"gave \[1, nan\] as action_mask, which ",
+        ),
         ({"source": "info", "action_mask": "info", "mask": [1]}, r"gave \[1\] as action_mask, which must be 2 numbers"),
     ],
 )

@@ -245,6 +245,15 @@ def test_an_option_ends_where_none_of_its_actions_is_allowed_any_more(high):
     assert after[keys.OPTION_ENDED].squeeze(-1)[is_stuck].all()
 
 
+def test_options_of_which_none_has_an_allowed_action_are_told_in_one_line():
+    problem = Forbidden(20)
+    problem.option_names = ()
+    problem.group_actions({"only": [0]})
+    expected = r"^environment \d+: its action_mask leaves none of the options an action; give them more actions$"
+    with pytest.raises(ProblemError, match=expected):
+        with_decisions(problem, 1.0, 3).reset()
+
+
 def test_an_option_that_can_neither_go_on_nor_end_is_told_in_one_line():
     env = with_decisions(problem_with_single_actions())
     held = torch.full((8,), 2)

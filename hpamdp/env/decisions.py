@@ -141,9 +141,20 @@ class DecisionTracker(Transform):
 
     @staticmethod
     def _possible_options(tensordict: TensorDictBase, option_actions: Tensor) -> Tensor:
-        """Return which options have an allowed action, bool `[*B, num_options]`; all where an episode is over."""
+        """Return which options have an allowed action, bool `[*B, num_options]`; all where an episode is over.
+
+        Raises:
+            ProblemError: none has one where the episode goes on.
+        """
         allowed = option_actions & tensordict.get(keys.ACTION_MASK).unsqueeze(-2)
-        return allowed.any(-1) | tensordict.get(keys.DONE)
+        possible = allowed.any(-1) | tensordict.get(keys.DONE)
+        is_stuck = ~possible.any(-1)
+        if is_stuck.any():
+            row = int(is_stuck.flatten().nonzero()[0])
+            raise ProblemError(
+                f"environment {row}: its action_mask leaves none of the options an action; give them more actions"
+            )
+        return possible
 
 
 def _zero_where(mask: Tensor, values: Tensor) -> Tensor:

@@ -253,7 +253,8 @@ class GymnasiumEnv(PAMDPEnv):
                 masks[row] = True
                 continue
             mask = np.asarray(given)
-            if mask.shape != masks[row].shape or mask.dtype.kind not in "iubf":
+            is_numbers = mask.shape == masks[row].shape and mask.dtype.kind in "iubf"
+            if not is_numbers or ((mask != 0) & (mask != 1)).any():
                 raise ProblemError(f"gave {given!r} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
             masks[row] = mask != 0
 
