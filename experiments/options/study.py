@@ -15,8 +15,10 @@ from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
+from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from hpamdp import keys
 from hpamdp.config import Config, read
 from hpamdp.env.rooms import rules
 from hpamdp.env.rooms.environment import RoomsEnv
@@ -37,7 +39,9 @@ COLUMNS = (
     "score",
     "optimum",
     "share",
+    "success",
     "value_error",
+    "value_error_everywhere",
     "cpu_s",
 )
 GAMMA = 0.95
@@ -51,18 +55,50 @@ COMMON = [
     "eval.every=0",
     "log_every=0",
 ]
+# Selectors: many updates from recent decisions alone. The defaults suit one decision an episode.
 SELECTORS = {
-    "meta_critic": [f"high.gamma={GAMMA}", "high.updates_per_decision=0.02", "high.epsilon_decisions=10000"],
-    "actor": [f"high.gamma={GAMMA}", "high.entropy=0.02", "high.lr=1e-3"],
+    "meta_critic": [
+        f"high.gamma={GAMMA}",
+        "high.num_members=1",
+        "high.epsilon_decisions=10000",
+        "high.buffer_size=10000",
+        "high.batch_size=256",
+        "high.updates_per_decision=0.05",
+        "high.tau=0.05",
+    ],
+    "actor": [f"high.gamma={GAMMA}", "high.minibatch_size=256", "high.entropy=0.02", "high.lr=1e-3"],
     "option_critic": [
         f"high.gamma={GAMMA}",
         "high.epsilon_steps=50000",
+        "high.buffer_size=10000",
+        "high.batch_size=256",
+        "high.tau=0.05",
         "agent.termination=learned",
         "agent.option_length=null",
     ],
 }
+# Options are uniform for half of the steps: a learner that is not chosen does not learn, and then is never chosen.
+# Replay learners: small networks and fast targets, for a problem of 104 cells.
+REPLAY = [
+    "total_frames=100000",
+    "agent.uniform_option_frames=50000",
+    "low.hidden_dims=[64,64]",
+    "low.updates_per_frame=0.05",
+    "low.warmup_frames=2000",
+]
 LEARNERS = {
-    "hppo": ["total_frames=600000", "num_envs=256", "steps_per_batch=16", "low.minibatch_size=1024"],
+    # Small batches, for many updates of a policy that must go through the rooms before it finds a reward.
+    "hppo": [
+        "total_frames=160000",
+        "agent.uniform_option_frames=80000",
+        "num_envs=64",
+        "steps_per_batch=16",
+        "low.minibatch_size=256",
+    ],
+    "pdqn": [*REPLAY, "low.actor_tau=0.05", "low.critic_tau=0.05", "low.epsilon_frames=15000"],
+    "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.codec_pretrain_updates=500"],
+    "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.actor_lr=1e-3"],
+    "hsac": [*REPLAY, "low.tau=0.05"],
     "qpamdp": ["low.features=[0,1]", "low.warmup_frames=5000", "low.initial_mean=0", "low.sigma=0.3"],
     "dlpa": ["low.horizon=3"],
 }
@@ -88,8 +124,10 @@ def train(words: Sequence[str]) -> dict[str, object]:
     cpu = time.process_time() - cpu
     length = config.run.agent.option_length
     steps = length or 1
-    means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
+    means, num_due = evaluate(parts)
     optimum = mean_over_starts(parts, rules.best_values(1.0, steps))
+    best = rules.best_values(GAMMA, steps)
+    error = (learned_values(parts.agent) - best).abs()
     return {
         "high": config.high.name,
         "low": config.low.name,
@@ -101,7 +139,9 @@ def train(words: Sequence[str]) -> dict[str, object]:
         "score": round(means["score"], 4),
         "optimum": round(optimum, 4),
         "share": round(means["score"] / optimum, 4),
-        "value_error": round(value_error(parts.agent, rules.best_values(GAMMA, steps)), 4),
+        "success": round(means["success"], 4),
+        "value_error": round(((num_due * error).sum() / (num_due * best).sum()).item(), 4),
+        "value_error_everywhere": round((error.sum() / best.sum()).item(), 4),
         "cpu_s": round(cpu, 1),
     }
 
@@ -115,19 +155,33 @@ def mean_over_starts(parts: Parts, values: torch.Tensor) -> float:
     return values[env.state.x.long(), env.state.y.long()].mean().item()
 
 
+def evaluate(parts: Parts) -> tuple[dict[str, float], torch.Tensor]:
+    """Play the evaluation's episodes; return their means, and how often an option was due in each cell, `[x, y]`."""
+    env = parts.evaluation.problem
+    assert isinstance(env, RoomsEnv)
+    num_due = torch.zeros(rules.SIZE, rules.SIZE, dtype=torch.float64)
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        x, y = env.state.x.long(), env.state.y.long()
+        td = parts.agent.policy(td)
+        is_due = (td[keys.IS_DECISION] & ~td[keys.DONE]).squeeze(-1)
+        num_due.index_put_((x[is_due], y[is_due]), num_due.new_ones(()), accumulate=True)
+        return td
+
+    return parts.evaluation.measure(parts.evaluation.run(policy)), num_due
+
+
 @torch.no_grad()
-def value_error(agent: HierarchicalAgent, values: torch.Tensor) -> float:
-    """Return the mean error of the learners' values over the free cells, as a share of the mean best value.
+def learned_values(agent: HierarchicalAgent) -> torch.Tensor:
+    """Return the learners' values of all cells, float64 `[x, y]`: 0 at walls and at the goal, NaN if they have none.
 
     In each cell the selector chooses greedily, and the value is that of the chosen option's learner.
     """
     x, y = (part.flatten().int() for part in torch.meshgrid(*2 * [torch.arange(rules.SIZE)], indexing="ij"))
-    is_asked = rules.is_free(x, y) & ~((x == rules.GOAL) & (y == rules.GOAL))
-    x, y = x[is_asked], y[is_asked]
     none = torch.zeros_like(x)
     observation = rules.observe(rules.RoomsState(x, y, none, none, none))
     follows = agent.next_options
-    assert follows is not None
+    assert follows is not None and agent.selector is not None
     shown = observation
     if agent.is_shared:
         shown = torch.cat([observation, observation.new_zeros(len(x), agent.specs.num_options)], -1)
@@ -135,11 +189,11 @@ def value_error(agent: HierarchicalAgent, values: torch.Tensor) -> float:
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         option = follows.choose(shown, none.long(), none.long())
         try:
-            estimate = torch.stack([follows.value(shown, option) for _ in range(10)]).mean(0)
+            value = torch.stack([follows.value(shown, option) for _ in range(10)]).mean(0)  # some are noisy
         except NotImplementedError:
-            return float("nan")
-    best = values[x.long(), y.long()]
-    return ((estimate - best).abs().mean() / best.mean()).item()
+            value = torch.full(x.shape, torch.nan)
+    is_nothing = ~rules.is_free(x, y) | ((x == rules.GOAL) & (y == rules.GOAL))
+    return value.double().masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
 
 
 def main(words: Sequence[str]) -> None:
