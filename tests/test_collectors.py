@@ -62,7 +62,7 @@ def workers(request, tmp_path_factory):
     parts, collection = make(tmp_path_factory.mktemp(request.param), f"collector={request.param}")
     yield parts, collection
     collection.close()
-    assert not multiprocessing.active_children()
+    wait_until(lambda: not multiprocessing.active_children(), seconds=30)
 
 
 def test_workers_give_the_batches_of_a_single_process(workers, tmp_path):
