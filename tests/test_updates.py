@@ -124,7 +124,5 @@ def test_a_missing_compiler_is_told_in_one_line(tmp_path, monkeypatch):
         raise InvalidCxxCompiler
 
     monkeypatch.setattr(cpp_builder, "get_cpp_compiler", missing)
-    with pytest.raises(
-        ConfigError, match=r"^compile_updates=true: low=pdqn: there is no C\+\+ compiler; install"
-    ):
+    with pytest.raises(ConfigError, match=r"^compile_updates=true: low=pdqn: there is no C\+\+ compiler; install"):
         assemble(make_config([*SMALL, "env=platform", "high=none", "low=pdqn"]), tmp_path)

@@ -173,6 +173,7 @@ def compile_updates(config: Config, agent: HierarchicalAgent) -> None:
     if termination != "episode":
         raise ConfigError(f"compile_updates=true: goes with agent.termination=episode only, not with {termination}")
     for low, learner in zip(_learners_of(config, agent.specs), agent.learners, strict=False):
+        assert isinstance(learner, Learner)
         try:
             learner.compile_updates()
         except ValueError as error:

@@ -33,9 +33,9 @@ class EnsembleLinear(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply each member to its own slice of `x`; if there are fewer slices, apply the first members alone."""
-        weight, bias = self.weight, self.bias
-        if len(x) < len(weight):
-            weight, bias = weight[: len(x)], bias[: len(x)]
+        is_whole = len(x) == len(self.weight)
+        weight = self.weight if is_whole else self.weight[: len(x)]
+        bias = self.bias if is_whole else self.bias[: len(x)]
         if weight.shape[-1] == 1:
             # A batched product with one column takes two to four times as long on the CPU.
             return (x * weight.mT).sum(-1, keepdim=True) + bias
