@@ -71,12 +71,12 @@ def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone
     learner, batch = make(), sample(1).set("discount", torch.tensor([OPTIONS["gamma"]]))
     learner.target_critics.load_state_dict(make().critics.state_dict())
     torch.manual_seed(3)
-    target = learner._target(batch)
+    target = learner.target(batch)
     torch.manual_seed(3)
     value = soft_value_by_hand(learner, learner.target_critics, batch["next_state"])
     torch.testing.assert_close(target, batch["reward"] + OPTIONS["gamma"] * value)
     batch["discount"] = torch.zeros(1)
-    torch.testing.assert_close(learner._target(batch), batch["reward"])
+    torch.testing.assert_close(learner.target(batch), batch["reward"])
 
 
 def test_the_stored_discount_is_0_at_termination_alone_and_rows_of_other_learners_are_dropped():

@@ -124,9 +124,9 @@ def test_only_masked_transitions_are_stored():
 def test_targets_bootstrap_past_truncation_and_not_past_termination(trained):
     rows = trained.buffer.sample(64)
     rows["discount"] = torch.zeros(64)
-    torch.testing.assert_close(trained._target(rows), rows["reward"])
+    torch.testing.assert_close(trained.target(rows), rows["reward"])
     rows["discount"] = torch.full((64,), 0.9)
-    assert (trained._target(rows) - rows["reward"]).abs().mean() > 0.05
+    assert (trained.target(rows) - rows["reward"]).abs().mean() > 0.05
 
 
 def test_the_greedy_form_takes_the_discrete_action_with_the_highest_q():
@@ -159,7 +159,7 @@ def test_the_target_of_the_greedy_form_is_the_maximum_over_discrete_actions():
         )
         for k in range(3)
     ]
-    torch.testing.assert_close(learner._target(rows), torch.cat(each, -1).amin(0).amax(-1))
+    torch.testing.assert_close(learner.target(rows), torch.cat(each, -1).amin(0).amax(-1))
 
 
 @pytest.mark.parametrize(("discrete", "is_left"), [("nearest", False), ("greedy", True)])
@@ -201,7 +201,7 @@ def test_ddpg_has_one_critic_an_actor_update_each_time_and_no_noise_in_its_targe
     learner.train_step(rows)
     assert not torch.equal(learner.actor.net[0].weight, before)
     rows["discount"] = torch.ones(64)
-    assert torch.equal(learner._target(rows), learner._target(rows))
+    assert torch.equal(learner.target(rows), learner.target(rows))
 
 
 def test_a_latent_is_outdated_by_the_codecs_own_error(trained):

@@ -67,7 +67,7 @@ def test_targets_equal_those_computed_by_hand():
     batch = rows_with_scores()
     output = other.actor.net(batch["next_state"]).clamp(-1.0, 1.0)
     q = other.critics(torch.cat([batch["next_state"], output], -1))[0, :, 0]
-    torch.testing.assert_close(learner._target(batch), batch["reward"] + batch["discount"] * q)
+    torch.testing.assert_close(learner.target(batch), batch["reward"] + batch["discount"] * q)
 
 
 def test_patd3_takes_the_lower_value_of_two_critics_smooths_targets_and_delays_the_actor():
@@ -76,10 +76,10 @@ def test_patd3_takes_the_lower_value_of_two_critics_smooths_targets_and_delays_t
     output = learner.target_actor(batch["next_state"])
     q = learner.target_critics(torch.cat([batch["next_state"], output], -1)).squeeze(-1)
     assert q.shape[0] == 2
-    torch.testing.assert_close(learner._target(batch), batch["reward"] + batch["discount"] * q.amin(0))
+    torch.testing.assert_close(learner.target(batch), batch["reward"] + batch["discount"] * q.amin(0))
 
     smooth = make(twin=True, target_smoothing=0.5, target_smoothing_clip=0.5)
-    assert not torch.allclose(smooth._target(batch), smooth._target(batch))
+    assert not torch.allclose(smooth.target(batch), smooth.target(batch))
     learner.updates += 1
     assert "actor" not in learner.train_step(batch)
     learner.updates += 1
@@ -89,7 +89,7 @@ def test_patd3_takes_the_lower_value_of_two_critics_smooths_targets_and_delays_t
 def test_paddpg_has_no_part_of_td3():
     learner, batch = make(target_smoothing=0.5, target_smoothing_clip=0.5, policy_delay=5), rows_with_scores()
     assert learner.critics.num_members == 1
-    torch.testing.assert_close(learner._target(batch), learner._target(batch))
+    torch.testing.assert_close(learner.target(batch), learner.target(batch))
     learner.updates += 1
     assert "actor" in learner.train_step(batch)
 

@@ -83,7 +83,7 @@ def test_targets_equal_those_computed_by_hand(twin_q, double_q):
     learner.target_actor.load_state_dict(other.actor.state_dict())
     learner.target_critics.load_state_dict(other.critics.state_dict())
     batch = sample(200)
-    target = learner._target(batch)
+    target = learner.target(batch)
     choices = set()
     for i in range(200):
         state = batch["next_state"][i : i + 1]
@@ -104,11 +104,11 @@ def test_targets_equal_those_computed_by_hand(twin_q, double_q):
 def test_target_smoothing_is_bounded():
     batch = sample()
     learner = make(multipass=False, target_smoothing=100.0, target_smoothing_clip=0.0)
-    smooth = learner._target(batch)
+    smooth = learner.target(batch)
     learner.target_smoothing = 0.0
-    torch.testing.assert_close(learner._target(batch), smooth)
+    torch.testing.assert_close(learner.target(batch), smooth)
     learner.target_smoothing, learner.target_smoothing_clip = 0.5, 0.5
-    assert not torch.allclose(learner._target(batch), smooth)
+    assert not torch.allclose(learner.target(batch), smooth)
 
 
 def test_n_step_returns_end_with_episodes_and_bootstrap_unless_terminated():

@@ -231,7 +231,7 @@ class HSAC(ReplayLearner):
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from the targets, and scalars."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
-        loss = (q - self._target(sample)).square().mean(-1).sum()
+        loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
     @torch.no_grad()
@@ -239,10 +239,6 @@ class HSAC(ReplayLearner):
         """Return the soft value V'(s) by the target critics, `[B]`."""
         value, _, _ = self.soft_value(self.target_critics, observation, self.specs.allowed(observation, action_mask))
         return value
-
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount V'(s'), `[B]`, where the discount is 0 after a termination."""
-        return batch["reward"] + batch["discount"] * self.next_value(batch)
 
     def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
         """Update the actor to increase the soft value; return the loss and the mean entropies minus their targets."""

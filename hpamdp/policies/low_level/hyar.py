@@ -384,7 +384,7 @@ class HyAR(ReplayLearner):
         """Return the squared distance from the targets, and scalars."""
         latent, is_corrected = self.corrected_latent(sample)
         q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
-        loss = (q - self._target(sample)).square().mean(-1).sum()
+        loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "redone": is_corrected.float().mean()}
 
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -431,10 +431,6 @@ class HyAR(ReplayLearner):
         if not self.actor.is_greedy:
             return self.target_critics(observation, self.codec.of_allowed(proposals, allowed)).amin(0).amax(-1)
         return masked_values(self.target_critics(observation, proposals).amin(0), allowed).amax(-1)
-
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
-        return batch["reward"] + batch["discount"] * self.next_value(batch)
 
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""

@@ -108,10 +108,8 @@ class IQL(ReplayLearner):
 
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from the targets."""
-        with torch.no_grad():
-            target = sample["reward"] + sample["discount"] * self.next_value(sample)
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
-        loss = F.mse_loss(q, target.expand_as(q))
+        loss = F.mse_loss(q, self.target(sample).expand_as(q))
         return loss, {"critic": loss}
 
     def _actor_loss(

@@ -199,7 +199,7 @@ class PADDPG(ReplayLearner):
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from the targets, and scalars."""
         q = self._q(self.critics, sample["state"], torch.cat([sample[SCORES], sample["unit"]], -1))
-        loss = (q - self._target(sample)).square().mean(-1).sum()
+        loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
@@ -210,7 +210,3 @@ class PADDPG(ReplayLearner):
     def _q(self, critics: EnsembleMLP, state: Tensor, output: Tensor) -> Tensor:
         """Return the critics' values `[E, B]` of an actor's outputs `[B, num_discrete + num_parameters]`."""
         return critics(torch.cat([state, output], -1)).squeeze(-1)
-
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
-        return batch["reward"] + batch["discount"] * self.next_value(batch)

@@ -228,7 +228,7 @@ class PDQN(ReplayLearner):
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from the targets, and scalars."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
-        loss = (q - self._target(sample)).square().mean(-1).sum()
+        loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
     def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
@@ -251,10 +251,6 @@ class PDQN(ReplayLearner):
         choosing_q = self.critics(observation, unit).amin(0) if self.double_q else q
         choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
         return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
-
-    def _target(self, batch: TensorDictBase) -> Tensor:
-        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
-        return batch["reward"] + batch["discount"] * self.next_value(batch)
 
 
 def n_step_returns(reward: Tensor, done: Tensor, n: int, gamma: float) -> tuple[Tensor, Tensor]:

@@ -166,7 +166,7 @@ class TD3BC(ReplayLearner):
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from the targets, and scalars."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
-        loss = F.mse_loss(q, self._target(sample).expand_as(q))
+        loss = F.mse_loss(q, self.target(sample).expand_as(q))
         return loss, {"critic": loss, "q": q.mean()}
 
     def _behaviour_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
@@ -194,7 +194,3 @@ class TD3BC(ReplayLearner):
         q = self.target_critics(observation, unit).amin(0)
         is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, action_mask))
         return q.masked_fill(is_refused, -torch.inf).amax(-1)
-
-    def _target(self, sample: TensorDictBase) -> Tensor:
-        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
-        return sample["reward"] + sample["discount"] * self.next_value(sample)

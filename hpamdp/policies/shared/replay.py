@@ -34,7 +34,7 @@ class ReplayLearner(Learner):
     Losses that are given to `minimise` as methods can be compiled, see `compile_updates`. A subclass with
     `has_compiled_updates` promises that `torch.compile` can trace all of them in one piece.
 
-    The target of a value is `reward + discount * next_value(sample)`, which asks `value`.
+    The `target` of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
     Attributes:
         symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
@@ -179,6 +179,11 @@ class ReplayLearner(Learner):
             rows["option"] = batch[keys.OPTION]
             rows["next_option"] = batch[keys.NEXT_OPTION]
         return rows
+
+    @torch.no_grad()
+    def target(self, sample: TensorDictBase) -> Tensor:
+        """Return r + discount V(s'), `[B]`, where the discount is 0 after a termination."""
+        return sample["reward"] + sample["discount"] * self.next_value(sample)
 
     def next_value(self, sample: TensorDictBase) -> Tensor:
         """Return the values `[B]` of a sample's next states.
