@@ -68,21 +68,19 @@ FIRST = action(
 SECOND = FIRST[len(KICKS) :]
 
 
+def of_rows(env: GoalEnv, rows: Tensor, seed: int = 0) -> GoalEnv:
+    """Return copies of some of the pitches, with noise of their own."""
+    copies = GoalEnv(len(rows), repaired=env.repaired, seed=seed)
+    copies.reset()
+    copies.set_env_state({name: column[rows] for name, column in env.env_state().items()})
+    return copies
+
+
 def tried(env: GoalEnv, actions: TensorDict, seed: int) -> tuple[Tensor, GoalEnv]:
     """Take each of these actions `[A]` from each state `[N]` with other noise; return outcomes `[N, A]` and pitches."""
-    model = GoalEnv(env.num_envs * len(actions), repaired=env.repaired, seed=seed)
-    model.reset()
-    model.set_env_state({name: column.repeat_interleave(len(actions)) for name, column in env.env_state().items()})
+    model = of_rows(env, torch.arange(env.num_envs).repeat_interleave(len(actions)), seed)
     outcome = model.step(actions.repeat(env.num_envs))["next", keys.OUTCOME]
     return outcome.reshape(env.num_envs, len(actions)), model
-
-
-def of_rows(env: GoalEnv, rows: Tensor) -> GoalEnv:
-    """Return a copy of some of the pitches."""
-    part = GoalEnv(len(rows), repaired=env.repaired)
-    part.reset()
-    part.set_env_state({name: column[rows] for name, column in env.env_state().items()})
-    return part
 
 
 def look_ahead_player(num_samples: int = 6) -> Player:
