@@ -27,8 +27,9 @@ BOATS = ("congruent", "incongruent")
 TASKS = {"congruent": "congruent", "incongruent": "incongruent", "chosen": "chosen by the agent"}
 HUMAN_SCORE = HUMAN["chosen"]["score"]
 BEST_SCORE = BEST_PERSON["score"]
+DECLARED = ("auto", "shaped")  # augment and reward by default
 SETTINGS = {
-    ("auto", "shaped"): "symmetry declared",
+    DECLARED: "symmetry declared",
     ("auto", "sparse"): "symmetry declared, sparse reward",
     ("False", "shaped"): "told nothing of symmetry",
 }
@@ -87,12 +88,17 @@ def _presses(counts: Sequence[float], statistic: str) -> str:
     return f"{value:,.0f}{share}" if np.isfinite(value) else f"not reached{share}"
 
 
+def runs_of(curves: Rows, augment: str, reward: str, boat: str) -> Rows:
+    """Return the rows of a setting with a boat."""
+    return [row for row in curves if (row["augment"], row["reward"], row["boat"]) == (augment, reward, boat)]
+
+
 def table(curves: Rows) -> str:
     """Return a line for each setting and boat."""
     lines = _head("| | boat |")
     for (augment, reward), label in SETTINGS.items():
         for boat, task in TASKS.items():
-            rows = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == (augment, reward, boat)]
+            rows = runs_of(curves, augment, reward, boat)
             if rows:
                 lines.append(f"| {label} | {task} {_figures(rows)}")
     return "\n".join(lines)
@@ -100,8 +106,7 @@ def table(curves: Rows) -> str:
 
 def ablation_table(curves: Rows) -> str:
     """Return a line for each variant, on the congruent boat with the seeds that all variants have."""
-    rows = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == ("auto", "shaped", "congruent")]
-    rows = [row for row in rows if row["seed"] in ABLATION_SEEDS]
+    rows = [row for row in runs_of(curves, *DECLARED, "congruent") if row["seed"] in ABLATION_SEEDS]
     cells = {name: of_name for (name,), of_name in groups(rows, "variant").items()}
     return "\n".join(
         [*_head("| |"), *(f"| {label} {_figures(cells[name])}" for name, label in VARIANTS.items() if name in cells)]
@@ -131,9 +136,10 @@ def augment_table(augment: Rows) -> str:
     lines = ["| | seeds | without | `low.augment=true` | CPU of a run with it |", "|---|---|---|---|---|"]
     for (learner,), rows in groups(augment, "learner").items():
         cells = {name: of_name for (name,), of_name in groups(rows, "augment").items()}
-        presses = {name: ", ".join(f"{row['presses']:,.0f}" for row in of_name) for name, of_name in cells.items()}
-        cpu = f"{np.mean([row['cpu_s'] for row in cells['True']]):.0f} s"
-        lines.append(f"| {learner} | {len(cells['True'])} | {presses['False']} | {presses['True']} | {cpu} |")
+        without, mapped = cells.get("False", []), cells.get("True", [])
+        presses = [", ".join(f"{row['presses']:,.0f}" for row in of_name) for of_name in (without, mapped)]
+        cpu = f"{np.mean([row['cpu_s'] for row in mapped]):.0f} s" if mapped else ""
+        lines.append(f"| {learner} | {max(len(without), len(mapped))} | {' | '.join(presses)} | {cpu} |")
     return "\n".join(lines)
 
 
@@ -147,11 +153,9 @@ def human_by_block(boat: str) -> tuple[np.ndarray, np.ndarray]:
 
 def draw(curves: Rows, path: Path) -> None:
     """Draw score against presses, a line for each seed, with people's own learning beside them."""
-    curves = [row for row in curves if not row["variant"]]
     figure = Figure(figsize=(11.0, 4.2), layout="constrained")
     for boat, axes in zip(BOATS, figure.subplots(1, 2, sharey=True), strict=True):
-        chosen = [row for row in curves if (row["augment"], row["reward"], row["boat"]) == ("auto", "shaped", boat)]
-        for number, run in enumerate(groups(chosen, "seed").values()):
+        for number, run in enumerate(groups(runs_of(curves, *DECLARED, boat), "seed").values()):
             x, y = [row["presses"] for row in run], [row["score"] for row in run]
             axes.plot(x, y, color="#56B4E9", linewidth=1.2, label=None if number else "PETS, a line for each seed")
         axes.plot(*human_by_block(boat), "s--", color="#D98200", markersize=4, label="a person, 60 episodes a square")
@@ -169,10 +173,11 @@ def draw(curves: Rows, path: Path) -> None:
 def main(folders: Sequence[str]) -> None:
     """Gather, draw, tabulate."""
     if folders:
-        write_tables(HERE, gather(finished(folders)))
+        tables = gather(finished(folders))
+        write_tables(HERE, {name: rows for name, rows in tables.items() if rows} or tables)
     curves = read_csv(HERE / "curves.csv")
-    draw(curves, HERE / "curves.png")
     plain = [row for row in curves if not row["variant"]]
+    draw(plain, HERE / "curves.png")
     print(table(plain), ablation_table(curves), augment_table(read_csv(HERE / "augment.csv")), sep="\n\n")
 
 
