@@ -128,19 +128,6 @@ def forked(function: Callable[..., object], *arguments: object) -> int | None:
 
 
 @pytest.fixture
-def hpamdp_command(monkeypatch, capsys) -> Callable[..., tuple[int, str, str]]:
-    """Give words to `hpamdp`, in the folder that the tests run in; return its exit code, its stdout and its stderr."""
-
-    def run(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["hpamdp", *words])
-        with pytest.raises(SystemExit) as stopped:
-            main()
-        return stopped.value.code, *capsys.readouterr()
-
-    return run
-
-
-@pytest.fixture
 def command(tmp_path, monkeypatch, capsys):
     """Run the command line in an empty folder and return its exit code, its stdout and its stderr."""
     monkeypatch.chdir(tmp_path)

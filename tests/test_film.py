@@ -122,10 +122,10 @@ def test_a_path_is_told_from_settings(tmp_path):
     assert split_words([str(tmp_path)]) == (str(tmp_path), [])
 
 
-def test_watch_writes_a_film(tmp_path, hpamdp_command):
+def test_watch_writes_a_film(tmp_path, command):
     file = tmp_path / "a.gif"
     words = ["high=uniform", "low=random", "--to", str(file), "--episodes", "2", "--size", "60", "--fps", "5"]
-    code, out, _ = hpamdp_command("watch", *words)
+    code, out, _ = command("watch", *words)
     assert code == 0 and "2 episodes, scores" in out
     with Image.open(file) as image:
         assert image.size == (120, 60)
@@ -146,6 +146,6 @@ def test_watch_writes_a_film(tmp_path, hpamdp_command):
         (["low=random", "high=none"], "needs a selector"),
     ],
 )
-def test_watch_tells_a_mistake_in_one_line(hpamdp_command, words, said):
-    code, out, err = hpamdp_command("watch", *words)
+def test_watch_tells_a_mistake_in_one_line(command, words, said):
+    code, out, err = command("watch", *words)
     assert code == 2 and said in err and err.count("\n") == 1 and not out

@@ -255,9 +255,9 @@ def test_a_disk_that_is_full_is_told_and_the_episode_can_be_sent_again(tmp_path,
         assert send(server, EPISODES[0])[0] == 201
 
 
-def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch, hpamdp_command):
+def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch, command):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 1)
-    code, out, _ = hpamdp_command("play", "--export", str(tmp_path / "site"), "--agent", "none")
+    code, out, _ = command("play", "--export", str(tmp_path / "site"), "--agent", "none")
     assert code == 0 and "index.html" in out
     assert {file.name for file in (tmp_path / "site").iterdir()} == {*BoatPage.files, "data.js"}
     script = (tmp_path / "site" / "data.js").read_text()
@@ -265,12 +265,12 @@ def test_the_page_is_written_as_files_that_need_no_server(tmp_path, monkeypatch,
     assert data["has_server"] is False and len(data["layouts"]["round"]) == 60
 
 
-def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, monkeypatch, hpamdp_command):
+def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, monkeypatch, command):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
     monkeypatch.setattr(torch, "set_num_threads", (given := []).append)
     site = str(tmp_path / "site")
-    assert hpamdp_command("play", "--export", site, "--agent", "none", "threads=3")[0] == 0 and given == [3]
-    assert hpamdp_command("play", "--export", site, "--agent", "none")[0] == 0 and given == [3, 1]
+    assert command("play", "--export", site, "--agent", "none", "threads=3")[0] == 0 and given == [3]
+    assert command("play", "--export", site, "--agent", "none")[0] == 0 and given == [3, 1]
 
 
 @pytest.mark.parametrize(
@@ -287,9 +287,9 @@ def test_the_plans_of_the_page_are_made_with_the_threads_that_are_set(tmp_path, 
         (["--agent", "none", "--host", "256.1.1.1"], "--host 256.1.1.1"),
     ],
 )
-def test_play_tells_a_mistake_in_one_line(monkeypatch, hpamdp_command, words, said):
+def test_play_tells_a_mistake_in_one_line(monkeypatch, command, words, said):
     monkeypatch.setattr("hpamdp.env.boatdock.play.boat_page.NUM_BLOCKS", 0)
-    code, _, err = hpamdp_command("play", *words)
+    code, _, err = command("play", *words)
     assert code == 2 and said in err and err.count("\n") == 1
 
 

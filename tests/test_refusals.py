@@ -231,7 +231,7 @@ def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_all_commands_tell_when_the_options_of_a_saved_agent_are_others(command, hpamdp_command):
+def test_all_commands_tell_when_the_options_of_a_saved_agent_are_others(command):
     first = "env.boats=[congruent,incongruent1]"
     assert command(*SMALL, "film=false", first, "high=uniform", "low=random", "hydra.run.dir=saved")[0] == 0
     chosen = "saved: its agent chooses among congruent, incongruent1, but env=boatdock has"
@@ -244,7 +244,7 @@ def test_all_commands_tell_when_the_options_of_a_saved_agent_are_others(command,
     assert code == 0 and f"{chosen} incongruent1, incongruent2, which take their places" in err
     code, _, err = command("mode=eval", "checkpoint=saved", "env.slip=0.5", "hydra.run.dir=again")
     assert code == 0 and "take their places" not in err
-    code, _, err = hpamdp_command("watch", "saved", "env.boats=[incongruent1,congruent]")
+    code, _, err = command("watch", "saved", "env.boats=[incongruent1,congruent]")
     assert code == 2 and "keep the order" in err
 
 
