@@ -127,7 +127,7 @@ def train(words: Sequence[str]) -> dict[str, object]:
     means, num_due = evaluate(parts)
     optimum = mean_over_starts(parts, rules.best_values(1.0, steps))
     best = rules.best_values(GAMMA, steps)
-    error = (learned_values(parts.agent) - best).abs()
+    error = (values_of_cells(parts.agent) - best).abs()
     return {
         "high": config.high.name,
         "low": config.low.name,
@@ -172,28 +172,34 @@ def evaluate(parts: Parts) -> tuple[dict[str, float], torch.Tensor]:
 
 
 @torch.no_grad()
-def learned_values(agent: HierarchicalAgent) -> torch.Tensor:
-    """Return the learners' values of all cells, float64 `[x, y]`: 0 at walls and at the goal, NaN if they have none.
+def learned_values(agent: HierarchicalAgent, observation: torch.Tensor) -> torch.Tensor:
+    """Return the learners' values of states `[N, observation_dim]`, float64 `[N]`; NaN if they have none.
 
-    In each cell the selector chooses greedily, and the value is that of the chosen option's learner.
+    In each state the selector chooses greedily, and the value is that of the chosen option's learner.
     """
-    x, y = (part.flatten().int() for part in torch.meshgrid(*2 * [torch.arange(rules.SIZE)], indexing="ij"))
-    none = torch.zeros_like(x)
-    observation = rules.observe(rules.RoomsState(x, y, none, none, none))
+    none = torch.zeros(len(observation), dtype=torch.long)
     follows = agent.next_options
     assert follows is not None and agent.selector is not None
     shown = observation
     if agent.is_shared:
-        shown = torch.cat([observation, observation.new_zeros(len(x), agent.specs.num_options)], -1)
+        shown = torch.cat([observation, observation.new_zeros(len(observation), agent.specs.num_options)], -1)
     agent.selector.decides_ends = False
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        option = follows.choose(shown, none.long(), none.long())
+        option = follows.choose(shown, none, none)
         try:
             value = torch.stack([follows.value(shown, option) for _ in range(10)]).mean(0)  # some are noisy
         except NotImplementedError:
-            value = torch.full(x.shape, torch.nan)
+            value = torch.full(none.shape, torch.nan)
+    return value.double()
+
+
+def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
+    """Return the learners' values of all cells, float64 `[x, y]`: 0 at walls and at the goal."""
+    x, y = (part.flatten().int() for part in torch.meshgrid(*2 * [torch.arange(rules.SIZE)], indexing="ij"))
+    none = torch.zeros_like(x)
+    value = learned_values(agent, rules.observe(rules.RoomsState(x, y, none, none, none)))
     is_nothing = ~rules.is_free(x, y) | ((x == rules.GOAL) & (y == rules.GOAL))
-    return value.double().masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
+    return value.masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
 
 
 def main(words: Sequence[str]) -> None:
