@@ -81,10 +81,8 @@ SELECTORS = {
 # Replay learners: small networks and fast targets, for a problem of 104 cells.
 REPLAY = [
     "total_frames=100000",
-    "agent.uniform_option_frames=50000",
+    "agent.uniform_option_frames=70000",
     "low.hidden_dims=[64,64]",
-    "low.updates_per_frame=0.05",
-    "low.warmup_frames=2000",
 ]
 LEARNERS = {
     # Small batches, for many updates of a policy that must go through the rooms before it finds a reward.
@@ -95,10 +93,30 @@ LEARNERS = {
         "steps_per_batch=16",
         "low.minibatch_size=256",
     ],
-    "pdqn": [*REPLAY, "low.actor_tau=0.05", "low.critic_tau=0.05", "low.epsilon_frames=15000"],
+    "pdqn": [
+        *REPLAY,
+        "total_frames=200000",
+        "agent.uniform_option_frames=100000",
+        "low.warmup_frames=2000",
+        "low.updates_per_frame=0.05",
+        "low.actor_tau=0.05",
+        "low.critic_tau=0.05",
+        "low.epsilon_frames=15000",
+    ],
     "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.codec_pretrain_updates=500"],
     "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.actor_lr=1e-3"],
-    "hsac": [*REPLAY, "low.tau=0.05"],
+    # Low temperatures: with the default ones a step earns more entropy than it costs, and never arriving is best.
+    "hsac": [
+        *REPLAY,
+        "low.warmup_frames=10000",
+        "low.updates_per_frame=0.1",
+        "low.batch_size=128",
+        "low.tau=0.05",
+        "low.discrete_temperature=0.01",
+        "low.parameter_temperature=0.005",
+        "low.discrete_target_entropy=0.5",
+        "low.parameter_target_entropy=-1.0",
+    ],
     "qpamdp": ["low.features=[0,1]", "low.warmup_frames=5000", "low.initial_mean=0", "low.sigma=0.3"],
     "dlpa": ["low.horizon=3"],
 }
