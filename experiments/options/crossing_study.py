@@ -56,6 +56,7 @@ SELECTORS = {
     "meta_critic": [
         *STEPS,
         "high.num_members=1",
+        "high.epsilon_final=0.02",
         "high.epsilon_decisions=3000",
         "high.warmup_decisions=200",
         "high.buffer_size=3000",
@@ -75,14 +76,35 @@ SELECTORS = {
         "high.tau=0.05",
     ],
 }
-REPLAY = ["low.hidden_dims=[64]", "low.warmup_frames=1000", "low.batch_size=128", "low.critic_lr=3e-3"]
+REPLAY = [
+    "low.hidden_dims=[64]",
+    "low.warmup_frames=1000",
+    "low.batch_size=128",
+    "low.updates_per_frame=0.1",
+    "low.critic_lr=3e-3",
+]
 LEARNERS = {
     "hppo": ["steps_per_batch=16", "low.minibatch_size=256", "low.hidden_dims=[64]", "low.critic_hidden_dims=[64]"],
     "pdqn": [*REPLAY, "low.actor_tau=0.05", "low.critic_tau=0.05", "low.epsilon_frames=5000"],
     "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.codec_pretrain_updates=300"],
     "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.actor_lr=1e-3"],
-    "hsac": [*REPLAY, "low.tau=0.05", "low.discrete_temperature=0.01", "low.parameter_temperature=0.005"],
-    "qpamdp": ["low.features=null", "low.warmup_frames=2000"],
+    "hsac": [*REPLAY, "low.tau=0.05", "low.discrete_temperature=0.003", "low.parameter_temperature=0.002"],
+    "qpamdp": [
+        "total_frames=150000",
+        "agent.uniform_option_frames=75000",
+        "steps_per_batch=16",
+        "low.features=null",
+        "low.phi_order=1",
+        "low.phi_max_coupled=1",
+        "low.psi_order=1",
+        "low.psi_max_coupled=1",
+        "low.warmup_frames=5000",
+        "low.initial_episodes=3000",
+        "low.relearning_episodes=1000",
+        "low.rollouts=1000",
+        "low.initial_mean=0",
+        "low.sigma=0.3",
+    ],
 }
 
 

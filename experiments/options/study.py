@@ -60,6 +60,7 @@ SELECTORS = {
     "meta_critic": [
         f"high.gamma={GAMMA}",
         "high.num_members=1",
+        "high.epsilon_final=0.02",
         "high.epsilon_decisions=10000",
         "high.buffer_size=10000",
         "high.batch_size=256",
@@ -103,8 +104,24 @@ LEARNERS = {
         "low.critic_tau=0.05",
         "low.epsilon_frames=15000",
     ],
-    "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.codec_pretrain_updates=500"],
-    "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.actor_lr=1e-3"],
+    "hyar": [
+        *REPLAY,
+        "low.warmup_frames=5000",
+        "low.updates_per_frame=0.1",
+        "low.tau=0.05",
+        "low.epsilon_frames=30000",
+        "low.codec_pretrain_updates=1000",
+    ],
+    "paddpg": [
+        *REPLAY,
+        "low.twin=true",
+        "low.updates_per_frame=0.1",
+        "low.hidden_dims=[128,128]",
+        "low.tau=0.05",
+        "low.epsilon_final=0.2",
+        "low.epsilon_frames=25000",
+        "low.actor_lr=3e-4",
+    ],
     # Low temperatures: with the default ones a step earns more entropy than it costs, and never arriving is best.
     "hsac": [
         *REPLAY,
