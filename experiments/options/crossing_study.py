@@ -4,12 +4,11 @@ python experiments/options/crossing_study.py high=meta_critic,actor low=hppo,pdq
                                                                                            row each to crossing.csv
 python experiments/options/crossing_study.py                                               tabulates crossing.csv
 
-Other words of the command line may follow; they hold for all runs.
+The words are those of the command line, and all combinations of their values are run.
 """
 
 from __future__ import annotations
 
-import csv
 import itertools
 import sys
 import tempfile
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
-from study import CONF, learned_values
+from study import CONF, add, learned_values, tabulate
 from tensordict import TensorDictBase
 
 from hpamdp import keys
@@ -28,11 +27,11 @@ from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.train import Trainer
 
 HERE = Path(__file__).resolve().parent
+FILE = HERE / "crossing.csv"
 EXAMPLE = HERE.parent.parent / "examples" / "crossing"
 sys.path.insert(0, str(EXAMPLE))
 from crossing import NUM_CELLS, Crossing, best_values, cell_of, observe  # noqa: E402
 
-COLUMNS = ("high", "low", "seed", "steps", "share", "success", "value_error", "value_error_everywhere", "cpu_s")
 GAMMA = 0.9
 OPTION_LENGTH = 3
 # On every run, before the words of the command line.
@@ -88,7 +87,7 @@ LEARNERS = {
     "pdqn": [*REPLAY, "low.actor_tau=0.05", "low.critic_tau=0.05", "low.epsilon_frames=5000"],
     "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.codec_pretrain_updates=300"],
     "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.actor_lr=1e-3"],
-    "hsac": [*REPLAY, "low.tau=0.05", "low.discrete_temperature=0.003", "low.parameter_temperature=0.002"],
+    "hsac": [*REPLAY, "low.tau=0.05", "low.discrete_temperature=0.002", "low.parameter_temperature=0.001"],
     "qpamdp": [
         "total_frames=150000",
         "agent.uniform_option_frames=75000",
@@ -175,28 +174,13 @@ def evaluate(parts: Parts, best: torch.Tensor) -> tuple[float, float, torch.Tens
 
 
 def main(words: Sequence[str]) -> None:
-    """Train if there are words, and print the table."""
-    file = HERE / "crossing.csv"
+    """Train with every combination of the words' values if there are words, and print the table."""
+    names = [word.split("=", 1)[0] for word in words]
+    values = [word.split("=", 1)[1].split(",") for word in words]
     if words:
-        choices = [
-            [f"{name}={value}" for value in values.split(",")]
-            for name, values in (word.split("=", 1) for word in words)
-        ]
-        for chosen in itertools.product(*choices):
-            row = train(chosen)
-            is_new = not file.exists()
-            with file.open("a", newline="") as stream:
-                writer = csv.DictWriter(stream, COLUMNS)
-                if is_new:
-                    writer.writeheader()
-                writer.writerow(row)
-    rows = []
-    if file.exists():
-        with file.open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
-    for row in rows:
-        print("| " + " | ".join(row[name] for name in COLUMNS) + " |")
+        for chosen in itertools.product(*values):
+            add(train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)]), FILE)
+    tabulate(FILE)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import csv
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -28,22 +28,7 @@ from hpamdp.run.train import Trainer
 
 HERE = Path(__file__).resolve().parent
 CONF = HERE.parent.parent / "conf"
-COLUMNS = (
-    "high",
-    "low",
-    "sharing",
-    "termination",
-    "option_length",
-    "seed",
-    "steps",
-    "score",
-    "optimum",
-    "share",
-    "success",
-    "value_error",
-    "value_error_everywhere",
-    "cpu_s",
-)
+FILE = HERE / "results.csv"
 GAMMA = 0.95
 # On every run, before the words of the command line.
 COMMON = [
@@ -134,8 +119,24 @@ LEARNERS = {
         "low.discrete_target_entropy=0.5",
         "low.parameter_target_entropy=-1.0",
     ],
-    "qpamdp": ["low.features=[0,1]", "low.warmup_frames=5000", "low.initial_mean=0", "low.sigma=0.3"],
-    "dlpa": ["low.horizon=3"],
+    # All entries, two in a feature: with the one-hot vectors this makes a value for each cell. Episodes are options.
+    "qpamdp": [
+        "total_frames=800000",
+        "agent.uniform_option_frames=400000",
+        "num_envs=64",
+        "steps_per_batch=16",
+        "low.features=null",
+        "low.phi_order=1",
+        "low.psi_order=1",
+        "low.warmup_frames=20000",
+        "low.initial_episodes=30000",
+        "low.relearning_episodes=10000",
+        "low.parameter_updates=5",
+        "low.rollouts=5000",
+        "low.temperature_decay=0.9999",
+        "low.initial_mean=0.5",
+        "low.sigma=0.3",
+    ],
 }
 
 
@@ -237,24 +238,29 @@ def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
     return value.masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
 
 
+def add(row: Mapping[str, object], file: Path) -> None:
+    """Write a row at the end of a csv file."""
+    is_new = not file.exists()
+    with file.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def tabulate(file: Path) -> None:
+    """Print a csv file as a table."""
+    with file.open(newline="") as stream:
+        names, *rows = csv.reader(stream)
+    for cells in (names, ["---"] * len(names), *rows):
+        print("| " + " | ".join(cells) + " |")
+
+
 def main(words: Sequence[str]) -> None:
     """Train if there are words, and print the table."""
-    file = HERE / "results.csv"
     if words:
-        row = train(words)
-        is_new = not file.exists()
-        with file.open("a", newline="") as stream:
-            writer = csv.DictWriter(stream, COLUMNS)
-            if is_new:
-                writer.writeheader()
-            writer.writerow(row)
-    rows = []
-    if file.exists():
-        with file.open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
-    for row in rows:
-        print("| " + " | ".join(row[name] for name in COLUMNS) + " |")
+        add(train(words), FILE)
+    tabulate(FILE)
 
 
 if __name__ == "__main__":
