@@ -89,8 +89,8 @@ LEARNERS = {
     "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.actor_lr=1e-3"],
     "hsac": [*REPLAY, "low.tau=0.05", "low.discrete_temperature=0.002", "low.parameter_temperature=0.001"],
     "qpamdp": [
-        "total_frames=150000",
-        "agent.uniform_option_frames=75000",
+        "total_frames=300000",
+        "agent.uniform_option_frames=150000",
         "steps_per_batch=16",
         "low.features=null",
         "low.phi_order=1",
@@ -100,8 +100,9 @@ LEARNERS = {
         "low.warmup_frames=5000",
         "low.initial_episodes=3000",
         "low.relearning_episodes=1000",
-        "low.rollouts=1000",
-        "low.initial_mean=0",
+        "low.rollouts=500",
+        "low.parameter_updates=10",
+        "low.initial_mean=0.5",
         "low.sigma=0.3",
     ],
 }
