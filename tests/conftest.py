@@ -33,8 +33,10 @@ for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, sig
 torch.set_num_threads(1)
 
 CONF = Path(__file__).resolve().parent.parent / "conf"
-# The word that adds the tests' own yaml files.
-OWN = f"hydra.searchpath=[file://{Path(__file__).resolve().parent / 'conf'}]"
+CROSSING = Path(__file__).resolve().parent.parent / "examples" / "crossing"
+sys.path.insert(0, str(CROSSING))
+# The word that adds the tests' own yaml files and that of the example.
+OWN = f"hydra.searchpath=[file://{Path(__file__).resolve().parent / 'conf'},file://{CROSSING / 'conf'}]"
 
 
 def compose_config(overrides: Sequence[str]) -> DictConfig:

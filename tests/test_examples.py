@@ -1,10 +1,20 @@
 """The examples run, import only what they say they need, and do what they promise."""
 
 import ast
+import json
+import os
+import re
 import runpy
+import shlex
+import sys
 from pathlib import Path
 
 import pytest
+from conftest import CROSSING, forked
+from crossing import NUM_CELLS, Crossing, best_values
+from torchrl.envs.utils import check_env_specs
+
+from hpamdp import cli
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 
@@ -22,3 +32,29 @@ def test_an_option_policy_in_plain_torchrl_beats_either_boat_alone(capsys):
     assert list(scores) == ["incongruent", "congruent", "learned"]
     assert scores["learned"] > max(scores["incongruent"], scores["congruent"]) + 0.3
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(scores)
+
+
+def test_the_command_of_crossing_runs(tmp_path):
+    (command,) = re.findall(r"^python -m hpamdp\.cli (.*)$", (CROSSING / "README.md").read_text(), re.MULTILINE)
+    short = ["total_frames=256", "num_envs=8", "eval.every=0", "eval.layouts=10", f"hydra.run.dir={tmp_path}"]
+
+    def run() -> None:
+        os.chdir(CROSSING)
+        sys.argv = ["hpamdp", *shlex.split(command), *short]
+        cli.main()
+
+    assert forked(run) == 0
+    assert json.loads((tmp_path / "summary.json").read_text())["finished"]
+
+
+def test_crossing_keeps_the_contract_and_its_best_values_are_those_by_hand():
+    check_env_specs(Crossing(3, start=3.0))
+    gamma = 0.9
+    every_step, every_third = best_values(gamma, 1), best_values(gamma, 3)
+    assert len(every_step) == NUM_CELLS == 25 and every_step[-1] == 0.0
+    # Three steps over land and three through water, the last of which pays.
+    assert [every_step[0], every_third[0]] == pytest.approx([gamma**5] * 2)
+    assert every_step[20] == 1.0
+    # A whole step before the water; with a choice at every third step, two slow ones follow before three that swim.
+    assert every_step[8] == pytest.approx(gamma**3)
+    assert every_third[8] == pytest.approx(gamma**5)

@@ -189,6 +189,44 @@ def test_options_end_with_the_initial_probability():
     assert critic.ends(td).float().mean().item() == pytest.approx(0.3, abs=0.04)
 
 
+def test_options_end_with_the_initial_probability_as_often_as_they_are_random():
+    critic = make_critic(initial_termination=0.3, warmup_steps=0, epsilon_steps=1, epsilon_final=0.2)
+    critic.num_steps.fill_(1)
+    td = TensorDict({keys.OBSERVATION: torch.rand(4000, SPECS.observation_dim), keys.OPTION: torch.arange(4000) % 2})
+    td.batch_size = [4000]
+    with torch.no_grad():
+        critic.termination[-1].bias.copy_(torch.tensor([-30.0, 30.0]))  # option 0 never ends, option 1 always does
+
+    def shares() -> list[float]:
+        is_ended = critic.ends(td).float()
+        return [is_ended[0::2].mean().item(), is_ended[1::2].mean().item()]
+
+    assert shares() == pytest.approx([0.2 * 0.3, 0.8 + 0.2 * 0.3], abs=0.04)
+    critic.is_uniform.fill_(True)
+    assert shares() == pytest.approx([0.3, 0.3], abs=0.04)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert shares() == [0.0, 1.0]
+
+
+def test_the_meta_critic_ends_the_best_option_too_as_often_as_it_chooses_at_random():
+    critic = make_meta_critic()
+    critic.num_decisions.fill_(10_000)  # the probability of a random option is 0.2
+    with torch.no_grad():
+        critic.critics.layers[-1].bias.copy_(torch.tensor([9.0, -9.0]))
+    td = TensorDict({keys.OBSERVATION: torch.rand(4000, SPECS.observation_dim), keys.OPTION: torch.arange(4000) % 2})
+    td.batch_size = [4000]
+
+    def shares() -> list[float]:
+        is_ended = critic.ends(td).float()
+        return [is_ended[0::2].mean().item(), is_ended[1::2].mean().item()]
+
+    assert shares() == pytest.approx([0.2, 1.0], abs=0.04)
+    critic.is_uniform.fill_(True)
+    assert shares() == [1.0, 1.0]
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert shares() == [0.0, 1.0]
+
+
 def test_options_of_a_fixed_length_are_interrupted_by_nobody():
     torch.manual_seed(0)
     agent = steppers(make_meta_critic(), SPECS)

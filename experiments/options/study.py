@@ -10,7 +10,7 @@ import csv
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -28,22 +28,7 @@ from hpamdp.run.train import Trainer
 
 HERE = Path(__file__).resolve().parent
 CONF = HERE.parent.parent / "conf"
-COLUMNS = (
-    "high",
-    "low",
-    "sharing",
-    "termination",
-    "option_length",
-    "seed",
-    "steps",
-    "score",
-    "optimum",
-    "share",
-    "success",
-    "value_error",
-    "value_error_everywhere",
-    "cpu_s",
-)
+FILE = HERE / "results.csv"
 GAMMA = 0.95
 # On every run, before the words of the command line.
 COMMON = [
@@ -60,6 +45,7 @@ SELECTORS = {
     "meta_critic": [
         f"high.gamma={GAMMA}",
         "high.num_members=1",
+        "high.epsilon_final=0.02",
         "high.epsilon_decisions=10000",
         "high.buffer_size=10000",
         "high.batch_size=256",
@@ -81,10 +67,8 @@ SELECTORS = {
 # Replay learners: small networks and fast targets, for a problem of 104 cells.
 REPLAY = [
     "total_frames=100000",
-    "agent.uniform_option_frames=50000",
+    "agent.uniform_option_frames=70000",
     "low.hidden_dims=[64,64]",
-    "low.updates_per_frame=0.05",
-    "low.warmup_frames=2000",
 ]
 LEARNERS = {
     # Small batches, for many updates of a policy that must go through the rooms before it finds a reward.
@@ -95,12 +79,64 @@ LEARNERS = {
         "steps_per_batch=16",
         "low.minibatch_size=256",
     ],
-    "pdqn": [*REPLAY, "low.actor_tau=0.05", "low.critic_tau=0.05", "low.epsilon_frames=15000"],
-    "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.codec_pretrain_updates=500"],
-    "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=15000", "low.actor_lr=1e-3"],
-    "hsac": [*REPLAY, "low.tau=0.05"],
-    "qpamdp": ["low.features=[0,1]", "low.warmup_frames=5000", "low.initial_mean=0", "low.sigma=0.3"],
-    "dlpa": ["low.horizon=3"],
+    "pdqn": [
+        *REPLAY,
+        "total_frames=200000",
+        "agent.uniform_option_frames=100000",
+        "low.warmup_frames=2000",
+        "low.updates_per_frame=0.05",
+        "low.actor_tau=0.05",
+        "low.critic_tau=0.05",
+        "low.epsilon_frames=15000",
+    ],
+    "hyar": [
+        *REPLAY,
+        "low.warmup_frames=5000",
+        "low.updates_per_frame=0.1",
+        "low.tau=0.05",
+        "low.epsilon_frames=30000",
+        "low.codec_pretrain_updates=1000",
+    ],
+    "paddpg": [
+        *REPLAY,
+        "low.twin=true",
+        "low.updates_per_frame=0.1",
+        "low.hidden_dims=[128,128]",
+        "low.tau=0.05",
+        "low.epsilon_final=0.2",
+        "low.epsilon_frames=25000",
+        "low.actor_lr=3e-4",
+    ],
+    # Low temperatures: with the default ones a step earns more entropy than it costs, and never arriving is best.
+    "hsac": [
+        *REPLAY,
+        "low.warmup_frames=10000",
+        "low.updates_per_frame=0.1",
+        "low.batch_size=128",
+        "low.tau=0.05",
+        "low.discrete_temperature=0.01",
+        "low.parameter_temperature=0.005",
+        "low.discrete_target_entropy=0.5",
+        "low.parameter_target_entropy=-1.0",
+    ],
+    # All entries, two in a feature: with the one-hot vectors this makes a value for each cell. Episodes are options.
+    "qpamdp": [
+        "total_frames=800000",
+        "agent.uniform_option_frames=400000",
+        "num_envs=64",
+        "steps_per_batch=16",
+        "low.features=null",
+        "low.phi_order=1",
+        "low.psi_order=1",
+        "low.warmup_frames=20000",
+        "low.initial_episodes=30000",
+        "low.relearning_episodes=10000",
+        "low.parameter_updates=5",
+        "low.rollouts=5000",
+        "low.temperature_decay=0.9999",
+        "low.initial_mean=0.5",
+        "low.sigma=0.3",
+    ],
 }
 
 
@@ -127,7 +163,7 @@ def train(words: Sequence[str]) -> dict[str, object]:
     means, num_due = evaluate(parts)
     optimum = mean_over_starts(parts, rules.best_values(1.0, steps))
     best = rules.best_values(GAMMA, steps)
-    error = (learned_values(parts.agent) - best).abs()
+    error = (values_of_cells(parts.agent) - best).abs()
     return {
         "high": config.high.name,
         "low": config.low.name,
@@ -172,48 +208,59 @@ def evaluate(parts: Parts) -> tuple[dict[str, float], torch.Tensor]:
 
 
 @torch.no_grad()
-def learned_values(agent: HierarchicalAgent) -> torch.Tensor:
-    """Return the learners' values of all cells, float64 `[x, y]`: 0 at walls and at the goal, NaN if they have none.
+def learned_values(agent: HierarchicalAgent, observation: torch.Tensor) -> torch.Tensor:
+    """Return the learners' values of states `[N, observation_dim]`, float64 `[N]`; NaN if they have none.
 
-    In each cell the selector chooses greedily, and the value is that of the chosen option's learner.
+    In each state the selector chooses greedily, and the value is that of the chosen option's learner.
     """
-    x, y = (part.flatten().int() for part in torch.meshgrid(*2 * [torch.arange(rules.SIZE)], indexing="ij"))
-    none = torch.zeros_like(x)
-    observation = rules.observe(rules.RoomsState(x, y, none, none, none))
+    none = torch.zeros(len(observation), dtype=torch.long)
     follows = agent.next_options
     assert follows is not None and agent.selector is not None
     shown = observation
     if agent.is_shared:
-        shown = torch.cat([observation, observation.new_zeros(len(x), agent.specs.num_options)], -1)
+        shown = torch.cat([observation, observation.new_zeros(len(observation), agent.specs.num_options)], -1)
     agent.selector.decides_ends = False
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        option = follows.choose(shown, none.long(), none.long())
+        option = follows.choose(shown, none, none)
         try:
             value = torch.stack([follows.value(shown, option) for _ in range(10)]).mean(0)  # some are noisy
         except NotImplementedError:
-            value = torch.full(x.shape, torch.nan)
+            value = torch.full(none.shape, torch.nan)
+    return value.double()
+
+
+def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
+    """Return the learners' values of all cells, float64 `[x, y]`: 0 at walls and at the goal."""
+    x, y = (part.flatten().int() for part in torch.meshgrid(*2 * [torch.arange(rules.SIZE)], indexing="ij"))
+    none = torch.zeros_like(x)
+    value = learned_values(agent, rules.observe(rules.RoomsState(x, y, none, none, none)))
     is_nothing = ~rules.is_free(x, y) | ((x == rules.GOAL) & (y == rules.GOAL))
-    return value.double().masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
+    return value.masked_fill(is_nothing, 0.0).reshape(rules.SIZE, rules.SIZE)
+
+
+def add(row: Mapping[str, object], file: Path) -> None:
+    """Write a row at the end of a csv file."""
+    is_new = not file.exists()
+    with file.open("a", newline="") as stream:
+        writer = csv.DictWriter(stream, list(row))
+        if is_new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def tabulate(file: Path) -> None:
+    """Print a csv file as a table."""
+    with file.open(newline="") as stream:
+        names, *rows = csv.reader(stream)
+    for cells in (names, ["---"] * len(names), *rows):
+        print("| " + " | ".join(cells) + " |")
 
 
 def main(words: Sequence[str]) -> None:
     """Train if there are words, and print the table."""
-    file = HERE / "results.csv"
     if words:
-        row = train(words)
-        is_new = not file.exists()
-        with file.open("a", newline="") as stream:
-            writer = csv.DictWriter(stream, COLUMNS)
-            if is_new:
-                writer.writeheader()
-            writer.writerow(row)
-    rows = []
-    if file.exists():
-        with file.open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-    print("| " + " | ".join(COLUMNS) + " |\n|" + "---|" * len(COLUMNS))
-    for row in rows:
-        print("| " + " | ".join(row[name] for name in COLUMNS) + " |")
+        add(train(words), FILE)
+    tabulate(FILE)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,8 @@ bounds of an ensemble: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
 Where the selector decides when options end, an option is interrupted as soon as another one is worth more (section 4 of
 the first source).
 
-Differs from the sources: where a time limit ends an episode, nothing follows.
+Differs from the sources: where a time limit ends an episode, nothing follows; exploring, options are also interrupted
+at random, with the probability of a random option.
 
 Differs from Chen et al.: which decisions a member of the ensemble learns from is drawn anew at every update, not once
 for each decision, and all members share one target, the mean of the target members.
@@ -131,9 +132,16 @@ class MetaCritic(Selector):
 
     @torch.no_grad()
     def ends(self, td: TensorDictBase) -> Tensor:
-        """Return where another option is worth more than the held one, bool `[*B]`."""
+        """Return where another option is worth more than the held one, bool `[*B]`; exploring, also at random.
+
+        Otherwise an option that is believed to be the best one would leave no steps to the others.
+        """
         value = self.critics(td.get(keys.OBSERVATION).flatten(0, -2)).mean(0).reshape(*td.batch_size, -1)
-        return masked_values(value, td.get(keys.OPTION_MASK, None)).argmax(-1) != td.get(keys.OPTION)
+        is_worse = masked_values(value, td.get(keys.OPTION_MASK, None)).argmax(-1) != td.get(keys.OPTION)
+        if is_greedy():
+            return is_worse
+        random_share = 1.0 if self.is_uniform else self.epsilon
+        return is_worse | (torch.rand(is_worse.shape, device=is_worse.device) < random_share)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions and, after the warm-up, make the updates that are due."""

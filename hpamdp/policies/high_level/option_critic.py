@@ -12,6 +12,7 @@ Differs from the sources:
 - Q and beta are learned from a replay buffer of steps, Q with a target network;
 - the value of a state is max_o Q(s, o), without the share of random choices;
 - where a time limit ends an episode, nothing follows;
+- exploring, an option ends with `initial_termination` as often as options are random, else with beta;
 - greedily, an option ends where beta is above 1/2.
 """
 
@@ -45,7 +46,8 @@ class OptionCritic(Selector):
         gamma: discount of an environment step.
         deliberation_cost: margin by which another option must be better for the held one to end, in units of the
             return; 0: the option-critic of 2017, whose options tend to end at every step.
-        initial_termination: probability that an option ends with a step, at the start.
+        initial_termination: probability that an option ends with a step, at the start; also with the probability of a
+            random option, and always while options are uniform.
         epsilon_final, epsilon_steps: the probability of a random option falls linearly from 1 to `epsilon_final` over
             the `epsilon_steps` steps after the warm-up.
         buffer_size: steps that are stored.
@@ -87,6 +89,7 @@ class OptionCritic(Selector):
         if initial_termination >= 1.0:
             raise ValueError(f"initial_termination={initial_termination}: must be less than 1")
         self.gamma = gamma
+        self.initial_termination = initial_termination
         self.deliberation_cost = deliberation_cost
         self.epsilon_final = epsilon_final
         self.epsilon_steps = epsilon_steps
@@ -139,7 +142,10 @@ class OptionCritic(Selector):
 
         It does where it is forbidden.
         """
-        beta = self._beta(td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None))
+        # An option that never ends leaves no steps to the others, and their values as wrong as those that beta was
+        # learned from. So beta counts as much as the values do in the choice.
+        random_share = 0.0 if is_greedy() else 1.0 if self.is_uniform else self.epsilon
+        beta = self._beta(td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_share)
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
@@ -177,15 +183,17 @@ class OptionCritic(Selector):
             rows["next_option_mask"] = after.get(keys.OPTION_MASK)
         return TensorDict(rows, batch_size=batch.shape)
 
-    def _beta(self, state: Tensor, option: Tensor, mask: Tensor | None) -> Tensor:
+    def _beta(self, state: Tensor, option: Tensor, mask: Tensor | None, random_share: float = 0.0) -> Tensor:
         """Return the probabilities `[*B]` that options end: 1 where they are forbidden.
 
         Args:
             state: where, `[*B, observation_dim]`.
             option: `[*B]`.
             mask: the options that may be chosen, bool `[*B, num_options]`; None: all.
+            random_share: of `initial_termination` in the probabilities, in [0, 1].
         """
         beta = self.termination(state).gather(-1, option.unsqueeze(-1)).squeeze(-1).sigmoid()
+        beta = (1.0 - random_share) * beta + random_share * self.initial_termination
         return beta if mask is None else torch.where(mask.gather(-1, option.unsqueeze(-1)).squeeze(-1), beta, 1.0)
 
     def _target(self, rows: TensorDictBase) -> Tensor:

@@ -1,0 +1,188 @@
+"""Train learners under selectors on Crossing, with options that end inside episodes, and compare with the best values.
+
+python experiments/options/crossing_study.py high=meta_critic,actor low=hppo,pdqn seed=0   trains each pair, and adds a
+                                                                                           row each to crossing.csv
+python experiments/options/crossing_study.py                                               tabulates crossing.csv
+
+The words are those of the command line, and all combinations of their values are run.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_dir
+from study import CONF, add, learned_values, tabulate
+from tensordict import TensorDictBase
+
+from hpamdp import keys
+from hpamdp.config import Config, read
+from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.train import Trainer
+
+HERE = Path(__file__).resolve().parent
+FILE = HERE / "crossing.csv"
+EXAMPLE = HERE.parent.parent / "examples" / "crossing"
+sys.path.insert(0, str(EXAMPLE))
+from crossing import NUM_CELLS, Crossing, best_values, cell_of, observe  # noqa: E402
+
+GAMMA = 0.9
+OPTION_LENGTH = 3
+# On every run, before the words of the command line.
+COMMON = [
+    f"hydra.searchpath=[file://{EXAMPLE / 'conf'}]",
+    "env=crossing",
+    f"low.gamma={GAMMA}",
+    f"high.gamma={GAMMA}",
+    "high.hidden_dims=[64]",
+    "high.lr=3e-3",
+    "num_envs=64",
+    "steps_per_batch=4",
+    "total_frames=30000",
+    "agent.uniform_option_frames=15000",
+    "eval.layouts=200",
+    "eval.every=0",
+    "log_every=0",
+]
+STEPS = ["agent.termination=steps", f"agent.option_length={OPTION_LENGTH}"]
+SELECTORS = {
+    "meta_critic": [
+        *STEPS,
+        "high.num_members=1",
+        "high.epsilon_final=0.02",
+        "high.epsilon_decisions=3000",
+        "high.warmup_decisions=200",
+        "high.buffer_size=3000",
+        "high.batch_size=128",
+        "high.updates_per_decision=0.1",
+        "high.tau=0.05",
+    ],
+    "actor": [*STEPS, "high.minibatch_size=128", "high.entropy=0.02"],
+    "option_critic": [
+        "agent.termination=learned",
+        "high.epsilon_steps=15000",
+        "high.warmup_steps=500",
+        "high.buffer_size=5000",
+        "high.batch_size=128",
+        "high.updates_per_step=0.05",
+        "high.termination_lr=3e-3",
+        "high.tau=0.05",
+    ],
+}
+REPLAY = [
+    "low.hidden_dims=[64]",
+    "low.warmup_frames=1000",
+    "low.batch_size=128",
+    "low.updates_per_frame=0.1",
+    "low.critic_lr=3e-3",
+]
+LEARNERS = {
+    "hppo": ["steps_per_batch=16", "low.minibatch_size=256", "low.hidden_dims=[64]", "low.critic_hidden_dims=[64]"],
+    "pdqn": [*REPLAY, "low.actor_tau=0.05", "low.critic_tau=0.05", "low.epsilon_frames=5000"],
+    "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.codec_pretrain_updates=300"],
+    "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.actor_lr=1e-3"],
+    "hsac": [*REPLAY, "low.tau=0.05", "low.discrete_temperature=0.002", "low.parameter_temperature=0.001"],
+    "qpamdp": [
+        "total_frames=300000",
+        "agent.uniform_option_frames=150000",
+        "steps_per_batch=16",
+        "low.features=null",
+        "low.phi_order=1",
+        "low.phi_max_coupled=1",
+        "low.psi_order=1",
+        "low.psi_max_coupled=1",
+        "low.warmup_frames=5000",
+        "low.initial_episodes=3000",
+        "low.relearning_episodes=1000",
+        "low.rollouts=500",
+        "low.parameter_updates=10",
+        "low.initial_mean=0.5",
+        "low.sigma=0.3",
+    ],
+}
+
+
+def train(words: Sequence[str]) -> dict[str, object]:
+    """Train one agent and return its row."""
+    config = make_config(words)
+    cpu = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        torch.manual_seed(config.run.seed)
+        parts = assemble(config, Path(folder))
+        trainer = Trainer(config, parts, Path(folder))
+        trainer.train()
+    cpu = time.process_time() - cpu
+    best = torch.tensor(best_values(GAMMA, config.run.agent.option_length or 1), dtype=torch.float64)
+    share, success, num_due = evaluate(parts, best)
+    value = learned_values(parts.agent, observe(torch.arange(NUM_CELLS)))
+    error = (value - best).abs()[:-1]  # but for the end of the way
+    num_due, best = num_due[:-1], best[:-1]
+    return {
+        "high": config.high.name,
+        "low": config.low.name,
+        "seed": config.run.seed,
+        "steps": trainer.frames,
+        "share": round(share, 4),
+        "success": round(success, 4),
+        "value_error": round(((num_due * error).sum() / (num_due * best).sum()).item(), 4),
+        "value_error_everywhere": round((error.sum() / best.sum()).item(), 4),
+        "cpu_s": round(cpu, 1),
+    }
+
+
+def make_config(words: Sequence[str]) -> Config:
+    """Return the checked config of a run."""
+    chosen = dict(word.split("=", 1) for word in words)
+    own = [*SELECTORS.get(chosen.get("high", ""), []), *LEARNERS.get(chosen.get("low", ""), [])]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return read(compose("config", [*COMMON, *own, *words], return_hydra_config=True))
+
+
+def evaluate(parts: Parts, best: torch.Tensor) -> tuple[float, float, torch.Tensor]:
+    """Play the evaluation's episodes.
+
+    Args:
+        parts: of the run.
+        best: the best values of the cells, `[NUM_CELLS]`.
+
+    Returns:
+        The mean discounted return over the mean best one, the share of the episodes that arrive, and how often an
+        option was due in each cell, `[NUM_CELLS]`.
+    """
+    env = parts.evaluation.problem
+    assert isinstance(env, Crossing)
+    num_due = torch.zeros(NUM_CELLS, dtype=torch.float64)
+    first = None
+
+    def policy(td: TensorDictBase) -> TensorDictBase:
+        nonlocal first
+        cell = cell_of(env.place)
+        first = cell if first is None else first
+        td = parts.agent.policy(td)
+        is_due = (td[keys.IS_DECISION] & ~td[keys.DONE]).squeeze(-1)
+        num_due.index_add_(0, cell[is_due], torch.ones_like(cell[is_due], dtype=num_due.dtype))
+        return td
+
+    played = parts.evaluation.run(policy)
+    earned = played["success"] * GAMMA ** (played["steps"] - 1.0)
+    return float(earned.mean()) / best[first].mean().item(), float(played["success"].mean()), num_due
+
+
+def main(words: Sequence[str]) -> None:
+    """Train with every combination of the words' values if there are words, and print the table."""
+    names = [word.split("=", 1)[0] for word in words]
+    values = [word.split("=", 1)[1].split(",") for word in words]
+    if words:
+        for chosen in itertools.product(*values):
+            add(train([f"{name}={value}" for name, value in zip(names, chosen, strict=True)]), FILE)
+    tabulate(FILE)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
