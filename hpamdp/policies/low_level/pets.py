@@ -162,12 +162,13 @@ class PETSModel(nn.Module):
             "is_predicted": is_input.clone(),
             "is_changing": is_input.clone(),
             "derivation": torch.eye(dim),
-            "linear_weight": torch.zeros(in_dim + len(slots) + 1, dim),
             "reward_mean": torch.zeros(2),
             "reward_scale": torch.ones(2),
             "feature_mean": torch.zeros(feature_dim),
             "feature_scale": torch.ones(feature_dim),
         }
+        if self.has_linear_part:
+            buffers["linear_weight"] = torch.zeros(in_dim + len(slots) + 1, dim)
         for name, value in buffers.items():
             self.register_buffer(name, value)
         self.register_buffer("is_input", is_input, persistent=False)
