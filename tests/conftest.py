@@ -1,5 +1,6 @@
 """What the tests share."""
 
+import copy
 import multiprocessing
 import os
 import random
@@ -7,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +43,15 @@ def compose_config(overrides: Sequence[str]) -> DictConfig:
     Runs are not filmed unless a test asks for it, which saves it half a second.
     """
     overrides = [*([] if any(word.startswith("film=") for word in overrides) else ["film=false"]), *overrides]
+    own = [] if any(word.startswith("hydra.searchpath=") for word in overrides) else [OWN]
+    return copy.deepcopy(_composed(*own, *overrides))
+
+
+@cache
+def _composed(*overrides: str) -> DictConfig:
+    """Compose each config once: Hydra takes a tenth of a second, which is longer than many tests."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        own = [] if any(word.startswith("hydra.searchpath=") for word in overrides) else [OWN]
-        return compose("config", [*own, *overrides], return_hydra_config=True)
+        return compose("config", [*overrides], return_hydra_config=True)
 
 
 def make_config(overrides: Sequence[str]) -> Config:

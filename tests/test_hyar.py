@@ -14,7 +14,7 @@ SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 OPTIONS = dict(
     rl="td3", discrete="greedy",
     embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000,
-    codec_pretrain_updates=1500, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
+    codec_pretrain_updates=700, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, relabelling="mean",
     buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
     augment=False,
@@ -52,7 +52,7 @@ def learn(learner: HyAR, num_batches: int, size: int = 200) -> dict[str, float]:
 def trained(request) -> HyAR:
     torch.manual_seed(0)
     learner = make(discrete=request.param)
-    learn(learner, 32)
+    learn(learner, 24)
     return learner
 
 

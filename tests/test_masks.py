@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from conftest import make_config
@@ -78,10 +80,24 @@ def play_and_learn(env: DecisionEnv, agent: HierarchicalAgent, num_batches: int)
 
 @pytest.mark.parametrize("name", CASES)
 def test_a_forbidden_action_is_never_taken(name):
+    play_with_forbidden_actions(name)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("name", sorted({*CASES} - {"random", "qpamdp"}))
+def test_compiled_updates_take_no_forbidden_action(name):
+    play_with_forbidden_actions(name, is_compiled=True)
+
+
+def play_with_forbidden_actions(name: str, *, is_compiled: bool = False) -> None:
+    """Collect and learn where some actions are forbidden; assert that none of them is taken."""
     env = with_decisions(Forbidden(16), 1.0)
     specs = PAMDPSpecs.from_env(env)
     assert specs.has_action_mask and not specs.has_option_mask
     learner = make_learner(name, specs)
+    if is_compiled:
+        learner.compile_updates()
     play_and_learn(env, HierarchicalAgent(None, [learner], specs), 6)
     assert env.base_env.violations == 0
     parameters = [part for part in learner.state_dict().values() if torch.is_tensor(part) and part.is_floating_point()]

@@ -296,3 +296,8 @@ def test_offline_learners_find_the_better_actions_of_the_data(learner, options):
     discrete, parameter = greedy_action(learner(SPECS, torch.device("cpu"), **options), 600)
     assert discrete == 1
     assert parameter == pytest.approx(0.95, abs=0.12)
+
+
+def test_learners_of_a_data_set_can_be_asked_for_the_option(path, tmp_path):
+    words = overrides(path, "iql", "value")
+    assert run(compose_config(words), tmp_path, words) == 0

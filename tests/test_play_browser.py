@@ -206,6 +206,17 @@ def test_a_new_press_ends_the_one_before_and_a_lost_focus_ends_it_too(player):
     assert player.get("events.map((event) => event.type)") == ["down", "down", "up", "blur", "up"]
 
 
+def test_an_episode_that_was_left_open_for_an_hour_begins_anew(player):
+    player.board(layout=DOWN_THE_MIDDLE)
+    player.page.evaluate("hpamdpGame.origin -= 3.7e6")
+    player.hold("k", 0.1)
+    player.until("screen === 'choose'")
+    assert "more than an hour" in player.page.inner_text("#result")
+    player.board()
+    player.hold("k", 0.3)
+    player.until("state?.legs.length === 1")
+
+
 def test_auto_repeat_is_no_press(player):
     player.board(layout=DOWN_THE_MIDDLE)
     for _ in range(5):

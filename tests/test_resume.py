@@ -13,7 +13,6 @@ import torch
 from conftest import TRAINED, compose_config, forked
 from test_grid import SHORT
 
-from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.run import checkpoint
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.stopping import STOP_SIGNALS
@@ -117,15 +116,15 @@ def test_every_pair_resumes_to_the_last_bit(high, low, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
-@pytest.mark.parametrize("low", ["pdqn", "hyar"])
+@pytest.mark.parametrize("low", ["hppo", "pdqn", "hsac", "hyar", "paddpg", "iql", "td3_bc", "dlpa", "pets"])
 def test_a_run_with_compiled_updates_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
-    compile_updates = ReplayLearner.compile_updates
+    in_this_process = torch.compile
 
-    def compile_afresh(self) -> None:
+    def compile_afresh(*args, **kwargs):
         torch.compiler.reset()  # as in another process
-        compile_updates(self)
+        return in_this_process(*args, **kwargs)
 
-    monkeypatch.setattr(ReplayLearner, "compile_updates", compile_afresh)
+    monkeypatch.setattr(torch, "compile", compile_afresh)
     stop_and_resume([*words_of("ucb", low), "compile_updates=true"], tmp_path, monkeypatch, signal.SIGINT)
 
 

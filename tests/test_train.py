@@ -131,10 +131,12 @@ def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, cap
     assert float(after[-1]["frames"]) == resumed["frames"]
 
 
-def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_path, with_figures):
+def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_path, draw_all, monkeypatch):
     start(tmp_path / "run", "low=random", "high=uniform")
     words = ["mode=eval", f"checkpoint={tmp_path / 'run'}"]
-    assert run(compose_config(words), tmp_path / "scored", words) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("hpamdp.analysis.figures.draw_all", draw_all)
+        assert run(compose_config(words), tmp_path / "scored", words) == 0
     again, first = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("scored", "run"))
     assert again["score"] == first["score"] and again["high"] == "uniform" and again["low"] == "random"
     assert (tmp_path / "scored" / "trajectories.png").is_file()

@@ -1,11 +1,13 @@
-"""Updates from a replay buffer: what a step of an optimizer changes, and updates that are compiled."""
+"""Updates: what a step of an optimizer changes, and updates that are compiled."""
 
 import copy
 import shutil
 from functools import partial
 
 import pytest
+import test_hppo
 import test_hyar
+import test_paddpg
 import test_pdqn
 import torch
 from conftest import make_config
@@ -14,6 +16,7 @@ from toy_steps import SPECS, sample
 
 from hpamdp.config import ConfigError
 from hpamdp.policies.low_level.hyar import LATENT
+from hpamdp.policies.low_level.paddpg import SCORES
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.run.assemble import assemble
 
@@ -21,8 +24,11 @@ from hpamdp.run.assemble import assemble
 MAKE = {
     "pdqn": partial(test_pdqn.make, target_smoothing=0.0),
     "hyar": partial(test_hyar.make, target_noise=0.0, relabelling="mean"),
+    "paddpg": partial(test_paddpg.make, max_grad_norm=None),
 }
-LR = {"pdqn": test_pdqn.OPTIONS["critic_lr"], "hyar": test_hyar.OPTIONS["critic_lr"]}
+LR = {
+    low: test.OPTIONS["critic_lr"] for low, test in (("pdqn", test_pdqn), ("hyar", test_hyar), ("paddpg", test_paddpg))
+}
 
 
 class TransposedLearner(ReplayLearner):
@@ -42,6 +48,8 @@ class TransposedLearner(ReplayLearner):
 def batch_for(name: str) -> dict[str, Tensor]:
     """Return a random sample; half of HyAR's actions were random, and have no latent action."""
     batch = sample(64)
+    if name == "paddpg":
+        batch[SCORES] = torch.rand(64, SPECS.num_discrete) * 2 - 1
     if name == "hyar":
         latent = torch.rand(64, MAKE[name]().critics.net.layers[0].weight.shape[1] - SPECS.observation_dim) * 2 - 1
         batch[LATENT] = torch.where(torch.arange(64).unsqueeze(-1) % 2 == 0, latent, torch.nan)
@@ -95,14 +103,32 @@ def test_compiled_updates_are_the_same_up_to_rounding(name):
         torch.testing.assert_close(compiled.critics.state_dict()[key], value, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+def test_compiled_updates_of_hppo_are_the_same_up_to_rounding_for_batches_of_any_size():
+    learner = test_hppo.make(minibatch_size=32)
+    compiled = copy.deepcopy(learner)
+    compiled.compile_updates()
+    for num in (20, 27, 34):
+        batch = test_hppo.random_rows(learner, num, steps=4)
+        with torch.random.fork_rng():
+            expected = learner.learn(batch, test_hppo.everything(batch))
+        scalars = compiled.learn(batch, test_hppo.everything(batch))
+        assert scalars == pytest.approx(expected, rel=1e-2, abs=1e-3)
+    for key, value in learner.actor.state_dict().items():
+        torch.testing.assert_close(compiled.actor.state_dict()[key], value, rtol=1e-2, atol=1e-3)
+
+
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "compile_updates=true"]
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["env=platform", "high=none", "low=hppo"], "compile_updates=true: low=hppo: its updates cannot be compiled"),
-        (["env=platform", "high=none", "low=hsac"], "compile_updates=true: low=hsac: its updates cannot be compiled"),
+        (
+            ["env=platform", "high=none", "low=qpamdp"],
+            "compile_updates=true: low=qpamdp: its updates cannot be compiled",
+        ),
         (
             ["env=platform", "+env.options=default", "high=meta_critic", "low=pdqn", "agent.termination=steps",
              "agent.option_length=3"],

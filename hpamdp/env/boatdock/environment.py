@@ -169,7 +169,7 @@ class BoatDockEnv(PAMDPEnv):
         )
         check_arguments(num_envs, rules)
         if human or recording is not None:
-            _check_people(rules, "human" if human else f"recording={recording}")
+            _check_people(rules, "what they chose says nothing here" if human else f"{recording=} does not fit")
         self.option_names = rules.names
         self.can_change_option = self.plans_change_options = switch_cost is not None
         self._played = None if recording is None else _figures_of(recording, controller)
@@ -582,12 +582,12 @@ class BoatDockEnv(PAMDPEnv):
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
 
 
-def _check_people(rules: Rules, what: str) -> None:
-    """Refuse what people did where they could not have done it."""
+def _check_people(rules: Rules, so: str) -> None:
+    """Refuse what people did where they could not have done it; `so` says what does not go with these rules."""
     if rules.are_peoples:
         return
     given = f"switch_cost={rules.switch_cost}" if rules.boats is None else f"boats={list(rules.names)}"
-    raise ValueError(f"BoatDockEnv: {given}: people kept one of their two boats; leave it out, or leave out {what}")
+    raise ValueError(f"BoatDockEnv: {given}: people kept one of their two boats, so {so}; leave it out")
 
 
 def _figures_of(recording: str, controller: str) -> dict[str, float]:

@@ -9,8 +9,6 @@ Russo and Van Roy 2013, arXiv 1306.0940.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -30,7 +28,6 @@ class Value(Selector):
         epsilon: probability of a random option.
     """
 
-    modes: ClassVar[tuple[str, ...]] = ("train",)
     asks_learners = True
 
     def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:

@@ -26,7 +26,7 @@ from predicted states only; on this project's benchmark the score after 8,000 st
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import torch
@@ -420,11 +420,12 @@ class DLPA(ReplayLearner):
             places.append(place)
         return stored[torch.stack(places, 1)].set("valid", torch.stack(valid, 1))
 
-    def losses(self, windows: TensorDictBase) -> dict[str, Tensor]:
+    def losses(self, windows: Mapping[str, Tensor] | TensorDictBase) -> dict[str, Tensor]:
         """Return the parts of the H-step loss, each summed over a window with weight rho^h, averaged over windows."""
         parts = {name: torch.zeros((), device=self.frames.device) for name in self.loss_weights}
         state = windows["state"][:, 0]
-        for h, step in enumerate(windows.unbind(1)):
+        for h in range(self.horizon):
+            step = {name: column[:, h] for name, column in windows.items()}
             predicted = self.model(state, step["discrete"], step["unit"])
             state = predicted.next_state
             terminated = step["terminated"]
@@ -444,7 +445,7 @@ class DLPA(ReplayLearner):
         """Update the model from windows `[batch_size, horizon]`."""
         return self.minimise("model", self._loss, sample)
 
-    def _loss(self, windows: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def _loss(self, windows: Mapping[str, Tensor] | TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         parts = self.losses(windows)
         loss = torch.zeros((), device=self.frames.device)
         for name, part in parts.items():

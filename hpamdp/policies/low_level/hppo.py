@@ -33,6 +33,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate
+from hpamdp.policies.shared.gradients import compiled
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy
@@ -143,6 +144,12 @@ class HPPO(OnPolicy, Learner):
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
 
+    def compile_updates(self) -> None:
+        """Compile the loss and its gradient, at the first update."""
+        self._gradients_of = compiled(
+            any_size=True
+        )  # minibatches differ where another option takes a share of the steps
+
     def portable(self) -> dict[str, Any] | None:
         """Return the actor, unless it is to sample: see `hpamdp.policies.shared.portable`."""
         return None if self.policy.samples_when_greedy else portable_actor(self.policy.actor, self.specs)
@@ -162,8 +169,9 @@ class HPPO(OnPolicy, Learner):
             return {}
         for group in self.optimizer.param_groups:
             group["lr"] = self.lr + progress * (self.lr_final - self.lr)
-        entropy_weight = 1.0 + progress * (self.entropy_final - 1.0)
-        scalars = self.make_passes(rows, lambda minibatch: self._update(minibatch, entropy_weight))
+        # A tensor, since compiled code would be made anew for another number.
+        entropy_weight = torch.tensor(1.0 + progress * (self.entropy_final - 1.0), device=rows.device)
+        scalars = self.make_passes(rows, lambda minibatch: self.minimise(self._loss, minibatch, entropy_weight))
         self.actor.set_min_scale(self.min_scale * (self.min_scale_final / self.min_scale) ** progress)
         return scalars
 
@@ -229,8 +237,8 @@ class HPPO(OnPolicy, Learner):
             batch_size=[int(mask.sum())],
         )
 
-    def _update(self, rows: Mapping[str, Tensor], entropy_weight: float) -> dict[str, Tensor]:
-        """Make one optimisation step of actors and critic from a minibatch `[B]`; return scalars."""
+    def _loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of actors and critic on a minibatch `[B]`, and scalars to log."""
         allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION], allowed)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
@@ -243,17 +251,16 @@ class HPPO(OnPolicy, Learner):
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.discrete_entropy * discrete_entropy + self.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(rows[keys.OBSERVATION]).squeeze(-1), rows["target"])
-        self.optimizer_step(self.critic_weight * critic_loss - gain - entropy_weight * bonus)
-        with torch.no_grad():
-            return {
-                "critic": critic_loss.detach(),
-                "discrete_entropy": discrete_entropy.detach(),
-                "scale": distribution.log_scale.mean().exp(),
-                "discrete_kl": kl_estimate(discrete_log_ratio),
-                "parameter_kl": kl_estimate(parameter_log_ratio),
-                "discrete_clipped": self._clipped_fraction(discrete_log_ratio),
-                "parameter_clipped": self._clipped_fraction(parameter_log_ratio),
-            }
+        loss = self.critic_weight * critic_loss - gain - entropy_weight * bonus
+        return loss, {
+            "critic": critic_loss,
+            "discrete_entropy": discrete_entropy,
+            "scale": distribution.log_scale.detach().mean().exp(),
+            "discrete_kl": kl_estimate(discrete_log_ratio.detach()),
+            "parameter_kl": kl_estimate(parameter_log_ratio.detach()),
+            "discrete_clipped": self._clipped_fraction(discrete_log_ratio.detach()),
+            "parameter_clipped": self._clipped_fraction(parameter_log_ratio.detach()),
+        }
 
     def _clipped_fraction(self, log_ratio: Tensor) -> Tensor:
         return (log_ratio.expm1().abs() > self.clip).float().mean()

@@ -252,7 +252,6 @@ class HyARPolicy(TensorDictModuleBase):
 class HyAR(ReplayLearner):
     """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
-    has_compiled_updates = True
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
 
     policy: HyARPolicy

@@ -104,8 +104,6 @@ class PDQNPolicy(TensorDictModuleBase):
 class PDQN(ReplayLearner):
     """Q-learning over discrete actions and gradient ascent on their parameters, from a replay buffer of its own."""
 
-    has_compiled_updates = True
-
     policy: PDQNPolicy
     episodes: Tensor
 

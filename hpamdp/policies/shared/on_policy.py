@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from hpamdp.policies.shared.gradients import Gradients, Inputs, LossFunction, gradients_of, step_down
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -38,6 +39,7 @@ class OnPolicy(nn.Module):
         self.clip = clip
         self.max_grad_norm = max_grad_norm
         self.waiting: list[TensorDict] = []
+        self._gradients_of: Gradients = gradients_of
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizer, for the checkpoint."""
@@ -93,9 +95,12 @@ class OnPolicy(nn.Module):
         clipped_ratio = ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
         return torch.minimum(ratio * advantage, clipped_ratio * advantage)
 
-    def optimizer_step(self, loss: Tensor) -> None:
-        """Take one step of the optimizer on a loss, with the gradient scaled down to `max_grad_norm`."""
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.parameters(), self.max_grad_norm)
-        self.optimizer.step()
+    def minimise(self, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
+        """Take one step of the optimizer on a loss, with the gradient scaled down to `max_grad_norm`; see `step_down`.
+
+        Returns:
+            The scalars of the loss.
+        """
+        return step_down(
+            self.optimizer, loss_of, *inputs, max_grad_norm=self.max_grad_norm, gradients_of=self._gradients_of
+        )

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, TypeAlias
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
-from hpamdp.policies.shared.compiling import compiled
 from hpamdp.policies.shared.frame import RandomSymmetry
+from hpamdp.policies.shared.gradients import Inputs, LossFunction, compiled, gradients_of, step_down
 from hpamdp.specs import PAMDPSpecs
-
-Inputs: TypeAlias = Tensor | Mapping[str, Tensor] | TensorDictBase | None
-# Maps what an update sees to the loss and to scalars to log.
-LossFunction = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 
 
 class ReplayLearner(Learner):
@@ -31,8 +27,8 @@ class ReplayLearner(Learner):
     - `start` and `explore`: what happens at the end of the warm-up, and with every batch after it;
     - `updates_due`: when updates are made.
 
-    Losses that are given to `minimise` as methods can be compiled, see `compile_updates`. A subclass with
-    `has_compiled_updates` promises that `torch.compile` can trace all of them in one piece.
+    Losses are given to `minimise` as methods. For `compile_updates` they must be such that `torch.compile` can trace
+    them in one piece, with dicts in the place of TensorDicts; a subclass with others has to refuse it.
 
     The `target` of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
@@ -42,7 +38,6 @@ class ReplayLearner(Learner):
             where there are many; samples then have 0 for the others.
     """
 
-    has_compiled_updates: ClassVar[bool] = False
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     stores_own_parameters: bool = False
 
@@ -103,9 +98,7 @@ class ReplayLearner(Learner):
 
     def compile_updates(self) -> None:
         """Compile what `minimise` does but for the optimizer's step, each loss at the first update that needs it."""
-        if not self.has_compiled_updates:
-            super().compile_updates()
-        self._gradients_of = compiled(gradients_of)
+        self._gradients_of = compiled(any_size=False)
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Store the transitions in `mask`."""
@@ -220,38 +213,10 @@ class ReplayLearner(Learner):
     def minimise(
         self, name: str, loss_of: LossFunction, *inputs: Inputs, max_grad_norm: float | None = None
     ) -> dict[str, Tensor]:
-        """Take one step of the named optimizer down the gradient of a loss; return the scalars of the loss.
-
-        Nothing but the parameters of this optimizer changes, whatever else the loss depends on.
-
-        Args:
-            name: of the optimizer.
-            loss_of: maps the inputs to the loss and to scalars to log.
-            inputs: tensors, tensors by name, or None.
-            max_grad_norm: largest norm of the gradient; None: no limit.
-        """
-        optimizer = self.optimizers[name]
-        parameters = [
-            parameter for group in optimizer.param_groups for parameter in group["params"] if parameter.requires_grad
-        ]
-        scalars, gradients = self._gradients_of(loss_of, parameters, *inputs)
-        for parameter, gradient in zip(parameters, gradients, strict=True):
-            parameter.grad = gradient
-        if max_grad_norm is not None:
-            nn.utils.clip_grad_norm_(parameters, max_grad_norm)
-        optimizer.step()
-        return scalars
-
-
-def gradients_of(
-    loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs
-) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
-    """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
-    loss, scalars = loss_of(*inputs)
-    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
-    # A fused optimizer takes it for granted that gradients lie in memory as their parameters do.
-    in_order = tuple(None if gradient is None else gradient.contiguous() for gradient in gradients)
-    return {name: value.detach() for name, value in scalars.items()}, in_order
+        """Take one step of the named optimizer down the gradient of a loss, see `step_down`; return its scalars."""
+        return step_down(
+            self.optimizers[name], loss_of, *inputs, max_grad_norm=max_grad_norm, gradients_of=self._gradients_of
+        )
 
 
 def set_learning_rates(

@@ -98,8 +98,15 @@
     const last = game.events.length ? game.events[game.events.length - 1].t : 0;
     // Different kinds of events may be told in another order than their times.
     const t = Math.max((time - game.origin) / 1000, last);
-    if (t > LONGEST || game.events.length >= 1990) return;
+    if (t > LONGEST) return leaveOpen();
+    if (game.events.length >= 1990) return;
     game.events.push({ t, type, key, code });
+  }
+
+  // Times of more than an hour are refused when an episode is read: this one begins anew, with the choice of a boat.
+  function leaveOpen() {
+    choose();
+    $("#result").innerHTML = "<p>This episode was open for more than an hour. Choose a boat to begin it anew.</p>";
   }
 
   function releaseAll(event) {

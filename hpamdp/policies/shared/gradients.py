@@ -1,0 +1,95 @@
+"""Steps of an optimizer down the gradient of a loss, and gradients that `torch.compile` makes code of.
+
+Compiled code merges the many small operations around the matrix products.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+Inputs: TypeAlias = Tensor | Mapping[str, Tensor] | TensorDictBase | None
+# Maps what an update sees to the loss and to scalars to log.
+LossFunction = Callable[..., tuple[Tensor, dict[str, Tensor]]]
+Gradients = Callable[..., tuple[dict[str, Tensor], tuple[Tensor | None, ...]]]
+
+
+def step_down(
+    optimizer: torch.optim.Optimizer,
+    loss_of: LossFunction,
+    *inputs: Inputs,
+    max_grad_norm: float | None = None,
+    gradients_of: Gradients,
+) -> dict[str, Tensor]:
+    """Take one step of an optimizer down the gradient of a loss; return the scalars of the loss.
+
+    Nothing but the parameters of the optimizer changes, whatever else the loss depends on.
+
+    Args:
+        optimizer: of the parameters to learn.
+        loss_of: maps the inputs to the loss and to scalars to log.
+        inputs: tensors, tensors by name, or None.
+        max_grad_norm: largest norm of the gradient; None: no limit.
+        gradients_of: the function of this module, or what `compiled` returns.
+    """
+    groups = optimizer.param_groups
+    parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
+    scalars, gradients = gradients_of(loss_of, parameters, *inputs)
+    for parameter, gradient in zip(parameters, gradients, strict=True):
+        parameter.grad = gradient
+    if max_grad_norm is not None:
+        nn.utils.clip_grad_norm_(parameters, max_grad_norm)
+    optimizer.step()
+    return scalars
+
+
+def gradients_of(
+    loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs
+) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
+    """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
+    loss, scalars = loss_of(*inputs)
+    gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+    # A fused optimizer takes it for granted that gradients lie in memory as their parameters do.
+    in_order = tuple(None if gradient is None else gradient.contiguous() for gradient in gradients)
+    return {name: value.detach() for name, value in scalars.items()}, in_order
+
+
+def compiled(*, any_size: bool) -> Gradients:
+    """Return `gradients_of` compiled at its first call for each loss, in a few seconds of CPU time.
+
+    What was compiled is kept on disk by PyTorch (`TORCHINDUCTOR_CACHE_DIR`), so that the same losses compile faster in
+    later runs. Compiled code draws other random numbers from the same seed, and sums in another order.
+
+    Args:
+        any_size: whether the inputs of a loss are not of the same size at every call.
+
+    Raises:
+        ValueError: there is no C++ compiler, or this PyTorch cannot compile gradients.
+    """
+    from torch._dynamo import config
+    from torch._inductor.cpp_builder import get_cpp_compiler
+    from torch._inductor.exc import InvalidCxxCompiler
+
+    if not hasattr(config, "trace_autograd_ops"):
+        raise ValueError(f"PyTorch {torch.__version__} cannot compile gradients; PyTorch 2.13 can")
+    try:
+        get_cpp_compiler()
+    except InvalidCxxCompiler as error:
+        raise ValueError("there is no C++ compiler; install g++ or name one in the variable CXX") from error
+    config.trace_autograd_ops = True
+    # Each loss of each kind of learner is another version of the same function.
+    config.recompile_limit = max(config.recompile_limit, 64)
+    fast = torch.compile(gradients_of, dynamic=any_size, fullgraph=True)
+
+    def with_plain_inputs(
+        loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs
+    ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
+        # A TensorDict would have to be traced, too.
+        plain = (dict(each.items()) if isinstance(each, TensorDictBase) else each for each in inputs)
+        return fast(loss_of, parameters, *plain)
+
+    return with_plain_inputs
