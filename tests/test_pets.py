@@ -24,8 +24,7 @@ OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
     linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0,
     warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
-    posterior_sampling=True, optimism=0.0, warmup_fades=False, parameter_noise=0.05, gamma=0.97,
-    planning_precision="float32", **SEARCH,
+    posterior_sampling=True, optimism=0.0, parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 
@@ -321,10 +320,9 @@ def test_changes_that_are_not_linear_are_left_to_the_networks():
     assert (learner.model.linear_weight[:, 1:] == 0.0).all()
 
 
-def test_where_no_states_are_turned_there_is_a_linear_part_and_members_explore_together_and_at_random():
+def test_where_no_states_are_turned_there_is_a_linear_part_and_all_members_explore_together():
     for specs, changes, turns in ((BOAT, {}, True), (BOAT, {"augment": False}, False), (SPECS, {}, False)):
-        learner = make(specs, posterior_sampling="auto", warmup_fades="auto", **changes)
-        assert learner.policy.has_random_actions is not turns
+        learner = make(specs, posterior_sampling="auto", **changes)
         assert learner.model.has_linear_part is not turns
         assert learner.policy.samples_posterior is turns
     assert make(linear_part=False).model.has_linear_part is False
@@ -531,23 +529,6 @@ def test_actions_are_random_as_long_as_all_rewards_are_the_same():
     for reward, is_trained in ((torch.zeros(64), False), (torch.arange(64.0), True)):
         learn(learner, random_batch(64, reward=reward))
         assert bool(learner.policy.is_trained) == is_trained
-
-
-def test_a_warmup_that_fades_leaves_a_falling_share_of_exploring_actions_random_and_no_greedy_one():
-    learner = make(warmup_fades=True, warmup_frames=100, updates_per_frame=0.01)
-    planned = []
-    plan = learner.policy.plan
-    learner.policy.plan = lambda state, *rest: planned.append(len(state)) or plan(state, *rest)
-    td = TensorDict({keys.OBSERVATION: torch.randn(400, 4)}, [400])
-    for num, share in ((100, 0.0), (100, 0.5), (600, 0.875)):
-        learn(learner, random_batch(num))
-        planned.clear()
-        learner.policy(td.clone())
-        assert sum(planned) / 400 == pytest.approx(share, abs=0.1)
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        planned.clear()
-        learner.policy(td.clone())
-    assert planned == [400]
 
 
 def test_actions_lie_in_their_bounds():

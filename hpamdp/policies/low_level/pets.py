@@ -20,9 +20,8 @@ Differs from the sources:
 - where states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
   (`linear_part`): some hundred steps tell networks alone little of such a problem;
 - nor does an environment follow a single member there. Exploring plans are those of the mean of all members' returns
-  plus their standard deviation (`posterior_sampling`, `optimism`): members that have seen little agree that nothing
-  earns anything, and best on actions that hardly do anything. For the same reason, a falling share of the actions
-  stays random (`warmup_fades`);
+  plus their standard deviation (`posterior_sampling`, `optimism`): all members are sure that what has never earned
+  anything never will, and agree best on actions that hardly do anything;
 - entries of the state whose changes depend linearly on those of others, such as a target's offset on one's own place,
   are not predicted but derived from them;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
@@ -384,7 +383,6 @@ class PETSPolicy(TensorDictModuleBase):
     """
 
     is_trained: Tensor
-    random_share: Tensor  # of exploring actions, with `has_random_actions`
 
     def __init__(
         self,
@@ -397,7 +395,6 @@ class PETSPolicy(TensorDictModuleBase):
         noise: float,
         samples_posterior: bool,
         optimism: float,
-        has_random_actions: bool,
         precision: str,
     ) -> None:
         super().__init__()
@@ -411,9 +408,6 @@ class PETSPolicy(TensorDictModuleBase):
         self.noise = noise
         self.samples_posterior = samples_posterior
         self.optimism = optimism
-        self.has_random_actions = has_random_actions
-        if has_random_actions:
-            self.register_buffer("random_share", torch.ones(()))
         self.precision: torch.dtype = getattr(torch, precision)
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
@@ -431,8 +425,6 @@ class PETSPolicy(TensorDictModuleBase):
         discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed_now, device)
         unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device) - 1.0
         is_planned = self.is_trained.expand(num)
-        if self.has_random_actions and not is_greedy():
-            is_planned = is_planned & (torch.rand(num, device=device) >= self.random_share)
         done = td.get(keys.DONE, None)
         if done is not None:
             is_planned = is_planned & ~done.flatten()
@@ -618,7 +610,6 @@ class PETS(ReplayLearner):
         buffer_size: PositiveInt,
         posterior_sampling: Literal["auto"] | bool,
         optimism: NonNegativeFloat,
-        warmup_fades: Literal["auto"] | bool,
         parameter_noise: NonNegativeFloat,
         gamma: PositiveFraction,
         horizon: PositiveInt,
@@ -679,7 +670,6 @@ class PETS(ReplayLearner):
             noise=parameter_noise,
             samples_posterior=self.model.frame.turns if posterior_sampling == "auto" else posterior_sampling,
             optimism=optimism,
-            has_random_actions=not self.model.frame.turns if warmup_fades == "auto" else warmup_fades,
             precision=planning_precision,
         )
         self.to(device)
@@ -700,8 +690,6 @@ class PETS(ReplayLearner):
 
     def explore(self, frames: int) -> None:
         """Let the policy plan, as soon as there are different rewards to plan for."""
-        if self.policy.has_random_actions:
-            self.policy.random_share.fill_(self.warmup_frames / (self.warmup_frames + frames))
         reward = self.buffer[:]["reward"]
         self.policy.is_trained.fill_(bool((reward != reward[0]).any()))
 
