@@ -21,10 +21,10 @@ SEARCH = dict(
     first_min_deviation=0.2, min_deviation=0.02,
 )  # fmt: skip
 OPTIONS = dict(
-    augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False, lr=2e-3,
-    weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0, warmup_frames=64, updates_per_frame=2.0,
-    batch_size=32, buffer_size=4000,
-    posterior_sampling=True, parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
+    augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
+    linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0,
+    warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
+    posterior_sampling=True, optimism=0.0, parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 
@@ -278,6 +278,57 @@ def test_changes_that_follow_from_others_are_derived_from_them():
     torch.testing.assert_close(moved[..., 3], 2.0 * moved[..., 0] - moved[..., 1], atol=1e-4, rtol=1e-4)
 
 
+def pushes(num: int) -> TensorDict:
+    """Return steps that move entry 0 by the cube of the parameter of action 0, and entry 1 by what is random."""
+    torch.manual_seed(0)
+    state, unit = torch.randn(num, 4), torch.rand(num, 3) * 2 - 1
+    discrete = torch.randint(3, (num,))
+    change = torch.zeros(num, 4)
+    change[:, 0] = torch.where(discrete == 0, unit[:, 0] ** 3, 0.0)
+    change[:, 1] = torch.randn(num)
+    never = torch.zeros(num, dtype=torch.bool)
+    parts = dict(state=state, discrete=discrete, unit=unit, next_state=state + change, terminated=never)
+    return random_batch(num, **parts)
+
+
+def change_error(learner: PETS, batch: TensorDict) -> torch.Tensor:
+    """Return the root mean square error of the predicted changes, `[4]`."""
+    state, discrete = batch[keys.OBSERVATION][:, 0], batch[keys.DISCRETE][:, 0]
+    unit = SPECS.to_unit(batch[keys.PARAMETERS][:, 0])
+    own = unit.gather(-1, SPECS.parameter_slots[discrete]) * learner.policy.search.has_slot[discrete]
+    each = [part.expand(3, *part.shape) for part in (state, discrete, own)]
+    with torch.no_grad():
+        ahead = learner.model(*each).next_state.mean(0)
+    return (ahead - batch["next", keys.OBSERVATION][:, 0]).square().mean(0).sqrt()
+
+
+def test_the_linear_part_knows_polynomial_changes_after_few_steps():
+    batch = pushes(300)
+    error = {}
+    for linear_part in (True, False):
+        learner = make(linear_part=linear_part, warmup_frames=100)
+        learn(learner, batch[:100])
+        error[linear_part] = change_error(learner, batch[100:])
+    assert error[True][0] < 0.5 * error[False][0]
+    assert error[True][1] < 1.3, "what is random is not made worse"
+
+
+def test_changes_that_are_not_linear_are_left_to_the_networks():
+    learner = make(linear_part=True)
+    learn(learner, pushes(64))
+    assert learner.model.linear_weight[:, 0].abs().max() > 0.1
+    assert (learner.model.linear_weight[:, 1:] == 0.0).all()
+
+
+def test_where_no_states_are_turned_there_is_a_linear_part_and_all_members_explore_together():
+    for specs, changes, turns in ((BOAT, {}, True), (BOAT, {"augment": False}, False), (SPECS, {}, False)):
+        learner = make(specs, posterior_sampling="auto", **changes)
+        assert learner.model.has_linear_part is not turns
+        assert learner.policy.samples_posterior is turns
+    assert make(linear_part=False).model.has_linear_part is False
+    assert make(BOAT, posterior_sampling=False).policy.samples_posterior is False
+
+
 def test_a_probabilistic_model_learns_how_noisy_a_step_is():
     torch.manual_seed(0)
     state = torch.rand(1000, 4)
@@ -413,6 +464,21 @@ def test_exploring_plans_with_the_environments_own_member_greedy_ones_and_withou
     learner.policy.samples_posterior = False
     acting(learner, td.clone())
     assert torch.equal(asked[0], member) and asked[1:] == [None, None]
+
+
+def test_exploring_plans_by_all_members_count_their_disagreement_greedy_ones_do_not():
+    learner = with_opinions(make(num_members=3, optimism=2.0), [1.0, 2.0, 6.0])
+    state, two_steps = torch.randn(6, 4), 1.0 + learner.gamma
+    deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
+    explored = learner.policy.plan(state).value
+    torch.testing.assert_close(explored, two_steps * (3.0 + 2.0 * deviation).expand(6), atol=1e-3, rtol=0.0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        torch.testing.assert_close(learner.policy.plan(state).value, torch.full((6,), 3.0 * two_steps))
+
+
+def test_one_member_can_plan_without_posterior_sampling():
+    learner = make(num_members=1, posterior_sampling=False, optimism=1.0)
+    assert learner.policy.plan(torch.randn(6, 4)).value.isfinite().all()
 
 
 @pytest.mark.parametrize("num_states", [1, 7, 10])

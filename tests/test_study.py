@@ -7,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from hpamdp.analysis.study import (
+    Run,
     curve,
     difference,
     finished,
@@ -197,3 +199,18 @@ def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length
     assert [(row["reward"], row["score"]) for row in found["results"]] == [("shaped", 3.3), ("sparse", 3.1)]
     assert len(found["curves"]) == 5
     assert [(row["frames"], row["eval/score"]) for row in found["efficiency"]] == [(0.0, 0.0), (100.0, 2.0)]
+
+
+def test_few_steps_keeps_runs_that_were_left_running_apart(tmp_path):
+    learner = dict(augment="auto", num_members=5, posterior_sampling="auto", updates_per_frame=10.0, horizon=2)
+    config = OmegaConf.create({"low": learner, "env": {"reward": "paper"}})
+    runs = []
+    for name, frames in (("short", 384), ("long", 2000)):
+        leave_run(tmp_path / name, low="pets")
+        (run,) = finished([tmp_path / name])
+        runs.append(Run(run.folder, {**run.summary, "frames": frames}, config))
+    gathered = study("few_steps").gather(runs)
+    assert [row["variant"] for row in gathered["curves"]] == [""] * 3
+    assert len(gathered["long"]) == 3 and gathered["augment"] == []
+    last = study("few_steps").long_table(gathered["long"]).splitlines()[-1]
+    assert last == "| congruent | 1 | 1.500 | 2.500 | 1 s |"

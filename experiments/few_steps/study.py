@@ -1,8 +1,8 @@
 """Draw and tabulate how many presses PETS needs to play as well as people, beside people's own learning.
 
 python experiments/few_steps/study.py FOLDER...    gathers the runs of experiment=few_steps in these folders into
-                                                   curves.csv, those of other learners into augment.csv, then draws
-                                                   and tabulates
+                                                   curves.csv, the long ones into long.csv, those of other learners
+                                                   into augment.csv, then draws and tabulates
 python experiments/few_steps/study.py              draws and tabulates the stored csv files
 """
 
@@ -23,6 +23,7 @@ HERE = Path(__file__).resolve().parent
 HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"
 BOTH_BOATS = -1  # in the column `controller` of these
 BLOCK_EPISODES = 60
+LONG = 2000  # presses from which on a run is one that was left running
 BOATS = ("congruent", "incongruent")
 TASKS = {"congruent": "congruent", "incongruent": "incongruent", "chosen": "chosen by the agent"}
 HUMAN_SCORE = HUMAN["chosen"]["score"]
@@ -33,8 +34,8 @@ SETTINGS = {
     ("auto", "sparse"): "symmetry declared, sparse reward",
     ("False", "shaped"): "told nothing of symmetry",
 }
-# What an ablation changes, its value otherwise, and what that means.
-ABLATED = {"num_members": 5, "posterior_sampling": True, "updates_per_frame": 10.0, "horizon": 2}
+# What an ablation changes, its values otherwise, and what that means.
+ABLATED = {"num_members": (5,), "posterior_sampling": ("auto", True), "updates_per_frame": (10.0,), "horizon": (2,)}
 VARIANTS = {
     "": "as above",
     "posterior_sampling=False": "explores by the mean of the members",
@@ -48,8 +49,9 @@ COLUMNS = {"frames": "presses", "eval/score": "score", "eval/success": "success"
 
 
 def gather(runs: Sequence[Run]) -> dict[str, Rows]:
-    """Return a row of `curves` for each evaluation of PETS, and a row of `augment` for each run of another learner."""
+    """Return a row of `curves` or `long` for each evaluation of PETS, and one of `augment` for each other run."""
     curves: Rows = []
+    long: Rows = []
     augment: Rows = []
     for run in runs:
         evaluations = [{short: round(row[column], 4) for column, short in COLUMNS.items()} for row in run.evaluations()]
@@ -60,19 +62,23 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
                 {"learner": run.summary["low"], **name, "presses": presses, "cpu_s": round(run.summary["cpu_s"], 1)}
             )
             continue
+        if run.summary["frames"] >= LONG:
+            name |= {"boat": run.summary["controller"], "cpu_s": round(run.summary["cpu_s"], 1)}
+            long += [name | row for row in evaluations]
+            continue
         name |= {
             "boat": run.summary["controller"],
             "reward": "sparse" if run.config.env.reward == "sparse" else "shaped",
             "variant": variant(run),
         }
         curves += [name | row for row in evaluations]
-    return {"curves": curves, "augment": augment}
+    return {"curves": curves, "long": long, "augment": augment}
 
 
 def variant(run: Run) -> str:
     """Return what an ablation changed."""
     values = {name: getattr(run.config.low, name) for name in ABLATED}
-    return " ".join(f"{name}={value}" for name, value in values.items() if value != ABLATED[name])
+    return " ".join(f"{name}={value}" for name, value in values.items() if value not in ABLATED[name])
 
 
 def first_at(rows: Rows, score: float) -> float:
@@ -131,6 +137,20 @@ def _figures(rows: Rows) -> str:
     )
 
 
+def long_table(long: Rows) -> str:
+    """Return a line for each boat: the scores of runs that were left running."""
+    presses = sorted({row["presses"] for row in long if row["presses"] > 0})
+    columns = ("seeds", *(f"{number:,.0f} presses" for number in presses), "CPU of a run")
+    lines = [f"| boat | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+    for boat, task in TASKS.items():
+        rows = [row for row in long if row["boat"] == boat]
+        if rows:
+            scores = [spread([row["score"] for row in rows if row["presses"] == number]) for number in presses]
+            cpu = f"{np.mean([row['cpu_s'] for row in rows]):.0f} s"
+            lines.append(f"| {task} | {len(groups(rows, 'seed'))} | {' | '.join(scores)} | {cpu} |")
+    return "\n".join(lines)
+
+
 def augment_table(augment: Rows) -> str:
     """Return a line for each learner: presses to people's score without and with mapped steps."""
     lines = ["| | seeds | without | `low.augment=true` | CPU of a run with it |", "|---|---|---|---|---|"]
@@ -178,7 +198,8 @@ def main(folders: Sequence[str]) -> None:
     curves = read_csv(HERE / "curves.csv")
     plain = [row for row in curves if not row["variant"]]
     draw(plain, HERE / "curves.png")
-    print(table(plain), ablation_table(curves), augment_table(read_csv(HERE / "augment.csv")), sep="\n\n")
+    long, augment = (read_csv(HERE / f"{name}.csv") for name in ("long", "augment"))
+    print(table(plain), ablation_table(curves), long_table(long), augment_table(augment), sep="\n\n")
 
 
 if __name__ == "__main__":

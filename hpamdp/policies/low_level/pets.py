@@ -17,6 +17,11 @@ Differs from the sources:
 - where the problem declares its geometry, states are turned until the discrete action points along +x before the
   networks see them, with the lengths of all vectors among the inputs; of other declared symmetries, the mapped steps
   are learned from as well (`augment`);
+- where states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
+  (`linear_part`): some hundred steps tell networks alone little of such a problem;
+- nor does an environment follow a single member there. Exploring plans are those of the mean of all members' returns
+  plus their standard deviation (`posterior_sampling`, `optimism`): all members are sure that what has never earned
+  anything never will, and agree best on actions that hardly do anything;
 - entries of the state whose changes depend linearly on those of others, such as a target's offset on one's own place,
   are not predicted but derived from them;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
@@ -52,6 +57,7 @@ MEMBER = "member"  # which member an environment follows, int64 [*B]
 _CHUNK_ROWS = 8192  # states predicted at once when planning: fits the cache and bounds the memory
 _LOG_VARIANCE_LOW, _LOG_VARIANCE_HIGH = -10.0, 1.0  # of a scaled change
 _LARGEST_COPIES = 16  # of a stored step under the problem's symmetries
+_RIDGE = 0.3  # of the linear part, whose inputs have a deviation of about 1
 
 
 class MemberNet(nn.Module):
@@ -97,6 +103,7 @@ class PETSModel(nn.Module):
         outcome_dims: hidden layers of those that predict end and reward.
         is_probabilistic: whether the change has a variance for each entry.
         uses_geometry: whether to turn states and add lengths where the problem declares its geometry.
+        linear_part: whether a linear model predicts the change first; auto: where states are not turned.
     """
 
     state_mean: Tensor
@@ -106,6 +113,7 @@ class PETSModel(nn.Module):
     is_changing: Tensor
     is_input: Tensor
     derivation: Tensor
+    linear_weight: Tensor
     reward_mean: Tensor
     reward_scale: Tensor
     feature_mean: Tensor
@@ -122,12 +130,14 @@ class PETSModel(nn.Module):
         *,
         is_probabilistic: bool,
         uses_geometry: bool,
+        linear_part: Literal["auto"] | bool,
     ) -> None:
         super().__init__()
         dim = specs.observation_dim
         self.num_members = num_members
         self.is_probabilistic = is_probabilistic
         self.frame = CanonicalFrame(specs, is_used=uses_geometry)
+        self.has_linear_part = not self.frame.turns if linear_part == "auto" else linear_part
         kinds = self.frame.kind.tolist()
         of_kinds = zip(kinds, specs.parameter_dims, strict=True)
         slots = sorted({(kind, slot) for kind, num_slots in of_kinds for slot in range(num_slots)})
@@ -157,6 +167,8 @@ class PETSModel(nn.Module):
             "feature_mean": torch.zeros(feature_dim),
             "feature_scale": torch.ones(feature_dim),
         }
+        if self.has_linear_part:
+            buffers["linear_weight"] = torch.zeros(in_dim + len(slots) + 1, dim)
         for name, value in buffers.items():
             self.register_buffer(name, value)
         self.register_buffer("is_input", is_input, persistent=False)
@@ -179,6 +191,8 @@ class PETSModel(nn.Module):
             change = self._sampled(self.transition(x, precision)) @ self._change_map()
         else:
             change = self.transition(x, precision, self._change_map())
+        if self.has_linear_part:
+            change = change + self._linear_part(x) @ self._change_map()
         outcome = self._outcome(x, turned, turned + change, precision)
         logit, terminating, continuing = outcome.unbind(-1)
         mean, scale = self.reward_mean, self.reward_scale
@@ -213,8 +227,31 @@ class PETSModel(nn.Module):
         x = self._inputs(turned, action)
         transition = self.transition(x)
         scaled = transition.detach()
-        change = (self._sampled(scaled) if self.is_probabilistic else scaled) @ self._change_map()
-        return transition, self._outcome(x, turned, turned + change, torch.float32)
+        if self.is_probabilistic:
+            scaled = self._sampled(scaled)
+        if self.has_linear_part:
+            scaled = scaled + self._linear_part(x)
+        return transition, self._outcome(x, turned, turned + scaled @ self._change_map(), torch.float32)
+
+    def target_change(self, turned: Tensor, action: Tensor, next_turned: Tensor) -> Tensor:
+        """Return the scaled change that is left to the transition networks, `[B, observation_dim]`.
+
+        Args:
+            turned, next_turned: states `[B, observation_dim]` in the canonical frame.
+            action: of `action_inputs`, `[B, *]`.
+        """
+        change = (next_turned - turned) / self.change_scale
+        return change - self._linear_part(self._inputs(turned, action)) if self.has_linear_part else change
+
+    def _linear_part(self, x: Tensor) -> Tensor:
+        """Return the scaled change by the linear model, of the networks' inputs `[*B, in]`."""
+        weight, of_cubes, bias = self.linear_weight.split([x.shape[-1], len(self.slot_kind), 1])
+        return x @ weight + self._parameters_in(x) ** 3 @ of_cubes + bias
+
+    def _parameters_in(self, x: Tensor) -> Tensor:
+        """Return the parameters of all slots, of the networks' inputs."""
+        end = x.shape[-1] - len(self.slot_kind)
+        return x[..., end - len(self.slot_kind) : end]
 
     def _inputs(self, turned: Tensor, action: Tensor) -> Tensor:
         return joined(_scaled(turned, self.state_mean, self.state_scale, self.is_input), action)
@@ -257,11 +294,14 @@ class PETSModel(nn.Module):
         return joined(*lengths, y.abs())
 
     @torch.no_grad()
-    def fit_scales(self, turned: Tensor, next_turned: Tensor, reward: Tensor, terminated: Tensor) -> None:
-        """Set the scales of inputs and targets, and which changes are derived from others.
+    def fit_scales(
+        self, turned: Tensor, action: Tensor, next_turned: Tensor, reward: Tensor, terminated: Tensor
+    ) -> None:
+        """Set the scales of inputs and targets, which changes are derived from others, and the linear part.
 
         Args:
             turned, next_turned: states `[B, observation_dim]` in the canonical frame.
+            action: of `action_inputs`, `[B, *]`.
             reward: `[B]`.
             terminated: bool `[B]`.
         """
@@ -272,6 +312,8 @@ class PETSModel(nn.Module):
             self.change_scale.copy_(_scale_of(change))
             self.is_changing.copy_((change.abs().amax(0) > 1e-6).float() * self.is_input)
             self._derive(change / self.change_scale)
+            if self.has_linear_part:
+                self._fit_linear_part(self._inputs(turned, action)[~terminated], change / self.change_scale)
         for place, rows in enumerate((reward[~terminated], reward[terminated])):
             if len(rows) > 1:
                 self.reward_mean[place] = rows.mean()
@@ -306,6 +348,21 @@ class PETSModel(nn.Module):
         self.derivation.copy_(derivation * scale / scale.unsqueeze(-1))
         self.is_predicted.copy_(torch.tensor(is_predicted, device=change.device).float())
 
+    def _fit_linear_part(self, x: Tensor, change: Tensor) -> None:
+        """Fit the linear model to the networks' inputs `[B, in]` and the scaled changes `[B, observation_dim]`.
+
+        It is ridge regression on the inputs and the cubes of the parameters. Entries whose changes it predicts worse
+        than no change does, each step by the fit to all others, are left to the networks.
+        """
+        inputs = torch.cat([x, self._parameters_in(x) ** 3, torch.ones_like(x[:, :1])], -1).double()
+        ridge = torch.full_like(inputs[0], _RIDGE)
+        ridge[-1] = 1e-6
+        solver = torch.linalg.solve(inputs.mT @ inputs + ridge.diag(), inputs.mT)
+        weight = solver @ change.double()
+        leverage = (inputs * solver.mT).sum(-1, keepdim=True)
+        error = (change - inputs @ weight) / (1.0 - leverage).clamp(min=0.05)
+        self.linear_weight.copy_(weight * (error.square().mean(0) < change.square().mean(0)))
+
 
 def _scaled(rows: Tensor, mean: Tensor, scale: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return `(rows - mean) / scale * mask` in one pass."""
@@ -337,6 +394,7 @@ class PETSPolicy(TensorDictModuleBase):
         gamma: float,
         noise: float,
         samples_posterior: bool,
+        optimism: float,
         precision: str,
     ) -> None:
         super().__init__()
@@ -349,6 +407,7 @@ class PETSPolicy(TensorDictModuleBase):
         self.gamma = gamma
         self.noise = noise
         self.samples_posterior = samples_posterior
+        self.optimism = optimism
         self.precision: torch.dtype = getattr(torch, precision)
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
@@ -397,8 +456,8 @@ class PETSPolicy(TensorDictModuleBase):
         """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
 
         Greedily that is by the mean of all members; exploring by posterior sampling, by a random member for each
-        observation, so that what members disagree on is tried. As long as nothing is planned, it is 0, and exploring
-        infinite.
+        observation, or else by the mean and `optimism`, so that what members disagree on is tried. As long as nothing
+        is planned, it is 0, and exploring infinite.
         """
         num = len(observation)
         if not bool(self.is_trained):
@@ -494,7 +553,10 @@ class PETSPolicy(TensorDictModuleBase):
                     yield Prediction(rows, *(_each_repeated(part, num_sequences // shape[1]) for part in parts))
 
             total = discounted_return(predictions(), self.gamma)
-            return total.mean(0) if is_mean else total.flatten(0, 1)
+            if not is_mean:
+                return total.flatten(0, 1)
+            optimism = 0.0 if is_greedy() else self.optimism
+            return total.mean(0) + optimism * total.std(0, correction=0)
 
         return returns
 
@@ -537,6 +599,7 @@ class PETS(ReplayLearner):
         transition_dims: list[PositiveInt],
         outcome_dims: list[PositiveInt],
         probabilistic: bool,
+        linear_part: Literal["auto"] | bool,
         lr: LearningRate,
         weight_decay: NonNegativeFloat,
         weight_decay_frames: PositiveInt,
@@ -545,7 +608,8 @@ class PETS(ReplayLearner):
         updates_per_frame: PositiveFloat,
         batch_size: PositiveInt,
         buffer_size: PositiveInt,
-        posterior_sampling: bool,
+        posterior_sampling: Literal["auto"] | bool,
+        optimism: NonNegativeFloat,
         parameter_noise: NonNegativeFloat,
         gamma: PositiveFraction,
         horizon: PositiveInt,
@@ -583,6 +647,7 @@ class PETS(ReplayLearner):
             outcome_dims,
             is_probabilistic=probabilistic,
             uses_geometry=uses_geometry,
+            linear_part=linear_part,
         )
         search = SequenceSearch(
             specs.parameter_dims,
@@ -603,7 +668,8 @@ class PETS(ReplayLearner):
             self.entries,
             gamma=gamma,
             noise=parameter_noise,
-            samples_posterior=posterior_sampling,
+            samples_posterior=self.model.frame.turns if posterior_sampling == "auto" else posterior_sampling,
+            optimism=optimism,
             precision=planning_precision,
         )
         self.to(device)
@@ -654,14 +720,15 @@ class PETS(ReplayLearner):
         if frame.turns and frame.geometry is not None and frame.geometry.has_mirror:
             turned = [torch.cat([state, frame.mirror(state)]) for state in turned]
             kind, own, reward, terminated = (torch.cat([part, part]) for part in (kind, own, reward, terminated))
-        self.model.fit_scales(turned[0], turned[1], reward, terminated)
+        action = self.model.action_inputs(kind, own)
+        self.model.fit_scales(turned[0], action, turned[1], reward, terminated)
         mean, scale = self.model.reward_mean, self.model.reward_scale
         which = terminated.long()
         return TensorDict(
             {
                 "turned": turned[0],
-                "action": self.model.action_inputs(kind, own),
-                "change": (turned[1] - turned[0]) / self.model.change_scale,
+                "action": action,
+                "change": self.model.target_change(turned[0], action, turned[1]),
                 "reward": (reward - mean[which]) / scale[which],
                 "terminated": terminated.float(),
             },
