@@ -23,6 +23,9 @@ play: $(VENV)/.installed
 run: $(VENV)/.installed
 	$(PYTHON) run.py high=ucb low=hyar $(ARGS)
 
+# Each process of the tests has one core, and the threads of NumPy's matrix products would wait for one another.
+test slow-tests ray-launcher lowest: export OMP_NUM_THREADS = 1
+
 # The gate: what every change has to pass.
 test: $(VENV)/.installed-dev
 	$(PYTHON) -m ruff check .

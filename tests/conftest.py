@@ -82,12 +82,28 @@ def global_generators_unmoved() -> Iterator[None]:
     assert states() == before
 
 
+# Files of which coverage is not measured: they take whole programs, or many steps, through lines that other tests reach.
+WITHOUT_COVERAGE = {
+    "test_bandits",
+    "test_counter_kernels",
+    "test_following_options",
+    "test_grid",
+    "test_human_file",
+    "test_hyar",
+    "test_linear_bandits",
+    "test_masks",
+    "test_option_ends",
+    "test_planner",
+    "test_resume",
+}
+
+
 def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
     """Measure coverage in the first case alone of a test with several: the tracer takes half as long as the tests."""
     seen = set()
     for item in items:
         name = item.nodeid.partition("[")[0]
-        if name in seen:
+        if name in seen or item.path.stem in WITHOUT_COVERAGE:
             item.add_marker(pytest.mark.no_cover)
         seen.add(name)
 

@@ -171,12 +171,12 @@ def test_the_ratio_is_1_in_the_first_minibatch(monkeypatch):
     actor = make(Actor, epochs=2, minibatch_size=32)
     seen = []
 
-    def update(rows):
+    def loss(rows):
         log_prob = actor.logits(rows["state"]).log_softmax(-1).gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
         seen.append((log_prob - rows["log_prob"]).abs().max().item())
-        return Actor._update(actor, rows)
+        return Actor._loss(actor, rows)
 
-    monkeypatch.setattr(actor, "_update", update)
+    monkeypatch.setattr(actor, "_loss", loss)
     play(actor, by_sign, 64, 64)
     assert len(seen) == 4 and seen[0] < 1e-6 and max(seen[1:]) > 1e-4
 
