@@ -82,7 +82,7 @@ def global_generators_unmoved() -> Iterator[None]:
     assert states() == before
 
 
-# Files of which coverage is not measured: they take whole programs, or many steps, through lines that other tests reach.
+# Coverage is not measured in these: they take whole programs, or many steps, through lines that other tests reach.
 WITHOUT_COVERAGE = {
     "test_bandits",
     "test_counter_kernels",
