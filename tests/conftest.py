@@ -85,13 +85,16 @@ def global_generators_unmoved() -> Iterator[None]:
 # Coverage is not measured in these: they take whole programs, or many steps, through lines that other tests reach.
 WITHOUT_COVERAGE = {
     "test_bandits",
+    "test_boats",
     "test_counter_kernels",
+    "test_decisions",
     "test_following_options",
     "test_grid",
     "test_human_file",
     "test_hyar",
     "test_linear_bandits",
     "test_masks",
+    "test_offline",
     "test_option_ends",
     "test_planner",
     "test_resume",
