@@ -277,6 +277,7 @@ def test_with_a_constant_epsilon_regret_grows_in_proportion_to_time():
     assert growth("epsilon_greedy", epsilon_scale=1.0, epsilon_final=0.1)[1] > 3.0
 
 
+@pytest.mark.slow
 def test_the_regret_of_exp3_tuned_to_the_horizon_grows_with_the_square_root_of_time():
     regret = {}
     for horizon in (T, 4 * T):

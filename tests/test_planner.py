@@ -254,6 +254,7 @@ def test_an_empty_batch_gets_an_empty_plan(layout: Layout) -> None:
     assert plans.keys.shape == (0, 2, 3) and plans.score.shape == (0, 2)
 
 
+@pytest.mark.slow
 def test_a_thousand_layouts_take_less_than_two_hundred_times_as_long_as_one(layout: Layout) -> None:
     def seconds(num: int) -> float:
         begin = time.process_time()
