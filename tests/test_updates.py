@@ -27,7 +27,9 @@ MAKE = {
     "paddpg": partial(test_paddpg.make, max_grad_norm=None),
 }
 LR = {
-    low: test.OPTIONS["critic_lr"] for low, test in (("pdqn", test_pdqn), ("hyar", test_hyar), ("paddpg", test_paddpg))
+    "pdqn": test_pdqn.OPTIONS["critic_lr"],
+    "hyar": test_hyar.OPTIONS["critic_lr"],
+    "paddpg": test_paddpg.OPTIONS["critic_lr"],
 }
 
 

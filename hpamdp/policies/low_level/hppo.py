@@ -146,9 +146,8 @@ class HPPO(OnPolicy, Learner):
 
     def compile_updates(self) -> None:
         """Compile the loss and its gradient, at the first update."""
-        self._gradients_of = compiled(
-            any_size=True
-        )  # minibatches differ where another option takes a share of the steps
+        # Minibatches differ in size where other options take their share of the steps.
+        self._gradients_of = compiled(any_size=True)
 
     def portable(self) -> dict[str, Any] | None:
         """Return the actor, unless it is to sample: see `hpamdp.policies.shared.portable`."""

@@ -555,8 +555,9 @@ class PETSPolicy(TensorDictModuleBase):
             total = discounted_return(predictions(), self.gamma)
             if not is_mean:
                 return total.flatten(0, 1)
-            optimism = 0.0 if is_greedy() else self.optimism
-            return total.mean(0) + optimism * total.std(0, correction=0)
+            if is_greedy():
+                return total.mean(0)
+            return total.mean(0) + self.optimism * total.std(0, correction=0)
 
         return returns
 
