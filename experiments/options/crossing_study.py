@@ -11,20 +11,15 @@ from __future__ import annotations
 
 import itertools
 import sys
-import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
-from study import CONF, add, learned_values, tabulate
+from study import add, learned_values, make_config, tabulate, trained, value_errors
 from tensordict import TensorDictBase
 
 from hpamdp import keys
-from hpamdp.config import Config, read
-from hpamdp.run.assemble import Parts, assemble
-from hpamdp.run.train import Trainer
+from hpamdp.run.assemble import Parts
 
 HERE = Path(__file__).resolve().parent
 FILE = HERE / "crossing.csv"
@@ -110,38 +105,21 @@ LEARNERS = {
 
 def train(words: Sequence[str]) -> dict[str, object]:
     """Train one agent and return its row."""
-    config = make_config(words)
-    cpu = time.process_time()
-    with tempfile.TemporaryDirectory() as folder:
-        torch.manual_seed(config.run.seed)
-        parts = assemble(config, Path(folder))
-        trainer = Trainer(config, parts, Path(folder))
-        trainer.train()
-    cpu = time.process_time() - cpu
+    config = make_config(words, COMMON, SELECTORS, LEARNERS)
+    parts, frames, cpu = trained(config)
     best = torch.tensor(best_values(GAMMA, config.run.agent.option_length or 1), dtype=torch.float64)
     share, success, num_due = evaluate(parts, best)
     value = learned_values(parts.agent, observe(torch.arange(NUM_CELLS)))
-    error = (value - best).abs()[:-1]  # but for the end of the way
-    num_due, best = num_due[:-1], best[:-1]
     return {
         "high": config.high.name,
         "low": config.low.name,
         "seed": config.run.seed,
-        "steps": trainer.frames,
+        "steps": frames,
         "share": round(share, 4),
         "success": round(success, 4),
-        "value_error": round(((num_due * error).sum() / (num_due * best).sum()).item(), 4),
-        "value_error_everywhere": round((error.sum() / best.sum()).item(), 4),
+        **value_errors(value[:-1], best[:-1], num_due[:-1]),  # but for the end of the way
         "cpu_s": round(cpu, 1),
     }
-
-
-def make_config(words: Sequence[str]) -> Config:
-    """Return the checked config of a run."""
-    chosen = dict(word.split("=", 1) for word in words)
-    own = [*SELECTORS.get(chosen.get("high", ""), []), *LEARNERS.get(chosen.get("low", ""), [])]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return read(compose("config", [*COMMON, *own, *words], return_hydra_config=True))
 
 
 def evaluate(parts: Parts, best: torch.Tensor) -> tuple[float, float, torch.Tensor]:

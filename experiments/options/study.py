@@ -12,6 +12,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -30,6 +31,7 @@ HERE = Path(__file__).resolve().parent
 CONF = HERE.parent.parent / "conf"
 FILE = HERE / "results.csv"
 GAMMA = 0.95
+Settings: TypeAlias = Mapping[str, Sequence[str]]  # words of the command line, by the selector or the learner
 # On every run, before the words of the command line.
 COMMON = [
     "env=rooms",
@@ -140,30 +142,47 @@ LEARNERS = {
 }
 
 
-def make_config(words: Sequence[str]) -> Config:
-    """Return the checked config of a run."""
+def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings, learners: Settings) -> Config:
+    """Return the checked config of a run: what all runs have, what its selector and its learner need, and the words."""
     chosen = dict(word.split("=", 1) for word in words)
-    own = [*SELECTORS.get(chosen.get("high", ""), []), *LEARNERS.get(chosen.get("low", ""), [])]
+    own = [*selectors.get(chosen.get("high", ""), []), *learners.get(chosen.get("low", ""), [])]
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return read(compose("config", [*COMMON, *own, *words], return_hydra_config=True))
+        return read(compose("config", [*common, *own, *words], return_hydra_config=True))
 
 
-def train(words: Sequence[str]) -> dict[str, object]:
-    """Train one agent and return its row."""
-    config = make_config(words)
+def trained(config: Config) -> tuple[Parts, int, float]:
+    """Train an agent; return the parts of its run, its steps and the CPU seconds that it took."""
     cpu = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         torch.manual_seed(config.run.seed)
         parts = assemble(config, Path(folder))
         trainer = Trainer(config, parts, Path(folder))
         trainer.train()
-    cpu = time.process_time() - cpu
+    return parts, trainer.frames, time.process_time() - cpu
+
+
+def value_errors(value: torch.Tensor, best: torch.Tensor, num_due: torch.Tensor) -> dict[str, float]:
+    """Return the errors of values over the mean best one, where options were due and everywhere.
+
+    Args:
+        value, best: of the cells, `[*C]`.
+        num_due: how often an option was due in each of them, `[*C]`.
+    """
+    error = (value - best).abs()
+    return {
+        "value_error": round(((num_due * error).sum() / (num_due * best).sum()).item(), 4),
+        "value_error_everywhere": round((error.sum() / best.sum()).item(), 4),
+    }
+
+
+def train(words: Sequence[str]) -> dict[str, object]:
+    """Train one agent and return its row."""
+    config = make_config(words, COMMON, SELECTORS, LEARNERS)
+    parts, frames, cpu = trained(config)
     length = config.run.agent.option_length
     steps = length or 1
     means, num_due = evaluate(parts)
     optimum = mean_over_starts(parts, rules.best_values(1.0, steps))
-    best = rules.best_values(GAMMA, steps)
-    error = (values_of_cells(parts.agent) - best).abs()
     return {
         "high": config.high.name,
         "low": config.low.name,
@@ -171,13 +190,12 @@ def train(words: Sequence[str]) -> dict[str, object]:
         "termination": config.run.agent.termination,
         "option_length": length,
         "seed": config.run.seed,
-        "steps": trainer.frames,
+        "steps": frames,
         "score": round(means["score"], 4),
         "optimum": round(optimum, 4),
         "share": round(means["score"] / optimum, 4),
         "success": round(means["success"], 4),
-        "value_error": round(((num_due * error).sum() / (num_due * best).sum()).item(), 4),
-        "value_error_everywhere": round((error.sum() / best.sum()).item(), 4),
+        **value_errors(values_of_cells(parts.agent), rules.best_values(GAMMA, steps), num_due),
         "cpu_s": round(cpu, 1),
     }
 
