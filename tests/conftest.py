@@ -84,20 +84,33 @@ def global_generators_unmoved() -> Iterator[None]:
 
 # Coverage is not measured in these: they take whole programs, or many steps, through lines that other tests reach.
 WITHOUT_COVERAGE = {
+    "test_architecture",
     "test_bandits",
     "test_boats",
+    "test_checkpoint",
+    "test_command_line",
+    "test_config",
     "test_counter_kernels",
     "test_decisions",
+    "test_extending",
+    "test_figures",
     "test_following_options",
     "test_grid",
     "test_human_file",
     "test_hyar",
+    "test_learners_of_options",
     "test_linear_bandits",
     "test_masks",
     "test_offline",
     "test_option_ends",
+    "test_pages",
+    "test_pdqn",
+    "test_physics",
     "test_planner",
+    "test_play_replay",
+    "test_reliability",
     "test_resume",
+    "test_selectors",
 }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +29,11 @@ def recording(seed: int = 0) -> list[list[Episode]]:
 
     Presses begin at rest. Every seventh episode lacks one press in its log, which may be the only one.
     """
+    return copy.deepcopy(_recording(seed))
+
+
+@cache
+def _recording(seed: int) -> list[list[Episode]]:
     rng = np.random.default_rng(seed)
     return [[_play(rng, person, index) for index in range(NUM_EPISODES)] for person in range(NUM_PEOPLE)]
 

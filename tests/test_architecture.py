@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -19,14 +19,17 @@ BOATS = ("hpamdp.env.boatdock", "hpamdp.env.boatdock_released", "hpamdp.data.hum
 BOAT_WORDS = re.compile(r"boat|\bpress|_press|harbou?r|\bdock|_dock|controller|congruent|\bfuel|_fuel", re.IGNORECASE)
 
 
-def imports(module: str) -> Iterator[str]:
-    """Yield the dotted names that a module imports, anywhere in it; `from a import b` gives `a.b`."""
+@cache
+def imports(module: str) -> list[str]:
+    """Return the dotted names that a module imports, anywhere in it; `from a import b` gives `a.b`."""
+    names = []
     for node in ast.walk(ast.parse(FILES[module].read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module} imports relatively"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return names
 
 
 def is_in(name: str, package: str) -> bool:

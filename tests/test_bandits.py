@@ -264,6 +264,7 @@ def growth(name: str, **changes: float) -> tuple[float, float]:
     return regret[T - 1].item(), (regret[-1] / regret[T - 1]).item()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "changes"),
     [("epsilon_greedy", {"epsilon_final": 0.0}), ("ucb", {"exploration": 1.0}), ("thompson", {"exploration": 1.0})],

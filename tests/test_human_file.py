@@ -218,7 +218,9 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("case", HOSTILE)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] if "gigabyte" in case else []) for case in HOSTILE]
+)
 def test_hostile_files_are_refused_in_little_time_and_memory(tmp_path, case):
     path = tmp_path / "hostile.mat"
     content = HOSTILE[case]

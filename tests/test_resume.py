@@ -102,7 +102,14 @@ def test_a_resumed_run_is_the_run_that_was_never_stopped(high, low, tmp_path, mo
     stop_and_resume(words_of(high, low), tmp_path, monkeypatch, signal.SIGINT)
 
 
-@pytest.mark.parametrize("number", STOP_SIGNALS[1:], ids=lambda number: number.name)
+SIGTERM, *OTHERS = STOP_SIGNALS[1:]
+
+
+@pytest.mark.parametrize(
+    "number",
+    [SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in OTHERS)],
+    ids=lambda number: number.name,
+)
 def test_every_signal_that_stops_a_run_saves_it(number, tmp_path, monkeypatch):
     stop_and_resume(words_of("ucb", "random"), tmp_path, monkeypatch, number)
 
