@@ -34,6 +34,7 @@ SHORT = {
             "low.outcome_dims=[16]",
             "low.num_members=2",
             "low.num_samples=4",
+            "low.greedy_samples=4",
             "low.num_elites=2",
             "low.num_iterations=2",
         ),

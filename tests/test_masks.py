@@ -42,6 +42,7 @@ SHORT = {
         "low.max_sequences=9",
         "low.num_kept=2",
         "low.num_samples=8",
+        "low.greedy_samples=8",
         "low.num_elites=2",
         "low.num_iterations=2",
         "low.horizon=2",

@@ -130,7 +130,7 @@ QUICK = {
         *(f"low.{name}=1" for name in ("phi_order", "psi_order", "parameter_updates")),
     ],
     "hyar": ["low.codec_pretrain_updates=1", "low.codec_every=1"],
-    "pets": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
+    "pets": ["low.num_samples=8", "low.greedy_samples=8", "low.num_elites=4", "low.num_iterations=1"],
     "dlpa": ["low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
     "actor": ["high.minibatch_size=16"],
     "meta_critic": ["high.warmup_decisions=16", "high.updates_per_decision=0.1"],

@@ -17,8 +17,8 @@ SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 BOAT = PAMDPSpecs.from_env(BoatDockEnv(1, controller="congruent"))
 
 SEARCH = dict(
-    horizon=2, max_sequences=16, num_kept=3, num_samples=16, num_elites=4, num_iterations=3, temperature=0.1,
-    first_min_deviation=0.2, min_deviation=0.02,
+    horizon=2, max_sequences=16, num_kept=3, num_samples=16, greedy_samples=16, num_elites=4, num_iterations=3,
+    temperature=0.1, first_min_deviation=0.2, min_deviation=0.02,
 )  # fmt: skip
 OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
@@ -540,6 +540,25 @@ def test_actions_lie_in_their_bounds():
 def test_more_elites_than_samples_are_refused():
     with pytest.raises(ValueError, match="num_elites=20, but must be at most num_samples=16"):
         make(num_elites=20)
+    with pytest.raises(ValueError, match="num_elites=12, but must be at most greedy_samples=8"):
+        make(num_elites=12, greedy_samples=8)
+
+
+def test_a_greedy_plan_tries_as_many_samples_as_it_is_told(monkeypatch):
+    learner = make(num_samples=16, greedy_samples=40)
+    predict, tried = learner.model.forward, []
+
+    def count_and_predict(state, discrete, own, precision):
+        tried.append(own.shape[1])
+        return predict(state, discrete, own, precision)
+
+    monkeypatch.setattr(learner.model, "forward", count_and_predict)
+    for exploration, num_samples in ((ExplorationType.RANDOM, 16), (ExplorationType.DETERMINISTIC, 40)):
+        tried.clear()
+        with set_exploration_type(exploration):
+            learner.policy.plan(torch.zeros(1, SPECS.observation_dim))
+        num_sequences = [size // num_samples for size in tried]
+        assert num_sequences[-1] == 1 and tried == [num * num_samples for num in num_sequences]
 
 
 def test_it_learns_a_two_step_problem_within_some_hundred_steps():

@@ -515,7 +515,8 @@ class PETSPolicy(TensorDictModuleBase):
         """
         search = self.search
         num_sequences = min(search.num_kept, search.num_sequences) if is_mean else search.num_sequences
-        size = max(1, _CHUNK_ROWS // (num_sequences * search.num_samples))
+        num_samples = search.greedy_samples if is_greedy() else search.num_samples
+        size = max(1, _CHUNK_ROWS // (num_sequences * num_samples))
         found = []
         for begin in range(0, state.shape[1], size):
             piece = state[:, begin : begin + size]
@@ -524,7 +525,8 @@ class PETSPolicy(TensorDictModuleBase):
                 own = own[begin : begin + size] if is_mean else own[:, begin : begin + size].flatten(0, 1)
             num_plans = piece.shape[1] if is_mean else piece.shape[:2].numel()
             first_returns = self._returns_of_single_members(piece[0]) if is_mean else None
-            part = search(self._returns(piece, is_mean), num_plans, state.device, own, first_returns)
+            returns = self._returns(piece, is_mean)
+            part = search(returns, num_plans, state.device, own, first_returns, is_greedy=is_greedy())
             found.append(part if is_mean else Found(*(each.unflatten(0, piece.shape[:2]) for each in part)))
         joined_found = Found(*(torch.cat(part, 0 if is_mean else 1) for part in zip(*found, strict=True)))
         return joined_found if is_mean else Found(*(part.flatten(0, 1) for part in joined_found))
@@ -617,6 +619,7 @@ class PETS(ReplayLearner):
         max_sequences: PositiveInt,
         num_kept: PositiveInt,
         num_samples: PositiveInt,
+        greedy_samples: PositiveInt,
         num_elites: PositiveInt,
         num_iterations: PositiveInt,
         temperature: PositiveFloat,
@@ -656,6 +659,7 @@ class PETS(ReplayLearner):
             max_sequences=max_sequences,
             num_kept=num_kept,
             num_samples=num_samples,
+            greedy_samples=greedy_samples,
             num_elites=num_elites,
             num_iterations=num_iterations,
             temperature=temperature,

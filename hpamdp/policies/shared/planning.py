@@ -93,6 +93,7 @@ class SequenceSearch:
         max_sequences: largest number of discrete sequences tried.
         num_kept: number of sequences in the second iteration; half as many in each one after it, down to 1.
         num_samples: parameter samples for each sequence in an iteration.
+        greedy_samples: the same in a greedy plan.
         num_elites: number of the best of them that define the next iteration's Gaussians.
         num_iterations: number of iterations, the first one included.
         temperature: of the elites' weights exp(return / temperature).
@@ -112,26 +113,30 @@ class SequenceSearch:
         max_sequences: int,
         num_kept: int,
         num_samples: int,
+        greedy_samples: int,
         num_elites: int,
         num_iterations: int,
         temperature: float,
         first_min_deviation: float,
         min_deviation: float,
     ) -> None:
-        if num_elites > num_samples:
-            raise ValueError(f"num_elites={num_elites}, but must be at most num_samples={num_samples}")
+        for name, number in {"num_samples": num_samples, "greedy_samples": greedy_samples}.items():
+            if num_elites > number:
+                raise ValueError(f"num_elites={num_elites}, but must be at most {name}={number}")
         if min_deviation > first_min_deviation:
             raise ValueError(f"min_deviation={min_deviation}, but must be at most {first_min_deviation=}")
-        if horizon * max_sequences * num_samples * num_iterations > 1e9:
+        if horizon * max_sequences * max(num_samples, greedy_samples) * num_iterations > 1e9:
             raise ValueError(
                 f"horizon={horizon}, max_sequences={max_sequences}, num_samples={num_samples}, "
-                f"num_iterations={num_iterations}: a plan would try more than 1,000,000,000 actions"
+                f"greedy_samples={greedy_samples}, num_iterations={num_iterations}: a plan would try more than "
+                "1,000,000,000 actions"
             )
         self.num_discrete = len(parameter_dims)
         self.horizon = horizon
         self.max_sequences = max_sequences
         self.num_kept = num_kept
         self.num_samples = num_samples
+        self.greedy_samples = greedy_samples
         self.num_elites = num_elites
         self.num_iterations = num_iterations
         self.temperature = temperature
@@ -184,6 +189,8 @@ class SequenceSearch:
         device: torch.device,
         allowed: Tensor | None = None,
         first_returns: Returns | None = None,
+        *,
+        is_greedy: bool = False,
     ) -> Found:
         """Search for `num_states` states at once.
 
@@ -194,12 +201,14 @@ class SequenceSearch:
             allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
             first_returns: the same as `returns`, but rougher and faster, for the first iteration, which only chooses
                 what is refined; None: `returns`.
+            is_greedy: whether to try `greedy_samples` of the parameters.
         """
+        num_samples = self.greedy_samples if is_greedy else self.num_samples
         has_slot = self.has_slot.to(device)
         steps = []
         for number in self.sequences(num_states, device, allowed):
             mask = has_slot[number].unsqueeze(2)
-            shape = *number.shape, self.num_samples, has_slot.shape[-1]
+            shape = *number.shape, num_samples, has_slot.shape[-1]
             steps.append(SequenceStep(number, (2.0 * _stratified(shape, device) - 1.0) * mask))
         is_last = self.num_iterations == 1
         value = returns(steps) if first_returns is None or is_last else first_returns(steps)
