@@ -164,6 +164,7 @@ class RunConfig(BaseModel):
     # Runs of earlier versions did not save these.
     film: bool = True
     compile_updates: bool = False
+    update_precision: Literal["float32", "bfloat16"] = "float32"
 
     @property
     def num_frames(self) -> int:

@@ -186,6 +186,14 @@ def test_a_learner_with_augment_learns_from_steps_under_the_problems_symmetries(
         assert calls and set(calls) == {6}, "each boat's learner has the maps that keep the boat"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("low", sorted({*TRAINED} - {*FIXED, "qpamdp"}))
+def test_every_learner_makes_updates_in_bfloat16(low, tmp_path):
+    given = [*words("ucb", low), "update_precision=bfloat16"]
+    assert run(compose_config(given), tmp_path, given) == 0
+    assert_it_updated(given, tmp_path)
+
+
 @pytest.mark.parametrize("low", ["pdqn", "pets"])
 def test_augment_is_refused_where_the_problem_declares_no_symmetries(low, tmp_path):
     with pytest.raises(ConfigError, match="low: augment=true: the problem declares no symmetries; use augment=false"):

@@ -12,11 +12,13 @@ import test_pdqn
 import torch
 from conftest import make_config
 from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
 from toy_steps import SPECS, sample
 
 from hpamdp.config import ConfigError
 from hpamdp.policies.low_level.hyar import LATENT
 from hpamdp.policies.low_level.paddpg import SCORES
+from hpamdp.policies.shared.gradients import gradients_of
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.run.assemble import assemble
 
@@ -121,24 +123,57 @@ def test_compiled_updates_of_hppo_are_the_same_up_to_rounding_for_batches_of_any
         torch.testing.assert_close(compiled.actor.state_dict()[key], value, rtol=1e-2, atol=1e-3)
 
 
-SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "compile_updates=true"]
+class Dtypes(TorchDispatchMode):
+    """Notes the types of the inputs of matrix products made under it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[torch.dtype] = set()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func in (torch.ops.aten.mm.default, torch.ops.aten.addmm.default, torch.ops.aten.bmm.default):
+            self.seen.add(args[-1].dtype)
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("name", MAKE)
+def test_updates_in_bfloat16_have_its_products_and_nearly_the_same_gradients(name):
+    torch.manual_seed(0)
+    learner, batch = MAKE[name](), batch_for(name)
+    parameters = list(learner.critics.parameters())
+    both = []
+    for _ in range(2):
+        with Dtypes() as products:
+            _, gradients = gradients_of(learner._critic_loss, parameters, batch, precision=learner._precision)
+        both.append(torch.cat([gradient.flatten() for gradient in gradients]))
+        learner.lower_precision()
+    assert products.seen == {torch.bfloat16}
+    assert all(gradient.dtype == torch.float32 for gradient in both)
+    assert torch.cosine_similarity(*both, dim=0) > 0.99
+
+
+SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4"]
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (
-            ["env=platform", "high=none", "low=qpamdp"],
+            ["env=platform", "high=none", "low=qpamdp", "compile_updates=true"],
             "compile_updates=true: low=qpamdp: its updates cannot be compiled",
         ),
         (
             ["env=platform", "+env.options=default", "high=meta_critic", "low=pdqn", "agent.termination=steps",
-             "agent.option_length=3"],
+             "agent.option_length=3", "compile_updates=true"],
             "compile_updates=true: goes with agent.termination=episode only, not with steps",
+        ),
+        (
+            ["env=platform", "high=none", "low=qpamdp", "update_precision=bfloat16"],
+            "update_precision=bfloat16: low=qpamdp: its updates are made in float32 alone",
         ),
     ],
 )  # fmt: skip
-def test_what_cannot_be_compiled_is_refused_in_one_line(tmp_path, words, message):
+def test_what_updates_cannot_do_is_refused_in_one_line(tmp_path, words, message):
     with pytest.raises(ConfigError) as error:
         assemble(make_config([*SMALL, *words]), tmp_path)
     assert str(error.value) == message
@@ -153,4 +188,4 @@ def test_a_missing_compiler_is_told_in_one_line(tmp_path, monkeypatch):
 
     monkeypatch.setattr(cpp_builder, "get_cpp_compiler", missing)
     with pytest.raises(ConfigError, match=r"^compile_updates=true: low=pdqn: there is no C\+\+ compiler; install"):
-        assemble(make_config([*SMALL, "env=platform", "high=none", "low=pdqn"]), tmp_path)
+        assemble(make_config([*SMALL, "env=platform", "high=none", "low=pdqn", "compile_updates=true"]), tmp_path)

@@ -382,6 +382,14 @@ class Learner(nn.Module):
         """
         raise ValueError("its updates cannot be compiled")
 
+    def lower_precision(self) -> None:
+        """Make the matrix products of updates in bfloat16, all else in float32. Override it if the learner can.
+
+        Raises:
+            ValueError: it cannot.
+        """
+        raise ValueError("its updates are made in float32 alone")
+
     def load_networks(self, state: Mapping[str, Tensor]) -> None:
         """Take over what an earlier run's learner has learned, but not how far its run had come (`progress`).
 

@@ -79,6 +79,8 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     agent = make_agent(config, specs, device)
     if config.run.compile_updates and config.run.mode != "eval":
         compile_updates(config, agent)
+    if config.run.update_precision != "float32" and config.run.mode != "eval":
+        lower_precision(config, agent)
     is_new = config.run.mode != "eval" and config.run.resume is None
     data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and config.run.low.checkpoint is not None:
@@ -178,6 +180,20 @@ def compile_updates(config: Config, agent: HierarchicalAgent) -> None:
             learner.compile_updates()
         except ValueError as error:
             raise ConfigError(f"compile_updates=true: {low}: {error}") from error
+
+
+def lower_precision(config: Config, agent: HierarchicalAgent) -> None:
+    """Let the learners make the matrix products of their updates in bfloat16.
+
+    Raises:
+        ConfigError: one of them cannot.
+    """
+    for low, learner in zip(_learners_of(config, agent.specs), agent.learners, strict=False):
+        assert isinstance(learner, Learner)
+        try:
+            learner.lower_precision()
+        except ValueError as error:
+            raise ConfigError(f"update_precision={config.run.update_precision}: {low}: {error}") from error
 
 
 def _learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:

@@ -149,6 +149,10 @@ class HPPO(OnPolicy, Learner):
         # Minibatches differ in size where other options take their share of the steps.
         self._gradients_of = compiled(any_size=True)
 
+    def lower_precision(self) -> None:
+        """Have the matrix products of the loss and its gradient in bfloat16."""
+        self._precision = torch.bfloat16
+
     def portable(self) -> dict[str, Any] | None:
         """Return the actor, unless it is to sample: see `hpamdp.policies.shared.portable`."""
         return None if self.policy.samples_when_greedy else portable_actor(self.policy.actor, self.specs)

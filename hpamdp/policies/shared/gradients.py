@@ -6,6 +6,7 @@ Compiled code merges the many small operations around the matrix products.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from typing import TypeAlias
 
 import torch
@@ -24,6 +25,7 @@ def step_down(
     *inputs: Inputs,
     max_grad_norm: float | None = None,
     gradients_of: Gradients,
+    precision: torch.dtype = torch.float32,
 ) -> dict[str, Tensor]:
     """Take one step of an optimizer down the gradient of a loss; return the scalars of the loss.
 
@@ -35,10 +37,11 @@ def step_down(
         inputs: tensors, tensors by name, or None.
         max_grad_norm: largest norm of the gradient; None: no limit.
         gradients_of: the function of this module, or what `compiled` returns.
+        precision: of the matrix products; parameters and what sums over many terms stay in float32.
     """
     groups = optimizer.param_groups
     parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
-    scalars, gradients = gradients_of(loss_of, parameters, *inputs)
+    scalars, gradients = gradients_of(loss_of, parameters, *inputs, precision=precision)
     for parameter, gradient in zip(parameters, gradients, strict=True):
         parameter.grad = gradient
     if max_grad_norm is not None:
@@ -48,10 +51,12 @@ def step_down(
 
 
 def gradients_of(
-    loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs
+    loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, precision: torch.dtype = torch.float32
 ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
     """Return the scalars of a loss and its gradients, None for parameters that it does not depend on."""
-    loss, scalars = loss_of(*inputs)
+    is_lower = precision != torch.float32
+    with torch.autocast(parameters[0].device.type, precision) if is_lower else nullcontext():
+        loss, scalars = loss_of(*inputs)
     gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
     # A fused optimizer takes it for granted that gradients lie in memory as their parameters do.
     in_order = tuple(None if gradient is None else gradient.contiguous() for gradient in gradients)
@@ -86,10 +91,10 @@ def compiled(*, any_size: bool) -> Gradients:
     fast = torch.compile(gradients_of, dynamic=any_size, fullgraph=True)
 
     def with_plain_inputs(
-        loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs
+        loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, precision: torch.dtype = torch.float32
     ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:
         # A TensorDict would have to be traced, too.
         plain = (dict(each.items()) if isinstance(each, TensorDictBase) else each for each in inputs)
-        return fast(loss_of, parameters, *plain)
+        return fast(loss_of, parameters, *plain, precision=precision)
 
     return with_plain_inputs

@@ -40,6 +40,7 @@ class OnPolicy(nn.Module):
         self.max_grad_norm = max_grad_norm
         self.waiting: list[TensorDict] = []
         self._gradients_of: Gradients = gradients_of
+        self._precision = torch.float32
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizer, for the checkpoint."""
@@ -102,5 +103,10 @@ class OnPolicy(nn.Module):
             The scalars of the loss.
         """
         return step_down(
-            self.optimizer, loss_of, *inputs, max_grad_norm=self.max_grad_norm, gradients_of=self._gradients_of
+            self.optimizer,
+            loss_of,
+            *inputs,
+            max_grad_norm=self.max_grad_norm,
+            gradients_of=self._gradients_of,
+            precision=self._precision,
         )

@@ -75,6 +75,7 @@ class ReplayLearner(Learner):
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
         self._gradients_of = gradients_of
+        self._precision = torch.float32
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizers and the replay buffer."""
@@ -99,6 +100,10 @@ class ReplayLearner(Learner):
     def compile_updates(self) -> None:
         """Compile what `minimise` does but for the optimizer's step, each loss at the first update that needs it."""
         self._gradients_of = compiled(any_size=False)
+
+    def lower_precision(self) -> None:
+        """Have the matrix products of what `minimise` does in bfloat16."""
+        self._precision = torch.bfloat16
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Store the transitions in `mask`."""
@@ -215,7 +220,12 @@ class ReplayLearner(Learner):
     ) -> dict[str, Tensor]:
         """Take one step of the named optimizer down the gradient of a loss, see `step_down`; return its scalars."""
         return step_down(
-            self.optimizers[name], loss_of, *inputs, max_grad_norm=max_grad_norm, gradients_of=self._gradients_of
+            self.optimizers[name],
+            loss_of,
+            *inputs,
+            max_grad_norm=max_grad_norm,
+            gradients_of=self._gradients_of,
+            precision=self._precision,
         )
 
 
