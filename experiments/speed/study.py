@@ -100,7 +100,7 @@ def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int, Lear
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Return a row of the table: CPU ms of an update, plain and compiled, and of its products."""
+    """Return a row of the table: CPU ms of an update, plain, compiled, and with bfloat16, and of its products."""
     with tempfile.TemporaryDirectory() as folder:
         update, num_updates, learner = updates_of(name, Path(folder))
     update()
@@ -117,6 +117,9 @@ def measure(name: str) -> dict[str, Any]:
     learner.compile_updates()
     update()
     compiled_ms, products_again_ms = in_turns(update, floor, num_updates)
+    learner.lower_precision()
+    update()
+    lower_ms, products_at_last_ms = in_turns(update, floor, num_updates)
     return {
         "learner": name,
         "update_ms": round(update_ms, 3),
@@ -124,6 +127,8 @@ def measure(name: str) -> dict[str, Any]:
         "ratio": round(update_ms / products_ms, 2),
         "compiled_ms": round(compiled_ms, 3),
         "compiled_ratio": round(compiled_ms / products_again_ms, 2),
+        "bfloat16_ms": round(lower_ms, 3),
+        "bfloat16_ratio": round(lower_ms / products_at_last_ms, 2),
         "products": round(len(made) / num_updates, 1),
     }
 
@@ -142,13 +147,14 @@ def in_turns(update: Callable[[], object], floor: Callable[[], object], num_upda
 def table(rows: Rows) -> str:
     """Return a line for each learner."""
     lines = [
-        "| learner | ms an update | ms of its products | ratio | ms compiled | ratio compiled | products |",
-        "|---|---|---|---|---|---|---|",
+        "| learner | ms an update | ms of products | ratio | ms compiled | ratio | and bfloat16 | ratio | products |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         lines.append(
             f"| {row['learner']} | {row['update_ms']:.2f} | {row['products_ms']:.2f} | {row['ratio']:.2f} | "
-            f"{row['compiled_ms']:.2f} | {row['compiled_ratio']:.2f} | {row['products']:.1f} |"
+            f"{row['compiled_ms']:.2f} | {row['compiled_ratio']:.2f} | "
+            f"{row['bfloat16_ms']:.2f} | {row['bfloat16_ratio']:.2f} | {row['products']:.1f} |"
         )
     return "\n".join(lines)
 
