@@ -37,6 +37,14 @@ def crossing(*words: str) -> Config:
     return make_config([*SMALL, "env=crossing", "low=stepper", *words])
 
 
+def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(tmp_path, capsys):
+    assemble(make_config(["env.switch_cost=0.2", "high=ucb", "low=random", "eval.layouts=4"]), tmp_path)
+    assert capsys.readouterr().err == (
+        "env=boatdock: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; use "
+        "agent.termination=steps agent.option_length=1 to change them\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [

@@ -21,7 +21,7 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
-from hpamdp.messages import first_line
+from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner, Selector
 from hpamdp.run import checkpoint
@@ -364,13 +364,18 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
 
 
 def _check_plans(config: Config, env: PAMDPEnv) -> None:
-    """Refuse plans that change options where an option lasts for its episode."""
+    """Refuse plans that change options where an option lasts for its episode; say so of a ceiling made of them."""
     for low in config.learners:
         if env.plans_change_options and "oracle" in getattr(low.cls, "needs", ()):
             raise ConfigError(
                 f"{low}: its plans on {config.env} change options, but agent.termination=episode keeps them; use "
                 "agent.termination=steps agent.option_length=1"
             )
+    if env.plans_change_options:
+        warn(
+            f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; use "
+            "agent.termination=steps agent.option_length=1 to change them"
+        )
 
 
 def _check_ends(config: Config, env: PAMDPEnv) -> None:
