@@ -68,8 +68,8 @@ SELECTORS = {
 # Options are uniform for half of the steps: a learner that is not chosen does not learn, and then is never chosen.
 # Replay learners: small networks and fast targets, for a problem of 104 cells.
 REPLAY = [
-    "total_frames=100000",
-    "agent.uniform_option_frames=70000",
+    "total_frames=200000",
+    "agent.uniform_option_frames=120000",
     "low.hidden_dims=[64,64]",
 ]
 LEARNERS = {
@@ -83,7 +83,6 @@ LEARNERS = {
     ],
     "pdqn": [
         *REPLAY,
-        "total_frames=200000",
         "agent.uniform_option_frames=100000",
         "low.warmup_frames=2000",
         "low.updates_per_frame=0.05",
@@ -99,20 +98,22 @@ LEARNERS = {
         "low.epsilon_frames=30000",
         "low.codec_pretrain_updates=1000",
     ],
+    # Of random episodes one in 500 arrives, so the random steps at the start are many.
     "paddpg": [
         *REPLAY,
+        "low.warmup_frames=25000",
         "low.twin=true",
         "low.updates_per_frame=0.1",
         "low.hidden_dims=[128,128]",
         "low.tau=0.05",
         "low.epsilon_final=0.2",
-        "low.epsilon_frames=25000",
+        "low.epsilon_frames=60000",
         "low.actor_lr=3e-4",
     ],
     # Low temperatures: with the default ones a step earns more entropy than it costs, and never arriving is best.
     "hsac": [
         *REPLAY,
-        "low.warmup_frames=10000",
+        "low.warmup_frames=25000",
         "low.updates_per_frame=0.1",
         "low.batch_size=128",
         "low.tau=0.05",
