@@ -137,7 +137,7 @@ class Dtypes(TorchDispatchMode):
 
 
 @pytest.mark.parametrize("name", MAKE)
-def test_updates_in_bfloat16_have_its_products_and_nearly_the_same_gradients(name):
+def test_updates_in_bfloat16_make_all_products_in_it_and_have_nearly_the_same_gradients(name):
     torch.manual_seed(0)
     learner, batch = MAKE[name](), batch_for(name)
     parameters = list(learner.critics.parameters())

@@ -58,6 +58,14 @@ def test_learners_are_asked_only_where_a_decision_is_due():
     assert chosen.option_values.asked == [2]
 
 
+def test_learners_are_not_asked_about_episodes_that_have_ended():
+    chosen = selector()
+    td = seen([[1.0, 2.0]] * 4).set(keys.DONE, torch.tensor([[True], [False], [True], [False]]))
+    assert chosen(td.clone())[keys.OPTION][[1, 3]].tolist() == [1, 1]
+    chosen(td.set(keys.DONE, torch.ones(4, 1, dtype=torch.bool)))
+    assert chosen.option_values.asked == [2]
+
+
 def test_of_equal_options_exploring_takes_a_random_one():
     torch.manual_seed(0)
     values = [[torch.inf, torch.inf]] * 400

@@ -373,8 +373,8 @@ def _check_plans(config: Config, env: PAMDPEnv) -> None:
             )
     if env.plans_change_options:
         warn(
-            f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; use "
-            "agent.termination=steps agent.option_length=1 to change them"
+            f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; "
+            "use agent.termination=steps agent.option_length=1 to change them"
         )
 
 

@@ -37,8 +37,14 @@ class Value(Selector):
         self.epsilon = epsilon
 
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return an option for every environment, int64 `[*B]`; 0 where no decision is due."""
+        """Return an option for every environment, int64 `[*B]`; 0 where no decision is due or the episode has ended."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
+        done = td.get(keys.DONE, None)
+        if done is not None:  # evaluations step on with episodes that have ended, and plans take long
+            is_decision = is_decision & ~done.squeeze(-1)
+        option = torch.zeros_like(is_decision, dtype=torch.long)
+        if not is_decision.any():
+            return option
         action_mask, option_mask = (
             None if mask is None else mask[is_decision]
             for mask in (td.get(keys.ACTION_MASK, None), td.get(keys.OPTION_MASK, None))
@@ -53,6 +59,5 @@ class Value(Selector):
             is_random = torch.rand(best.shape, device=best.device) < self.epsilon
             anything = random_choice(best.shape, self.specs.num_options, option_mask, best.device)
             best = torch.where(is_random, anything, best)
-        option = torch.zeros_like(is_decision, dtype=torch.long)
         option[is_decision] = best
         return option
