@@ -118,7 +118,14 @@ def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
     assert niceness == {os.getpriority(os.PRIO_PROCESS, 0)}
 
 
-@pytest.mark.parametrize("low", TRAINED)
+# Quick: a learner of each kind.
+@pytest.mark.parametrize(
+    "low",
+    [
+        pytest.param(low, marks=[] if low in ("hppo", "hyar", "pets", "qpamdp") else [pytest.mark.slow])
+        for low in TRAINED
+    ],
+)
 def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
     warmup = ["low.warmup_frames=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
     warmup += ["low.codec_pretrain_updates=2"] if low == "hyar" else []

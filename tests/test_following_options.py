@@ -84,7 +84,7 @@ def two_options(agent: HierarchicalAgent, num: int, num_steps: int = 2) -> Tenso
     return td.set("next", TensorDict(after, [num, 2]))
 
 
-@pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
+@pytest.mark.parametrize("is_shared", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["per_option", "shared"])
 @pytest.mark.parametrize("low", LEARNERS)
 def test_an_option_is_worth_the_discounted_value_of_the_option_that_follows_it(low, is_shared):
     agent = make_agent(low, Fixed(SPECS, option="second"), is_shared=is_shared)

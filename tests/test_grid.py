@@ -78,8 +78,8 @@ def assert_it_updated(given: list[str], folder: Path) -> None:
 
 # `high=value` is refused with these, which have no value to compare.
 WITHOUT_VALUE = ("bc", "dlpa", "planner", "random")
-# Quick: each selector over H-PPO, each learner under a uniform selector.
-QUICK = {*itertools.product(choices("high"), ["hppo"]), *itertools.product(["uniform"], TRAINED)}
+# Quick: each selector over H-PPO. `test_every_learner_works_on_other_problems` has the learners.
+QUICK = {*itertools.product(choices("high"), ["hppo"])}
 PAIRS = [
     pytest.param(*pair, marks=[] if pair in QUICK else [pytest.mark.slow])
     for pair in itertools.product(choices("high"), TRAINED)

@@ -161,7 +161,7 @@ def test_a_latent_action_is_worth_what_its_allowed_action_is_worth(name):
     torch.testing.assert_close(moved[:, 0, : embeddings.shape[1]], embeddings[[1, 1, 1]])
 
 
-@pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
+@pytest.mark.parametrize("is_shared", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["per_option", "shared"])
 @pytest.mark.parametrize("name", [*SHORT])
 def test_an_option_that_is_a_set_of_actions_takes_no_other_action(name, is_shared):
     problem = Forbidden(8)
