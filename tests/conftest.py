@@ -68,6 +68,8 @@ def choices(group: str) -> list[str]:
 
 # The learners that learn from presses of their own; the others learn from data sets alone.
 TRAINED = sorted({*choices("low")} - {"bc"})
+# One of each kind: on-policy, with a replay, with a model, of episodes. Tests of all learners are quick with these.
+OF_EACH_KIND = ("hppo", "hyar", "pets", "qpamdp")
 
 
 @contextmanager

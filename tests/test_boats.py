@@ -186,7 +186,9 @@ def follow_held(env, option):
     return harbour.score(td[keys.OUTCOME], td["fuel"].squeeze(-1)), td[keys.OUTCOME]
 
 
-@pytest.mark.parametrize(("num_presses", "cost"), [(1, 0.1), (2, 0.1), (3, 0.15)])
+@pytest.mark.parametrize(
+    ("num_presses", "cost"), [(1, 0.1), (2, 0.1), (3, 0.15), pytest.param(3, 0.0, marks=pytest.mark.slow)]
+)
 def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(num_presses, cost):
     num, samples, elite, children = 25, 4000, 30, 8
     rules = made(["congruent", "incongruent1", "sideways"], cost, SIDEWAYS)

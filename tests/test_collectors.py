@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import pytest
 import torch
-from conftest import CONF, TRAINED, compose_config, make_config
+from conftest import CONF, OF_EACH_KIND, TRAINED, compose_config, make_config
 
 from hpamdp.config import ConfigError
 from hpamdp.run import checkpoint
@@ -118,11 +118,10 @@ def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
     assert niceness == {os.getpriority(os.PRIO_PROCESS, 0)}
 
 
-# Quick: a learner of each kind.
 @pytest.mark.parametrize(
     "low",
     [
-        pytest.param(low, marks=[] if low in ("hppo", "hyar", "pets", "qpamdp") else [pytest.mark.slow])
+        pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow])
         for low in TRAINED
     ],
 )

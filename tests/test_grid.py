@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import CONF, TRAINED, choices, compose_config, make_config
+from conftest import CONF, OF_EACH_KIND, TRAINED, choices, compose_config, make_config
 from tensordict import TensorDict
 
 from hpamdp.config import ConfigError
@@ -79,11 +79,10 @@ def assert_it_updated(given: list[str], folder: Path) -> None:
 # `high=value` is refused with these, which have no value to compare.
 WITHOUT_VALUE = ("bc", "dlpa", "planner", "random")
 # Quick: each selector over H-PPO. `test_every_learner_works_on_other_problems` has the learners.
-QUICK = {*itertools.product(choices("high"), ["hppo"])}
 PAIRS = [
-    pytest.param(*pair, marks=[] if pair in QUICK else [pytest.mark.slow])
-    for pair in itertools.product(choices("high"), TRAINED)
-    if pair[0] != "value" or pair[1] not in WITHOUT_VALUE
+    pytest.param(high, low, marks=[] if low == "hppo" else [pytest.mark.slow])
+    for high, low in itertools.product(choices("high"), TRAINED)
+    if high != "value" or low not in WITHOUT_VALUE
 ]
 
 
@@ -134,7 +133,7 @@ def test_learners_work_for_each_option_and_shared(sharing, tmp_path):
 RELOADED = [
     *((high, "hppo" if high == "value" else "random") for high in choices("high")),
     *(
-        pytest.param("uniform", low, marks=[] if low in ("hppo", "hyar", "pets", "qpamdp") else [pytest.mark.slow])
+        pytest.param("uniform", low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow])
         for low in TRAINED
     ),
 ]

@@ -144,7 +144,7 @@ def test_updates_in_bfloat16_make_all_products_in_it_and_have_nearly_the_same_gr
     both = []
     for _ in range(2):
         with Dtypes() as products:
-            _, gradients = gradients_of(learner._critic_loss, parameters, batch, precision=learner._precision)
+            _, gradients = gradients_of(learner._critic_loss, parameters, batch, precision=learner.descent.precision)
         both.append(torch.cat([gradient.flatten() for gradient in gradients]))
         learner.lower_precision()
     assert products.seen == {torch.bfloat16}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -77,10 +77,8 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     specs = PAMDPSpecs.from_env(env)
     check_agent_memory(config, specs, device)
     agent = make_agent(config, specs, device)
-    if config.run.compile_updates and config.run.mode != "eval":
-        compile_updates(config, agent)
-    if config.run.update_precision != "float32" and config.run.mode != "eval":
-        lower_precision(config, agent)
+    if config.run.mode != "eval":
+        set_up_updates(config, agent)
     is_new = config.run.mode != "eval" and config.run.resume is None
     data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and config.run.low.checkpoint is not None:
@@ -165,35 +163,31 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     return agent.to(device)
 
 
-def compile_updates(config: Config, agent: HierarchicalAgent) -> None:
-    """Let the learners compile their updates.
+def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:
+    """Have the learners compile their updates, or make their products in bfloat16, if the run asks for it.
 
     Raises:
-        ConfigError: one of them cannot, or what follows an option decides what an update computes.
+        ConfigError: one of them cannot, or what follows an option decides what a compiled update computes.
     """
-    termination = config.run.agent.termination
-    if termination != "episode":
-        raise ConfigError(f"compile_updates=true: goes with agent.termination=episode only, not with {termination}")
+    run = config.run
+    if run.compile_updates:
+        given = "compile_updates=true"
+        if run.agent.termination != "episode":
+            raise ConfigError(f"{given}: goes with agent.termination=episode only, not with {run.agent.termination}")
+        _ask_learners(config, agent, given, lambda learner: learner.compile_updates())
+    if run.update_precision != "float32":
+        given = f"update_precision={run.update_precision}"
+        _ask_learners(config, agent, given, lambda learner: learner.lower_precision())
+
+
+def _ask_learners(config: Config, agent: HierarchicalAgent, given: str, ask: Callable[[Learner], None]) -> None:
+    """Ask all learners for something; if one refuses, say so with the setting that was given."""
     for low, learner in zip(_learners_of(config, agent.specs), agent.learners, strict=False):
         assert isinstance(learner, Learner)
         try:
-            learner.compile_updates()
+            ask(learner)
         except ValueError as error:
-            raise ConfigError(f"compile_updates=true: {low}: {error}") from error
-
-
-def lower_precision(config: Config, agent: HierarchicalAgent) -> None:
-    """Let the learners make the matrix products of their updates in bfloat16.
-
-    Raises:
-        ConfigError: one of them cannot.
-    """
-    for low, learner in zip(_learners_of(config, agent.specs), agent.learners, strict=False):
-        assert isinstance(learner, Learner)
-        try:
-            learner.lower_precision()
-        except ValueError as error:
-            raise ConfigError(f"update_precision={config.run.update_precision}: {low}: {error}") from error
+            raise ConfigError(f"{given}: {low}: {error}") from error
 
 
 def _learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:

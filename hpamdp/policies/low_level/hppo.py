@@ -33,7 +33,6 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate
-from hpamdp.policies.shared.gradients import compiled
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy
@@ -147,11 +146,11 @@ class HPPO(OnPolicy, Learner):
     def compile_updates(self) -> None:
         """Compile the loss and its gradient, at the first update."""
         # Minibatches differ in size where other options take their share of the steps.
-        self._gradients_of = compiled(any_size=True)
+        self.descent.compile(any_size=True)
 
     def lower_precision(self) -> None:
         """Have the matrix products of the loss and its gradient in bfloat16."""
-        self._precision = torch.bfloat16
+        self.descent.lower_precision()
 
     def portable(self) -> dict[str, Any] | None:
         """Return the actor, unless it is to sample: see `hpamdp.policies.shared.portable`."""

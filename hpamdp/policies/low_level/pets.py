@@ -515,8 +515,7 @@ class PETSPolicy(TensorDictModuleBase):
         """
         search = self.search
         num_sequences = min(search.num_kept, search.num_sequences) if is_mean else search.num_sequences
-        num_samples = search.greedy_samples if is_greedy() else search.num_samples
-        size = max(1, _CHUNK_ROWS // (num_sequences * num_samples))
+        size = max(1, _CHUNK_ROWS // (num_sequences * search.samples_of_a_sequence(is_greedy())))
         found = []
         for begin in range(0, state.shape[1], size):
             piece = state[:, begin : begin + size]

@@ -19,35 +19,47 @@ LossFunction = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 Gradients = Callable[..., tuple[dict[str, Tensor], tuple[Tensor | None, ...]]]
 
 
-def step_down(
-    optimizer: torch.optim.Optimizer,
-    loss_of: LossFunction,
-    *inputs: Inputs,
-    max_grad_norm: float | None = None,
-    gradients_of: Gradients,
-    precision: torch.dtype = torch.float32,
-) -> dict[str, Tensor]:
-    """Take one step of an optimizer down the gradient of a loss; return the scalars of the loss.
+class Descent:
+    """Takes steps of optimizers down the gradients of losses: as they are, compiled, or with products in bfloat16."""
 
-    Nothing but the parameters of the optimizer changes, whatever else the loss depends on.
+    def __init__(self) -> None:
+        self._gradients_of: Gradients = gradients_of
+        self.precision = torch.float32
 
-    Args:
-        optimizer: of the parameters to learn.
-        loss_of: maps the inputs to the loss and to scalars to log.
-        inputs: tensors, tensors by name, or None.
-        max_grad_norm: largest norm of the gradient; None: no limit.
-        gradients_of: the function of this module, or what `compiled` returns.
-        precision: of the matrix products; parameters and what sums over many terms stay in float32.
-    """
-    groups = optimizer.param_groups
-    parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
-    scalars, gradients = gradients_of(loss_of, parameters, *inputs, precision=precision)
-    for parameter, gradient in zip(parameters, gradients, strict=True):
-        parameter.grad = gradient
-    if max_grad_norm is not None:
-        nn.utils.clip_grad_norm_(parameters, max_grad_norm)
-    optimizer.step()
-    return scalars
+    def compile(self, *, any_size: bool) -> None:
+        """Compile the gradients of each loss at the first step down it; see `compiled`."""
+        self._gradients_of = compiled(any_size=any_size)
+
+    def lower_precision(self) -> None:
+        """Have matrix products in bfloat16; parameters and what sums over many terms stay in float32."""
+        self.precision = torch.bfloat16
+
+    def step(
+        self,
+        optimizer: torch.optim.Optimizer,
+        loss_of: LossFunction,
+        *inputs: Inputs,
+        max_grad_norm: float | None = None,
+    ) -> dict[str, Tensor]:
+        """Take one step of an optimizer down the gradient of a loss; return the scalars of the loss.
+
+        Nothing but the parameters of the optimizer changes, whatever else the loss depends on.
+
+        Args:
+            optimizer: of the parameters to learn.
+            loss_of: maps the inputs to the loss and to scalars to log.
+            inputs: tensors, tensors by name, or None.
+            max_grad_norm: largest norm of the gradient; None: no limit.
+        """
+        groups = optimizer.param_groups
+        parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
+        scalars, gradients = self._gradients_of(loss_of, parameters, *inputs, precision=self.precision)
+        for parameter, gradient in zip(parameters, gradients, strict=True):
+            parameter.grad = gradient
+        if max_grad_norm is not None:
+            nn.utils.clip_grad_norm_(parameters, max_grad_norm)
+        optimizer.step()
+        return scalars
 
 
 def gradients_of(

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from hpamdp.policies.shared.gradients import Gradients, Inputs, LossFunction, gradients_of, step_down
+from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -39,8 +39,7 @@ class OnPolicy(nn.Module):
         self.clip = clip
         self.max_grad_norm = max_grad_norm
         self.waiting: list[TensorDict] = []
-        self._gradients_of: Gradients = gradients_of
-        self._precision = torch.float32
+        self.descent = Descent()
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizer, for the checkpoint."""
@@ -97,16 +96,5 @@ class OnPolicy(nn.Module):
         return torch.minimum(ratio * advantage, clipped_ratio * advantage)
 
     def minimise(self, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
-        """Take one step of the optimizer on a loss, with the gradient scaled down to `max_grad_norm`; see `step_down`.
-
-        Returns:
-            The scalars of the loss.
-        """
-        return step_down(
-            self.optimizer,
-            loss_of,
-            *inputs,
-            max_grad_norm=self.max_grad_norm,
-            gradients_of=self._gradients_of,
-            precision=self._precision,
-        )
+        """Take one step of the optimizer down the gradient of a loss, see `Descent.step`; return its scalars."""
+        return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=self.max_grad_norm)

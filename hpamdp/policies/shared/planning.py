@@ -182,6 +182,10 @@ class SequenceSearch:
             is_allowed &= is_step_allowed.repeat_interleave(self.num_sequences // step.discrete.shape[1], 1)
         return is_allowed
 
+    def samples_of_a_sequence(self, is_greedy: bool) -> int:
+        """Return how many samples of the parameters each sequence has in an iteration."""
+        return self.greedy_samples if is_greedy else self.num_samples
+
     def __call__(
         self,
         returns: Returns,
@@ -203,7 +207,7 @@ class SequenceSearch:
                 what is refined; None: `returns`.
             is_greedy: whether to try `greedy_samples` of the parameters.
         """
-        num_samples = self.greedy_samples if is_greedy else self.num_samples
+        num_samples = self.samples_of_a_sequence(is_greedy)
         has_slot = self.has_slot.to(device)
         steps = []
         for number in self.sequences(num_states, device, allowed):

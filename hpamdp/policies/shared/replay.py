@@ -13,7 +13,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.policies.base import Learner
 from hpamdp.policies.shared.frame import RandomSymmetry
-from hpamdp.policies.shared.gradients import Inputs, LossFunction, compiled, gradients_of, step_down
+from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -74,8 +74,7 @@ class ReplayLearner(Learner):
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
-        self._gradients_of = gradients_of
-        self._precision = torch.float32
+        self.descent = Descent()
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizers and the replay buffer."""
@@ -99,11 +98,11 @@ class ReplayLearner(Learner):
 
     def compile_updates(self) -> None:
         """Compile what `minimise` does but for the optimizer's step, each loss at the first update that needs it."""
-        self._gradients_of = compiled(any_size=False)
+        self.descent.compile(any_size=False)
 
     def lower_precision(self) -> None:
         """Have the matrix products of what `minimise` does in bfloat16."""
-        self._precision = torch.bfloat16
+        self.descent.lower_precision()
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Store the transitions in `mask`."""
@@ -218,15 +217,8 @@ class ReplayLearner(Learner):
     def minimise(
         self, name: str, loss_of: LossFunction, *inputs: Inputs, max_grad_norm: float | None = None
     ) -> dict[str, Tensor]:
-        """Take one step of the named optimizer down the gradient of a loss, see `step_down`; return its scalars."""
-        return step_down(
-            self.optimizers[name],
-            loss_of,
-            *inputs,
-            max_grad_norm=max_grad_norm,
-            gradients_of=self._gradients_of,
-            precision=self._precision,
-        )
+        """Take one step of the named optimizer down the gradient of a loss, see `Descent.step`; return its scalars."""
+        return self.descent.step(self.optimizers[name], loss_of, *inputs, max_grad_norm=max_grad_norm)
 
 
 def set_learning_rates(
