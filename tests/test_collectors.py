@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 
 import pytest
 import torch
@@ -16,7 +16,7 @@ from conftest import CONF, OF_EACH_KIND, TRAINED, compose_config, make_config
 from hpamdp.config import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
-from hpamdp.run.collection.worker import EnvShard, PolicyCopy, packed
+from hpamdp.run.collection.worker import EnvShard, PolicyCopy, packed, unpack
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
@@ -120,10 +120,7 @@ def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
 
 @pytest.mark.parametrize(
     "low",
-    [
-        pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow])
-        for low in TRAINED
-    ],
+    [pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow]) for low in TRAINED],
 )
 def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
     warmup = ["low.warmup_frames=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
@@ -175,6 +172,33 @@ def test_a_collection_goes_on_where_another_one_stood(workers, tmp_path):
     single.set_state(state)
     expected, batch = collection.next(), single.next()
     torch.testing.assert_close(batch["observation"][:, 0], expected["observation"][:, 0])
+
+
+def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(tmp_path):
+    words = ["high=uniform", "collector=multi", "collector.num_workers=1", "collector.ahead=true"]
+    (parts, collection), (others, other) = make(tmp_path, *words), make(tmp_path, *words)
+    with closing(collection), closing(other):
+        last = collection.next()
+        before = packed(parts.policy)
+        as_given = last.clone()
+        assert parts.agent.learn(last)
+        state = collection.state()
+        (theirs,) = collection._call("policy.policy.state_dict")
+        unpack(others.policy, before)
+        assert_same_state(others.policy.state_dict(), theirs)
+        assert (last == as_given).all(), "the next batch is written elsewhere"
+
+        unpack(others.policy, packed(parts.policy))
+        other.set_state(state)
+        for _ in range(2):
+            batch, same = collection.next(), other.next()
+            for name in ("observation", ("action", "parameters")):
+                assert torch.equal(batch[name], same[name])
+            is_on = ~last["next", "done"][:, -1, 0]
+            assert torch.equal(last["next", "observation"][:, -1][is_on], batch["observation"][:, 0][is_on])
+            last = batch
+        collection.state()
+        assert_same_state(parts.policy.state_dict(), *collection._call("policy.policy.state_dict"))
 
 
 def test_the_state_of_another_number_of_environments_is_refused(workers, tmp_path):

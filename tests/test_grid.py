@@ -132,10 +132,7 @@ def test_learners_work_for_each_option_and_shared(sharing, tmp_path):
 # Quick: each selector, and a learner of each kind.
 RELOADED = [
     *((high, "hppo" if high == "value" else "random") for high in choices("high")),
-    *(
-        pytest.param("uniform", low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow])
-        for low in TRAINED
-    ),
+    *(pytest.param("uniform", low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow]) for low in TRAINED),
 ]
 
 

@@ -39,14 +39,12 @@ from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.policies.shared.portable import portable_actor
 from hpamdp.specs import PAMDPSpecs
 
-# The policy also writes what the ratios need: the raw sample of the parameters and the log-likelihoods.
+# The policy also writes what the ratios need: the raw sample of the parameters.
 RAW = "raw_parameters"
-DISCRETE_LOG_PROB = "discrete_log_prob"
-PARAMETER_LOG_PROB = "parameter_log_prob"
 
 
 class HPPOPolicy(TensorDictModuleBase):
-    """Samples the action from the actor, or takes the most probable one when greedy; records its likelihood.
+    """Samples the action from the actor, or takes the most probable one when greedy.
 
     With `samples_when_greedy`, greedy discrete actions are sampled as well, and only their parameters are the means.
     """
@@ -54,14 +52,14 @@ class HPPOPolicy(TensorDictModuleBase):
     def __init__(self, actor: HybridActor, specs: PAMDPSpecs, samples_when_greedy: bool = False) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW, DISCRETE_LOG_PROB, PARAMETER_LOG_PROB]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW]
         self.actor = actor
         self.specs = specs
         self.samples_when_greedy = samples_when_greedy
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the discrete action `[*B]`, the parameters `[*B, num_parameters]` and what their ratios need."""
+        """Write the discrete action `[*B]`, the parameters and their raw sample, `[*B, num_parameters]` each."""
         observation = td.get(keys.OBSERVATION)
         allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(observation, allowed)
@@ -71,16 +69,8 @@ class HPPOPolicy(TensorDictModuleBase):
             discrete, raw = distribution.sample_discrete()
         else:
             discrete, raw = distribution.mode()
-        discrete_log_prob, parameter_log_prob = distribution.log_prob(discrete, raw)
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
-        return td.update(
-            {
-                RAW: raw,
-                DISCRETE_LOG_PROB: discrete_log_prob,
-                PARAMETER_LOG_PROB: parameter_log_prob,
-                keys.ACTION: {"discrete": discrete, "parameters": parameters},
-            }
-        )
+        return td.update({RAW: raw, keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
 
 class HPPO(OnPolicy, Learner):
@@ -205,7 +195,13 @@ class HPPO(OnPolicy, Learner):
         next_value = torch.zeros_like(value)
         reward = torch.zeros_like(value)
         value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
-        next_value[mask] = self.critic(batch.get(("next", keys.OBSERVATION))[mask])
+        # The next state is that of the next row; but for the last row, and for the last state of a truncated episode.
+        next_value[..., :-1, :] = value[..., 1:, :]
+        done, terminated = (batch.get(("next", key)).squeeze(-1) for key in (keys.DONE, keys.TERMINATED))
+        is_another = done.clone()
+        is_another[..., -1] = True
+        is_another &= mask & ~terminated
+        next_value[is_another] = self.critic(batch.get(("next", keys.OBSERVATION))[is_another])
         reward[mask] = batch.get(("next", keys.REWARD))[mask]
         return value, next_value, reward
 
@@ -222,30 +218,38 @@ class HPPO(OnPolicy, Learner):
         return self.following.value(observation, option.flatten(), *masks).reshape(*option.shape, 1)
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
-        """Return what an update needs of the rows in `mask`, `[N]`."""
+        """Return what an update needs of the rows in `mask`, `[N]`.
+
+        Ratios are to the policy that the update begins with. With collectors that work ahead, it is not quite the one
+        that acted, to which ratios would be clipped before anything was learned: Hilton, Cobbe and Schulman 2021,
+        arXiv 2110.00641, section 3.
+        """
         advantage, target = self.advantages(batch, mask)
-        masks = {keys.ACTION_MASK: batch.get(keys.ACTION_MASK)[mask]} if self.specs.has_action_mask else {}
-        return TensorDict(
-            {
-                **masks,
-                keys.OBSERVATION: batch.get(keys.OBSERVATION)[mask],
-                "discrete": batch.get(keys.DISCRETE)[mask],
-                RAW: batch.get(RAW)[mask],
-                DISCRETE_LOG_PROB: batch.get(DISCRETE_LOG_PROB)[mask],
-                PARAMETER_LOG_PROB: batch.get(PARAMETER_LOG_PROB)[mask],
-                "advantage": advantage[mask],
-                "target": target[mask],
-            },
-            batch_size=[int(mask.sum())],
-        )
+        rows = {
+            keys.OBSERVATION: batch.get(keys.OBSERVATION)[mask],
+            "discrete": batch.get(keys.DISCRETE)[mask],
+            RAW: batch.get(RAW)[mask],
+            "advantage": advantage[mask],
+            "target": target[mask],
+        }
+        if self.specs.has_action_mask:
+            rows[keys.ACTION_MASK] = batch.get(keys.ACTION_MASK)[mask]
+        with torch.no_grad():
+            log_probs = self._distribution(rows).log_prob(rows["discrete"], rows[RAW])
+        rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
+        return TensorDict(rows, batch_size=[int(mask.sum())])
+
+    def _distribution(self, rows: Mapping[str, Tensor]) -> HybridDistribution:
+        allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
+        distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION], allowed)
+        return distribution
 
     def _loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of actors and critic on a minibatch `[B]`, and scalars to log."""
-        allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
-        distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION], allowed)
+        distribution = self._distribution(rows)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
-        discrete_log_ratio = discrete_log_prob - rows[DISCRETE_LOG_PROB]
-        parameter_log_ratio = parameter_log_prob - rows[PARAMETER_LOG_PROB]
+        discrete_log_ratio = discrete_log_prob - rows["discrete_log_prob"]
+        parameter_log_ratio = parameter_log_prob - rows["parameter_log_prob"]
         discrete_gain = self.surrogate(discrete_log_ratio, rows["advantage"])
         parameter_gain = self.surrogate(parameter_log_ratio, rows["advantage"])
         gain = (discrete_gain + parameter_gain).mean()

@@ -21,8 +21,8 @@ _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an e
 class MultiCollection(WorkerCollection):
     """Steps the environments in processes of TorchRL's MultiSyncCollector, which write into shared memory."""
 
-    def __init__(self, config: Config, parts: Parts, frames: int, *, num_workers: PositiveInt) -> None:
-        super().__init__(config, parts, frames, num_workers)
+    def __init__(self, config: Config, parts: Parts, frames: int, *, num_workers: PositiveInt, ahead: bool) -> None:
+        super().__init__(config, parts, frames, num_workers, ahead=ahead)
 
     def _death(self) -> str | None:
         workers = self._collector.procs

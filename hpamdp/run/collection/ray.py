@@ -32,10 +32,11 @@ class RayCollection(WorkerCollection):
         frames: int,
         *,
         num_workers: PositiveInt,
+        ahead: bool,
         address: str | None = None,
     ) -> None:
         self.address = address
-        super().__init__(config, parts, frames, num_workers)
+        super().__init__(config, parts, frames, num_workers, ahead=ahead)
 
     def _start(self, shares: Sequence[EnvShard], config: Config) -> RayCollector:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")

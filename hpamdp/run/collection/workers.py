@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
+from hpamdp import keys
 from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection, WorkerDiedError
@@ -22,12 +24,20 @@ class WorkerCollection(Collection):
 
     Environment `i` has the same episodes as in a single process; only exploration uses other random numbers, one
     stream for each worker. Before each batch, all workers get the policy's weights and buffers; they wait for one
-    another and for the learner. A subclass starts TorchRL's collector in `_start`.
+    another and for the learner.
+
+    With `ahead`, workers begin the next batch as soon as one is handed out, by the policy from before anything was
+    learned from that one. What is collected does not depend on how long either takes. A batch that is on its way when
+    the run is saved is saved with it.
+
+    A subclass starts TorchRL's collector in `_start`.
     """
 
     has_workers: ClassVar[bool] = True
 
-    def __init__(self, config: Config, parts: Parts, frames: int, num_workers: int) -> None:
+    def __init__(self, config: Config, parts: Parts, frames: int, num_workers: int, *, ahead: bool) -> None:
+        self._ahead = ahead
+        self._coming: Future[TensorDictBase] | None = None
         self._policy = parts.policy
         self._device = parts.device
         self._keeps_episodes = parts.env.keeps_episodes
@@ -54,6 +64,7 @@ class WorkerCollection(Collection):
             self.close()
             raise
         self._batches = iter(self._collector)
+        self._thread = ThreadPoolExecutor(max_workers=1)
         self._is_idle = True
 
     def _start(self, shares: Sequence[EnvShard], config: Config) -> Any:
@@ -61,15 +72,15 @@ class WorkerCollection(Collection):
         raise NotImplementedError
 
     def next(self) -> TensorDictBase:
-        """Send the policy's state, then collect a batch.
+        """Send the policy's state, then collect a batch; with `ahead`, hand out the one on its way and begin another.
 
         Raises:
             WorkerDiedError: a worker died.
         """
         self._is_idle = False
+        policy = packed(self._policy)
         try:
-            self.cpu_s = sum(self._call("policy.receive", packed(self._policy)))
-            batch = self._joined(next(self._batches))
+            batch = self._collect(policy) if self._coming is None else self._coming.result()
         except Exception as error:
             # TorchRL ends the other workers by a signal that they block, and then complains of these.
             death = self._death()
@@ -77,7 +88,15 @@ class WorkerCollection(Collection):
                 raise
             raise WorkerDiedError(death) from error
         self._is_idle = True
+        self._coming = None
+        if self._ahead:
+            batch = batch.clone()  # the workers write the next one to the same place
+            self._coming = self._thread.submit(self._collect, policy)
         return batch.to(self._device)
+
+    def _collect(self, policy: bytes) -> TensorDictBase:
+        self.cpu_s = sum(self._call("policy.receive", policy))
+        return self._joined(next(self._batches))
 
     def _joined(self, batch: TensorDictBase) -> TensorDictBase:
         """Return what TorchRL's collector gave as `[num_envs, steps_per_batch]`."""
@@ -94,13 +113,17 @@ class WorkerCollection(Collection):
     def state(self) -> dict[str, Any]:
         """Return the workers' states side by side; if one failed, the last ones that are known.
 
-        `generators` holds the state of each worker's random generator.
+        `generators` holds the state of each worker's random generator, `coming` the batch that is handed out next, if
+        it has been collected.
         """
-        if self._is_idle:
+        is_known = self._is_idle and (self._coming is None or self._coming.exception() is None)
+        if is_known:
             self._state = {"env": _side_by_side(self._call("env.env_state"))}
             if self._keeps_episodes:
                 self._state["root"] = _side_by_side([_without_ids(root) for root in self._call("_carrier.to_dict")])
             self._state["generators"] = self._call("policy.generator_state")
+            if self._coming is not None:
+                self._state["coming"] = self._coming.result().clone().to_dict()
         return self._state
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -113,6 +136,10 @@ class WorkerCollection(Collection):
             self._send("env.set_env_state", state["env"])
         if "root" in state and self._keeps_episodes:
             self._send("_carrier.update", state["root"])
+        if "coming" in state:
+            self._coming = Future()
+            shape = state["coming"]["next"][keys.DONE].shape
+            self._coming.set_result(TensorDict(state["coming"], batch_size=shape[:-1]))
         generators = state.get("generators", [])
         if len(generators) == self._collector.num_workers:
             self._collector.map_fn("policy.set_generator_state", [(generator,) for generator in generators])
@@ -125,6 +152,7 @@ class WorkerCollection(Collection):
     def close(self) -> None:
         """End the workers."""
         if self._collector is not None:
+            self._thread.shutdown()  # after the batch that is on its way
             self._collector.shutdown()
             self._collector = None
 
