@@ -17,7 +17,7 @@ class Collection:
 
     A subclass's `__init__` takes any of `config`, `parts` and `frames` (steps so far) and its options as keyword
     arguments, which are the schema of its yaml. Every collection gives batches of the same keys and shape, with the
-    environments in the same order, from the current policy.
+    environments in the same order, from the current policy, or from that of the batch before if it collects ahead.
     """
 
     package: ClassVar[str | None] = None  # an optional package that it needs; also the name of the extra
