@@ -214,3 +214,19 @@ def test_few_steps_keeps_runs_that_were_left_running_apart(tmp_path):
     assert len(gathered["long"]) == 3 and gathered["augment"] == []
     last = study("few_steps").long_table(gathered["long"]).splitlines()[-1]
     assert last == "| congruent | 1 | 1.500 | 2.500 | 1 s |"
+
+
+def test_domains_scores_each_learner_by_its_longest_runs_and_finds_the_steps_to_the_best_published_score():
+    domains = study("domains")
+
+    def run(frames, seed, *success):
+        name = {"domain": "catch_point", "learner": "hyar", "frames": frames, "seed": seed}
+        return [name | {"at_frames": 1000 * i, "score": 9.0, "success": value} for i, value in enumerate(success)]
+
+    curves = run(2000, 0, 0.1, 0.95, 0.5) + run(2000, 1, 0.1, 0.2, 0.9) + run(1000, 0, 0.1, 0.3)
+    published = [{"domain": "catch_point", "score": score} for score in (0.9, 0.94)]
+    assert domains.steps_table(curves, published).splitlines()[-1] == (
+        "| catch_point | hyar | 0.94 | 1,000, never, never | 100,000 |"
+    )
+    too_many = run(2_000_000, 0, 1.0)
+    assert domains.at_published_steps(curves + too_many) == curves[:6]
