@@ -24,7 +24,7 @@ OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
     linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0,
     warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
-    posterior_sampling=True, optimism=0.0, parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
+    posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 
@@ -466,14 +466,15 @@ def test_exploring_plans_with_the_environments_own_member_greedy_ones_and_withou
     assert torch.equal(asked[0], member) and asked[1:] == [None, None]
 
 
-def test_exploring_plans_by_all_members_count_their_disagreement_greedy_ones_do_not():
-    learner = with_opinions(make(num_members=3, optimism=2.0), [1.0, 2.0, 6.0])
+def test_plans_by_all_members_count_their_disagreement_for_what_is_explored_and_against_greedy_plans():
+    learner = with_opinions(make(num_members=3, optimism=2.0, caution=0.5), [1.0, 2.0, 6.0])
     state, two_steps = torch.randn(6, 4), 1.0 + learner.gamma
     deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
     explored = learner.policy.plan(state).value
     torch.testing.assert_close(explored, two_steps * (3.0 + 2.0 * deviation).expand(6), atol=1e-3, rtol=0.0)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        torch.testing.assert_close(learner.policy.plan(state).value, torch.full((6,), 3.0 * two_steps))
+        greedy = learner.policy.plan(state).value
+    torch.testing.assert_close(greedy, two_steps * (3.0 - 0.5 * deviation).expand(6), atol=1e-3, rtol=0.0)
 
 
 def test_one_member_can_plan_without_posterior_sampling():

@@ -395,6 +395,7 @@ class PETSPolicy(TensorDictModuleBase):
         noise: float,
         samples_posterior: bool,
         optimism: float,
+        caution: float,
         precision: str,
     ) -> None:
         super().__init__()
@@ -408,6 +409,7 @@ class PETSPolicy(TensorDictModuleBase):
         self.noise = noise
         self.samples_posterior = samples_posterior
         self.optimism = optimism
+        self.caution = caution
         self.precision: torch.dtype = getattr(torch, precision)
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
@@ -455,7 +457,7 @@ class PETSPolicy(TensorDictModuleBase):
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
 
-        Greedily that is by the mean of all members; exploring by posterior sampling, by a random member for each
+        Greedily that is by the mean of all members, and `caution`; exploring by posterior sampling, by a random member for each
         observation, or else by the mean and `optimism`, so that what members disagree on is tried. As long as nothing
         is planned, it is 0, and exploring infinite.
         """
@@ -556,9 +558,8 @@ class PETSPolicy(TensorDictModuleBase):
             total = discounted_return(predictions(), self.gamma)
             if not is_mean:
                 return total.flatten(0, 1)
-            if is_greedy():
-                return total.mean(0)
-            return total.mean(0) + self.optimism * total.std(0, correction=0)
+            weight = -self.caution if is_greedy() else self.optimism
+            return total.mean(0) if weight == 0.0 else total.mean(0) + weight * total.std(0, correction=0)
 
         return returns
 
@@ -612,6 +613,7 @@ class PETS(ReplayLearner):
         buffer_size: PositiveInt,
         posterior_sampling: Literal["auto"] | bool,
         optimism: NonNegativeFloat,
+        caution: NonNegativeFloat,
         parameter_noise: NonNegativeFloat,
         gamma: PositiveFraction,
         horizon: PositiveInt,
@@ -674,6 +676,7 @@ class PETS(ReplayLearner):
             noise=parameter_noise,
             samples_posterior=self.model.frame.turns if posterior_sampling == "auto" else posterior_sampling,
             optimism=optimism,
+            caution=caution,
             precision=planning_precision,
         )
         self.to(device)
