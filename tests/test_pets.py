@@ -24,7 +24,8 @@ OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
     linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0,
     warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
-    posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, gamma=0.97, planning_precision="float32", **SEARCH,
+    posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, gamma=0.97,
+    planning_precision="float32", **SEARCH,
 )  # fmt: skip
 
 

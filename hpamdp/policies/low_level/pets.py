@@ -457,9 +457,9 @@ class PETSPolicy(TensorDictModuleBase):
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
 
-        Greedily that is by the mean of all members, and `caution`; exploring by posterior sampling, by a random member for each
-        observation, or else by the mean and `optimism`, so that what members disagree on is tried. As long as nothing
-        is planned, it is 0, and exploring infinite.
+        Greedily that is by the mean of all members, and `caution`; exploring by posterior sampling, by a random member
+        for each observation, or else by the mean and `optimism`, so that what members disagree on is tried. As long as
+        nothing is planned, it is 0, and exploring infinite.
         """
         num = len(observation)
         if not bool(self.is_trained):
