@@ -220,8 +220,8 @@ class HPPO(OnPolicy, Learner):
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what an update needs of the rows in `mask`, `[N]`.
 
-        Ratios are to the policy that the update begins with. Where the collector works ahead, an older one has acted, and
-        ratios to that one would be clipped before anything was learned: Hilton, Cobbe and Schulman 2021, arXiv
+        Ratios are to the policy that the update begins with. Where the collector works ahead, an older one has acted,
+        and ratios to that one would be clipped before anything was learned: Hilton, Cobbe and Schulman 2021, arXiv
         2110.00641, section 3.
         """
         advantage, target = self.advantages(batch, mask)
