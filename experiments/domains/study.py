@@ -25,6 +25,7 @@ from hpamdp.analysis.study import (
     curve,
     difference,
     finished,
+    first_at,
     groups,
     interquartile_mean,
     read_csv,
@@ -51,6 +52,7 @@ DOMAINS = {
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_COMPARED = 3  # of both learners, for a probability of improvement
 CPU_LIMIT = 600.0  # seconds, of the second table
+AUGMENTED = "_augment"  # follows a learner's name where steps are mapped by symmetries that the problem declares
 KEY = ("domain", "learner", "frames", "seed")
 
 
@@ -81,7 +83,7 @@ def domain(run: Run) -> str:
 def learner(run: Run) -> str:
     """Return the learner's name; the forms of P-DQN and PADDPG that have names of their own go by those.
 
-    Where steps are mapped by symmetries that the problem declares, `_augment` follows.
+    `AUGMENTED` may follow.
     """
     name = str(run.summary["low"])
     low = run.config.low
@@ -89,7 +91,7 @@ def learner(run: Run) -> str:
         return "patd3"
     if name == "pdqn_published" and low.multipass:
         return "mpdqn_published"
-    return f"{name}_augment" if low.get("augment", False) is True else name
+    return f"{name}{AUGMENTED}" if low.get("augment", False) is True else name
 
 
 def merged(stored: Rows, new: Rows) -> Rows:
@@ -132,7 +134,8 @@ def _longest(results: Rows, is_allowed: Callable[[Rows], bool]) -> Rows:
 
 def table(results: Rows, published: Rows) -> str:
     """Return a line for each learner, a column for each domain: its scores over seeds; then the published scores."""
-    learners = [name for name in LEARNER_COLOURS if any(row["learner"] == name for row in results)]
+    names = [f"{name}{form}" for form in ("", AUGMENTED) for name in LEARNER_COLOURS]
+    learners = [name for name in names if any(row["learner"] == name for row in results)]
     lines = [
         "| | " + " | ".join(DOMAINS) + " |",
         "|---|" + "---|" * len(DOMAINS),
@@ -178,8 +181,7 @@ def best_table(results: Rows, published: Rows) -> str:
             second = ranked[1][0][0]
             if min(len(rows), len(ranked[1][1])) >= MIN_SEEDS_COMPARED:
                 improvement = f"{difference(_values(rows), _values(ranked[1][1])).improvement:.2f}"
-        others = [row for row in published if row["domain"] == name]
-        top = max(others, key=lambda row: row["score"], default=None)
+        top = best_published(published, name)
         beside = f"{top['score']:g} ({top['method']})" if top else ""
         unit = "return" if what == "score" else "success"
         cpu = f"{np.mean([row['cpu_s'] for row in rows]):.0f} s"
@@ -205,19 +207,21 @@ def steps_table(curves: Rows, published: Rows) -> str:
         "|---|---|---|---|---|",
     ]
     for (name, low), rows in groups(curves, "domain", "learner").items():
-        scores = [row["score"] for row in published if row["domain"] == name]
-        if not scores:
+        published_steps, what = DOMAINS[name]
+        best = best_published(published, name)
+        if best is None:
             continue
-        steps = [_first_at(run, max(scores)) for run in groups(rows, "frames", "seed").values()]
-        if np.isfinite(steps).any():
-            words = ", ".join(f"{each:,.0f}" if np.isfinite(each) else "never" for each in sorted(steps))
-            lines.append(f"| {name} | {low} | {max(scores):g} | {words} | {DOMAINS[name][0] / 10:,.0f} |")
+        reached = [first_at(run, what, best["score"]) for run in groups(rows, "frames", "seed").values()]
+        steps = sorted(row["at_frames"] for row in reached if row is not None)
+        if steps:
+            words = ", ".join([f"{each:,.0f}" for each in steps] + ["never"] * (len(reached) - len(steps)))
+            lines.append(f"| {name} | {low} | {best['score']:g} | {words} | {published_steps / 10:,.0f} |")
     return "\n".join(lines)
 
 
-def _first_at(run: Rows, score: float) -> float:
-    """Return a run's steps at its first evaluation with this score or more, infinity if there is none."""
-    return min((row["at_frames"] for row in run if _values([row])[0] >= score), default=float("inf"))
+def best_published(published: Rows, name: str) -> dict[str, Any] | None:
+    """Return the row of the best score that was published on a domain, None if there is none."""
+    return max((row for row in published if row["domain"] == name), key=lambda row: row["score"], default=None)
 
 
 def draw(curves: Rows, published: Rows, path: Path) -> None:
@@ -239,11 +243,12 @@ def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
     for (low,), rows in groups(curves, "learner").items():
         longest = max(row["frames"] for row in rows)
         at, mean, deviation = curve([row for row in rows if row["frames"] == longest], "at_frames", what)
-        axes.plot(at, mean, color=LEARNER_COLOURS[low], linewidth=1.6, label=low)
-        axes.fill_between(at, mean - deviation, mean + deviation, color=LEARNER_COLOURS[low], alpha=0.18, lw=0)
-    scores = [row["score"] for row in published if row["domain"] == name]
-    if scores:
-        axes.axhline(max(scores), color="#2b2b2b", linestyle="--", linewidth=1.0, label="best published")
+        colour, line = LEARNER_COLOURS[low.removesuffix(AUGMENTED)], ":" if low.endswith(AUGMENTED) else "-"
+        axes.plot(at, mean, color=colour, linestyle=line, linewidth=1.6, label=low)
+        axes.fill_between(at, mean - deviation, mean + deviation, color=colour, alpha=0.18, lw=0)
+    best = best_published(published, name)
+    if best is not None:
+        axes.axhline(best["score"], color="#2b2b2b", linestyle="--", linewidth=1.0, label="best published")
     axes.set_title(name, loc="left", fontweight="bold", fontsize=10)
     axes.set_xlabel("steps")
     axes.set_ylabel("mean return, greedy" if what == "score" else "share of successes, greedy")

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hpamdp.analysis.study import Rows, Run, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import Rows, Run, finished, first_at, groups, read_csv, spread, write_tables
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import BEST_PERSON, HUMAN
 
@@ -57,7 +57,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
         evaluations = [{short: round(row[column], 4) for column, short in COLUMNS.items()} for row in run.evaluations()]
         name = {"augment": str(run.config.low.augment), "seed": run.summary["seed"]}
         if run.summary["low"] != "pets":
-            presses = first_at(evaluations, HUMAN_SCORE)
+            presses = presses_to(HUMAN_SCORE, evaluations)
             augment.append(
                 {"learner": run.summary["low"], **name, "presses": presses, "cpu_s": round(run.summary["cpu_s"], 1)}
             )
@@ -81,9 +81,10 @@ def variant(run: Run) -> str:
     return " ".join(f"{name}={value}" for name, value in values.items() if value not in ABLATED[name])
 
 
-def first_at(rows: Rows, score: float) -> float:
+def presses_to(score: float, evaluations: Rows) -> float:
     """Return a run's presses at its first evaluation with this score or more, infinity if there is none."""
-    return next((row["presses"] for row in rows if row["score"] >= score), float("inf"))
+    reached = first_at(evaluations, "score", score)
+    return float("inf") if reached is None else reached["presses"]
 
 
 def _presses(counts: Sequence[float], statistic: str) -> str:
@@ -127,8 +128,8 @@ def _head(first: str) -> list[str]:
 def _figures(rows: Rows) -> str:
     """Return the number of runs, their presses to people's scores, and their scores after 256 and 384 presses."""
     runs = list(groups(rows, "seed").values())
-    human = [first_at(run, HUMAN_SCORE) for run in runs]
-    best = [first_at(run, BEST_SCORE) for run in runs]
+    human = [presses_to(HUMAN_SCORE, run) for run in runs]
+    best = [presses_to(BEST_SCORE, run) for run in runs]
     after = [[row["score"] for row in rows if row["presses"] == presses] for presses in (256, 384)]
     scores = " | ".join(spread(score) if len(score) == len(runs) else "" for score in after)
     return (

@@ -17,7 +17,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    curve,
+    difference,
+    finished,
+    first_at,
+    groups,
+    read_csv,
+    spread,
+    write_tables,
+)
 from hpamdp.analysis.style import LEARNER_COLOURS
 from hpamdp.env.boatdock.reference import HUMAN
 
@@ -44,7 +55,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
             "reward": "sparse" if run.config.env.get("reward") == "sparse" else "shaped",
             "seed": summary["seed"],
         }
-        reached = _first_at_human_score(evaluations)
+        reached = first_at(evaluations, "eval/score", HUMAN["chosen"]["score"])
         results.append(
             {
                 **name,
@@ -62,11 +73,6 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
         for row in evaluations:
             curves.append({**name, **{column: round(row[column], 4) for column in CURVE_COLUMNS}})
     return results, curves
-
-
-def _first_at_human_score(evaluations: Rows) -> dict[str, Any] | None:
-    """Return a run's first evaluation at the mean human score or above."""
-    return next((row for row in evaluations if row["eval/score"] >= HUMAN["chosen"]["score"]), None)
 
 
 def _name(run: Run) -> str:

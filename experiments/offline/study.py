@@ -15,7 +15,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups, read_csv, spread, write_tables
+from hpamdp.analysis.study import (
+    Rows,
+    Run,
+    curve,
+    difference,
+    finished,
+    first_at,
+    groups,
+    read_csv,
+    spread,
+    write_tables,
+)
 from hpamdp.env.boatdock.reference import HUMAN
 
 HERE = Path(__file__).resolve().parent
@@ -51,14 +62,14 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
             "episodes": episodes,
             "seed": summary["seed"],
         }
-        reached = [row["frames"] for row in evaluations if row["eval/score"] >= HUMAN_SCORE]
+        reached = first_at(evaluations, "eval/score", HUMAN_SCORE)
         results.append(
             {
                 **name,
                 "score": round(summary["score"], 4),
                 **{outcome: round(summary[outcome], 4) for outcome in OUTCOMES},
                 "presses": round(summary["steps"], 4),
-                "frames_to_human": reached[0] if reached else "",
+                "frames_to_human": "" if reached is None else reached["frames"],
                 "cpu_s": round(summary["cpu_s"], 1),
             }
         )

@@ -92,6 +92,11 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
     return dict(found)
 
 
+def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:
+    """Return the first row, such as a run's evaluation, with `level` or more in a column; None if there is none."""
+    return next((row for row in rows if row[column] >= level), None)
+
+
 def spread(values: Sequence[float], digits: int = 3) -> str:
     """Return mean ± standard deviation (of a sample, n - 1) over seeds, or the one value."""
     mean = f"{np.mean(values):.{digits}f}"

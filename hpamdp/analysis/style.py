@@ -22,8 +22,6 @@ LEARNER_COLOURS = {
     "mpdqn_published": "#882255",
     "pdqn_published": "#117733",
     "pets": "#AA4499",
-    "hyar_augment": "#E07BB0",
-    "pdqn_augment": "#44AA99",
 }
 
 # Label, colour and line style of each reference.
