@@ -59,10 +59,10 @@ def one_step_rows(learner: HPPO, num: int) -> TensorDict:
     return td
 
 
-def random_rows(learner: HPPO, num: int, steps: int) -> TensorDict:
-    """Return random transitions `[num, steps]` with actions of the policy."""
+def random_rows(learner: HPPO, num: int, steps: int, done: torch.Tensor | None = None) -> TensorDict:
+    """Return random transitions `[num, steps]` with actions of the policy, and ends where `done` or at random."""
     td = learner.policy(TensorDict({keys.OBSERVATION: torch.randn(num, steps, 4)}, [num, steps]))
-    done = torch.rand(num, steps, 1) < 0.3
+    done = torch.rand(num, steps, 1) < 0.3 if done is None else done
     last, following = torch.randn(num, steps, 4), torch.cat([td[keys.OBSERVATION][:, 1:], torch.randn(num, 1, 4)], 1)
     td["next"] = {
         keys.OBSERVATION: torch.where(done, last, following),
@@ -110,8 +110,12 @@ def test_the_ratios_are_one_before_the_first_update_also_of_what_an_older_policy
     with torch.no_grad():
         for parameter in learner.actor.parameters():
             parameter.add_(0.3 * torch.randn_like(parameter))
-        _, scalars = learner._loss(learner._rows(td, everything(td)), torch.zeros(()))
-    assert max(scalars["discrete_kl"].abs(), scalars["parameter_kl"].abs()) < 1e-6
+    rows = learner._rows(td, everything(td))
+    discrete_log_prob, parameter_log_prob = learner.actor(td[keys.OBSERVATION].flatten(0, 1)).log_prob(
+        td[keys.DISCRETE].flatten(), td[RAW].flatten(0, 1)
+    )
+    torch.testing.assert_close(discrete_log_prob, rows["discrete_log_prob"], atol=1e-5, rtol=0)
+    torch.testing.assert_close(parameter_log_prob, rows["parameter_log_prob"], atol=1e-5, rtol=0)
 
 
 def test_the_surrogate_stops_rewarding_beyond_the_clip():
@@ -122,16 +126,12 @@ def test_the_surrogate_stops_rewarding_beyond_the_clip():
 
 def test_advantages_bootstrap_past_truncation_and_stop_at_every_end():
     learner = make()
-    td = random_rows(learner, 3, 4)
     # Row 0 terminates at its second step, row 1 is truncated there, row 2 goes on. What follows in row 0 is another
     # learner's.
     done = torch.tensor([[0, 1, 0, 0], [0, 1, 0, 0], [0, 0, 0, 0]], dtype=torch.bool).unsqueeze(-1)
-    td["next", keys.DONE] = done
+    td = random_rows(learner, 3, 4, done)
     td["next", keys.TERMINATED] = done.clone()
     td["next", keys.TERMINATED][1:] = False
-    td["next", keys.OBSERVATION][:, :-1] = torch.where(done, torch.randn(3, 4, 4), td[keys.OBSERVATION].roll(-1, 1))[
-        :, :-1
-    ]
     mask = everything(td)
     mask[0, 2:] = False
     advantage, target = learner.advantages(td, mask)

@@ -467,15 +467,23 @@ def test_exploring_plans_with_the_environments_own_member_greedy_ones_and_withou
     assert torch.equal(asked[0], member) and asked[1:] == [None, None]
 
 
-def test_plans_by_all_members_count_their_disagreement_for_what_is_explored_and_against_greedy_plans():
-    learner = with_opinions(make(num_members=3, optimism=2.0, caution=0.5), [1.0, 2.0, 6.0])
+def test_exploring_plans_by_all_members_count_their_disagreement_greedy_ones_do_not():
+    learner = with_opinions(make(num_members=3, optimism=2.0), [1.0, 2.0, 6.0])
     state, two_steps = torch.randn(6, 4), 1.0 + learner.gamma
     deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
     explored = learner.policy.plan(state).value
     torch.testing.assert_close(explored, two_steps * (3.0 + 2.0 * deviation).expand(6), atol=1e-3, rtol=0.0)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        greedy = learner.policy.plan(state).value
-    torch.testing.assert_close(greedy, two_steps * (3.0 - 0.5 * deviation).expand(6), atol=1e-3, rtol=0.0)
+        torch.testing.assert_close(learner.policy.plan(state).value, torch.full((6,), 3.0 * two_steps))
+
+
+def test_cautious_greedy_plans_count_the_disagreement_of_members_against_a_sequence():
+    learner = with_opinions(make(num_members=3, optimism=2.0, caution=0.5), [1.0, 2.0, 6.0])
+    deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        planned = learner.policy.plan(torch.randn(6, 4)).value
+    expected = (1.0 + learner.gamma) * (3.0 - 0.5 * deviation)
+    torch.testing.assert_close(planned, expected.expand(6), atol=1e-3, rtol=0.0)
 
 
 def test_one_member_can_plan_without_posterior_sampling():
