@@ -19,7 +19,7 @@ OPTIONS = dict(
     buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
     augment=False,
     lr_final=1.0, lr_frames=0, policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1,
-    epsilon_final=0.05, epsilon_frames=3000,
+    greedy_samples=0, greedy_noise=0.3, epsilon_final=0.05, epsilon_frames=3000,
 )  # fmt: skip
 
 
@@ -107,6 +107,24 @@ def test_parameters_stay_in_bounds_and_the_greedy_policy_is_deterministic(traine
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         first, second = trained.policy(td.clone()), trained.policy(td.clone())
     assert torch.equal(first[keys.PARAMETERS], second[keys.PARAMETERS]) and not first[LATENT].isnan().any()
+
+
+@pytest.mark.parametrize("discrete", ["greedy", "nearest"])
+def test_the_greedy_policy_takes_the_best_of_the_actors_latent_actions_and_their_variations(discrete):
+    torch.manual_seed(0)
+    learner = make(discrete=discrete, greedy_samples=40, greedy_noise=0.5)
+    td = TensorDict({keys.OBSERVATION: torch.rand(30, 4) * 2 - 1}, [30])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        latent = learner.policy(td.clone())[LATENT]
+    own = learner.actor(td[keys.OBSERVATION], learner.codec.embeddings)
+    with torch.no_grad():
+        tried = [own, *((own + each).clamp(-1.0, 1.0) for each in learner.policy.variations)]
+        values = torch.stack([learner.critics(td[keys.OBSERVATION], each).amin(0).amax(-1) for each in tried])
+        torch.testing.assert_close(
+            learner.critics(td[keys.OBSERVATION], latent.unsqueeze(1)).amin(0)[:, 0], values.amax(0)
+        )
+    assert (values.argmax(0) > 0).float().mean() > 0.6, "an untrained actor is nowhere near the maximum"
+    assert torch.equal(learner.policy.variations[:, :3], torch.zeros(40, 3)), "e says which discrete action it is"
 
 
 def test_the_state_change_is_scaled_by_its_standard_deviation(trained):

@@ -18,7 +18,7 @@ OPTIONS = dict(
     multipass=True, twin_q=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
     n_step=1, bounding="tanh", hidden_dims=[64, 64], warmup_frames=1000, buffer_size=20_000, batch_size=64,
     updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
-    max_grad_norm=None, parameter_noise=0.1, epsilon_final=0.1, epsilon_frames=3000,
+    max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1, epsilon_frames=3000,
     epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0, lr_frames=1000,
 )  # fmt: skip
 PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
@@ -181,8 +181,44 @@ def test_the_greedy_policy_samples_nothing_and_the_exploring_one_varies_the_whol
     assert 0.08 < moved.std() < 0.12
 
 
+@pytest.mark.parametrize("multipass", [True, False])
+def test_the_greedy_policy_takes_the_best_allowed_action_of_the_actor_and_its_variations(multipass):
+    torch.manual_seed(0)
+    learner = make(multipass=multipass, greedy_samples=40, greedy_noise=0.5)
+    td = states(30)
+    td[keys.ACTION_MASK] = torch.tensor([True, True, False]).expand(30, -1)
+    with global_generators_unmoved(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        taken = learner.policy(td.clone())
+    has_varied = 0
+    for i in range(30):
+        state = td[keys.OBSERVATION][i : i + 1]
+        own = learner.actor(state)
+        tried = [own, *((own + each).clamp(-1.0, 1.0) for each in learner.policy.variations)]
+        values = {
+            (number, k): learner.critics(state, unit)[:, 0, k].min().item()
+            for number, unit in enumerate(tried)
+            for k in (0, 1)
+        }
+        number, discrete = max(values, key=values.__getitem__)
+        has_varied += number > 0
+        assert taken[keys.DISCRETE][i] == discrete
+        torch.testing.assert_close(SPECS.to_unit(taken[keys.PARAMETERS][i]), tried[number][0].detach())
+    assert has_varied > 20, "an untrained actor is nowhere near the maximum"
+
+
+def test_variations_of_greedy_parameters_change_neither_exploration_nor_training():
+    ends = []
+    for greedy_samples in (0, 20):
+        torch.manual_seed(0)
+        learner = make(greedy_samples=greedy_samples, warmup_frames=100)
+        learn(learner, 3)
+        ends.append(learner.state_dict())
+    assert ends[0].keys() == ends[1].keys()
+    assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
+
+
 def test_discrete_actions_without_parameters_work():
-    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
+    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100, greedy_samples=3)
     td = learner.policy(states(200))
     assert td[keys.PARAMETERS].shape == (200, 0)
     is_end = torch.ones(200, 1, dtype=torch.bool)

@@ -22,6 +22,7 @@ Differs from the source:
   encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones;
 - the correction compares the error of a stored action with a running mean of the codec's error, over its last hundred
   or so updates, instead of the error of the last update;
+- with `greedy_samples` the greedy policy also values variations of z and takes the best of them all;
 - tanh bounds the actor's output; the published code multiplies the gradient by the range that is left (inverting
   gradients) besides, and clips its norm at 10;
 - exploration is by random actions, ever fewer, and by Gaussian noise of a constant scale; in the published code it is
@@ -48,9 +49,19 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
-from hpamdp.policies.shared.networks import EnsembleMLP, mlp, polyak_update, with_clipped_noise
+from hpamdp.policies.shared.networks import (
+    EnsembleMLP,
+    even_normal,
+    mlp,
+    polyak_update,
+    with_clipped_noise,
+    with_variations,
+)
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
+
+# Latent actions that are valued at once: bounds the memory where there are many discrete actions.
+_MAX_TRIED = 1 << 14
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
 
@@ -191,12 +202,31 @@ class LatentCritics(nn.Module):
 
 
 class HyARPolicy(TensorDictModuleBase):
-    """Takes the best of the actor's proposals, decoded; explores with noise on them and with random actions."""
+    """Takes the best of the actor's proposals, decoded; explores with noise on them and with random actions.
+
+    Args:
+        actor: makes the proposals.
+        critics: value them.
+        codec: decodes them.
+        specs: of the problem.
+        noise: standard deviation of the exploring noise on the proposals.
+        greedy_samples: how many variations of each proposal's z the greedy policy values besides the proposal itself.
+        greedy_noise: standard deviation of these variations.
+    """
 
     epsilon: Tensor
+    variations: Tensor
 
     def __init__(
-        self, actor: LatentActor, critics: LatentCritics, codec: HybridCodec, specs: PAMDPSpecs, noise: float
+        self,
+        actor: LatentActor,
+        critics: LatentCritics,
+        codec: HybridCodec,
+        specs: PAMDPSpecs,
+        *,
+        noise: float,
+        greedy_samples: int,
+        greedy_noise: float,
     ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
@@ -207,6 +237,8 @@ class HyARPolicy(TensorDictModuleBase):
         self.specs = specs
         self.noise = noise
         self.register_buffer("epsilon", torch.ones(()))
+        of_z = even_normal(greedy_samples, codec.latent_dim, greedy_noise)
+        self.register_buffer("variations", F.pad(of_z, (codec.table.shape[-1], 0)), persistent=False)
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -220,6 +252,8 @@ class HyARPolicy(TensorDictModuleBase):
         proposals = self.actor(state, self.codec.embeddings, self.noise if is_exploring else 0.0)
         if not self.actor.is_greedy:
             proposals = self.codec.of_allowed(proposals, allowed)
+        if not is_exploring and len(self.variations) > 0:
+            proposals = self._best_variations(state, proposals)
         latent = proposals[:, 0]
         if proposals.shape[1] > 1:
             best = masked_values(self.critics(state, proposals).amin(0), allowed).argmax(-1)
@@ -234,6 +268,16 @@ class HyARPolicy(TensorDictModuleBase):
         td.set(LATENT, latent.reshape(*td.batch_size, -1))
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+
+    def _best_variations(self, state: Tensor, proposals: Tensor) -> Tensor:
+        """Return of each proposal `[B, K, embedding_dim + latent_dim]` the best among itself and its variations."""
+        best = []
+        num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * (1 + len(self.variations))))
+        for some_states, some_proposals in zip(state.split(num_rows), proposals.split(num_rows), strict=True):
+            tried = with_variations(some_proposals, self.variations)
+            q = self.critics(some_states, tried.flatten(1, 2)).amin(0).unflatten(1, tried.shape[1:3])
+            best.append(tried.take_along_dim(q.argmax(-1)[..., None, None], 2).squeeze(2))
+        return torch.cat(best)
 
     def decode(self, state: Tensor, latent: Tensor, allowed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the discrete action `[B]` and the parameters `[B, num_parameters]` in [-1, 1] of a latent action.
@@ -291,6 +335,8 @@ class HyAR(ReplayLearner):
         target_noise: NonNegativeFloat,
         target_noise_clip: NonNegativeFloat,
         exploration_noise: NonNegativeFloat,
+        greedy_samples: NonNegativeInt,
+        greedy_noise: NonNegativeFloat,
         epsilon_final: Fraction,
         epsilon_frames: NonNegativeInt,
     ) -> None:
@@ -328,7 +374,15 @@ class HyAR(ReplayLearner):
         self.critics = LatentCritics(num_critics, specs.observation_dim, embedding_dim + latent_dim, hidden_dims)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = HyARPolicy(self.actor, self.critics, self.codec, specs, exploration_noise)
+        self.policy = HyARPolicy(
+            self.actor,
+            self.critics,
+            self.codec,
+            specs,
+            noise=exploration_noise,
+            greedy_samples=greedy_samples,
+            greedy_noise=greedy_noise,
+        )
         # The codec's recent mean squared error of the scaled change of the state.
         self.register_buffer("dynamics_error", torch.ones(()))
         self.to(device)

@@ -12,6 +12,8 @@ arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.041
 Differs from the source:
 - one learner with uniform replay and target networks, which move at a rate each, as in Bester et al., instead of
   asynchronous learners;
+- with `greedy_samples` the greedy policy also values variations of x(s) and takes the best of them all: the critics
+  often know better parameters than those that the actor's gradient has led to. It makes no difference in training;
 - where only the chosen action's value matters, only its pass is computed; passes share what they have in common;
 - networks start as PyTorch's, not as Kaiming et al. proposed;
 - by default, that is with `pdqn.yaml`: twin critics, whose minimum is Q everywhere (in the targets, in the actor's loss
@@ -43,9 +45,11 @@ from hpamdp.policies.shared.networks import (
     InitialLayer,
     InitialParameters,
     InvertingGradients,
+    even_normal,
     mlp,
     polyak_update,
     with_clipped_noise,
+    with_variations,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
@@ -70,11 +74,30 @@ class ParameterActor(nn.Module):
 
 
 class PDQNPolicy(TensorDictModuleBase):
-    """Takes the discrete action with the highest Q; explores with random actions and noise on the parameters."""
+    """Takes the discrete action with the highest Q; explores with random actions and noise on the parameters.
+
+    Args:
+        actor: gives the parameters.
+        critics: value them.
+        specs: of the problem.
+        noise: standard deviation of the exploring noise on the parameters in [-1, 1].
+        greedy_samples: how many variations of the parameters the greedy policy values besides the actor's own.
+        greedy_noise: standard deviation of these variations.
+    """
 
     epsilon: Tensor
+    variations: Tensor
 
-    def __init__(self, actor: ParameterActor, critics: HybridCritics, specs: PAMDPSpecs, noise: float) -> None:
+    def __init__(
+        self,
+        actor: ParameterActor,
+        critics: HybridCritics,
+        specs: PAMDPSpecs,
+        *,
+        noise: float,
+        greedy_samples: int,
+        greedy_noise: float,
+    ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
@@ -83,6 +106,8 @@ class PDQNPolicy(TensorDictModuleBase):
         self.specs = specs
         self.noise = noise
         self.register_buffer("epsilon", torch.ones(()))
+        variations = even_normal(greedy_samples, specs.num_parameters, greedy_noise)
+        self.register_buffer("variations", variations, persistent=False)
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
@@ -90,7 +115,10 @@ class PDQNPolicy(TensorDictModuleBase):
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         allowed = allowed_rows(self.specs, td)
         unit = self.actor(state)
-        discrete = masked_values(self.critics(state, unit).amin(0), allowed).argmax(-1)
+        if is_greedy() and len(self.variations) > 0:
+            discrete, unit = self._best_variation(state, unit, allowed)
+        else:
+            discrete = masked_values(self.critics(state, unit).amin(0), allowed).argmax(-1)
         if not is_greedy():
             is_random = torch.rand(discrete.shape, device=discrete.device) < self.epsilon
             noisy = (unit + self.noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
@@ -99,6 +127,16 @@ class PDQNPolicy(TensorDictModuleBase):
             discrete = torch.where(is_random, anything, discrete)
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+
+    def _best_variation(self, state: Tensor, unit: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return the discrete actions `[B]` and the parameters `[B, P]` that are best among x(s) and its variations."""
+        tried = with_variations(unit, self.variations)
+        num_tried = tried.shape[1]
+        q = self.critics(state.repeat_interleave(num_tried, 0), tried.flatten(0, 1)).amin(0)
+        best, place = q.unflatten(0, (-1, num_tried)).max(1)
+        discrete = masked_values(best, allowed).argmax(-1)
+        place = place.gather(-1, discrete.unsqueeze(-1))
+        return discrete, tried.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
 
 
 class PDQN(ReplayLearner):
@@ -137,6 +175,8 @@ class PDQN(ReplayLearner):
         critic_tau: PositiveFraction,
         max_grad_norm: PositiveFloat | None,
         parameter_noise: NonNegativeFloat,
+        greedy_samples: NonNegativeInt,
+        greedy_noise: NonNegativeFloat,
         epsilon_final: Fraction,
         epsilon_frames: NonNegativeInt,
         epsilon_episodes: PositiveInt | None,
@@ -173,7 +213,14 @@ class PDQN(ReplayLearner):
         self.critics = HybridCritics(specs, 2 if twin_q else 1, hidden_dims, multipass)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = PDQNPolicy(self.actor, self.critics, specs, parameter_noise)
+        self.policy = PDQNPolicy(
+            self.actor,
+            self.critics,
+            specs,
+            noise=parameter_noise,
+            greedy_samples=greedy_samples,
+            greedy_noise=greedy_noise,
+        )
         self.to(device)
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),

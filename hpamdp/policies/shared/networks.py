@@ -94,6 +94,18 @@ def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
     return (unit + noise).clamp(-1.0, 1.0)
 
 
+def even_normal(num: int, dim: int, deviation: float) -> Tensor:
+    """Return normal vectors `[num, dim]` with mean 0, the same at each call, that cover the space evenly."""
+    uniform = torch.quasirandom.SobolEngine(max(dim, 1), scramble=True, seed=0).draw(max(num, 1))[:num, :dim]
+    return deviation * torch.special.ndtri(uniform.clamp(1e-6, 1.0 - 1e-6))
+
+
+def with_variations(unit: Tensor, variations: Tensor) -> Tensor:
+    """Return actions in [-1, 1], `[*B, D]`, and behind each its sums with the variations `[S, D]`: `[*B, 1 + S, D]`."""
+    unit = unit.unsqueeze(-2)
+    return torch.cat([unit, (unit + variations).clamp(-1.0, 1.0)], -2)
+
+
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move a target network's parameters the fraction `tau` of the way towards the source network's."""
     targets, sources = tuple(target.parameters()), tuple(source.parameters())
