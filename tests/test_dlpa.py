@@ -24,7 +24,8 @@ SEARCH = dict(
 OPTIONS = dict(
     form="masking", hidden_dims=[64, 64], num_members=2, lr=2e-3, state_weight=2.0, reward_weight=0.5,
     termination_weight=0.5, rho=0.5, buffer_size=5000, batch_size=64, updates_per_frame=0.5, warmup_frames=500,
-    augment=False, epsilon=0.05, planning_precision="float32", **SEARCH,
+    augment=False, epsilon=0.05, planning_precision="float32", end_values=False, end_value_lr=1e-3,
+    end_value_tau=0.02, end_value_expectile=0.9, **SEARCH,
 )  # fmt: skip
 
 
@@ -237,6 +238,16 @@ def test_a_return_weights_later_rewards_by_the_probability_of_reaching_them():
     found = planner.returns(torch.zeros(1, 4), torch.zeros(1, 7, 2, dtype=torch.long), torch.zeros(1, 7, 2, 3))
     members = torch.tensor([2.5, 3.5]) * (1.0 + 0.5 * 0.5)
     torch.testing.assert_close(found, (members.mean() - 0.5 * members.std(correction=0)).expand(1, 7))
+
+
+def test_a_plan_counts_what_its_last_state_is_worth_weighted_by_the_probability_of_reaching_it():
+    def model(state, discrete, unit):
+        one = torch.ones(1, len(state))
+        return Prediction(state + 1.0, one, one, 0.0 * one)  # every second step ends the episode
+
+    planner = Planner(model, SPECS, **{**SEARCH, "gamma": 0.5}, end_value=lambda state: 10.0 * state[:, 0])
+    found = planner.returns(torch.zeros(1, 4), torch.zeros(1, 7, 2, dtype=torch.long), torch.zeros(1, 7, 2, 3))
+    torch.testing.assert_close(found, torch.full((1, 7), 1.0 + 0.25 * 1.0 + 0.25**2 * 20.0))
 
 
 def one_step_rows(learner: DLPA, num: int) -> TensorDict:

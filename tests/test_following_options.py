@@ -22,6 +22,15 @@ CPU = torch.device("cpu")
 GAMMA = 0.5
 REPLAY = ["low.warmup_frames=0", "low.updates_per_frame=0.15", "low.batch_size=32", "low.critic_lr=0.02"]
 SMALL = ["low.hidden_dims=[16]", f"low.gamma={GAMMA}"]
+MODEL = [
+    "low.warmup_frames=1",
+    "low.updates_per_frame=0.15",
+    "low.batch_size=32",
+    "low.horizon=1",
+    "low.end_values=true",
+    "low.end_value_lr=0.02",
+    "low.end_value_tau=0.3",
+]
 LEARNERS = {
     "hppo": [*SMALL, "low.critic_hidden_dims=[16]", "low.minibatch_size=64", "low.lr=0.02", "low.lr_final=0.02"],
     "pdqn": [*SMALL, *REPLAY, "low.critic_tau=0.3"],
@@ -38,6 +47,17 @@ LEARNERS = {
     "hyar": [*SMALL, *REPLAY, "low.warmup_frames=64", "low.tau=0.3", "low.codec_pretrain_updates=2"],
     "iql": [*SMALL, *REPLAY, "low.tau=0.3"],
     "td3_bc": [*SMALL, *REPLAY, "low.tau=0.3"],
+    "dlpa": [*SMALL, *MODEL, "low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],
+    "pets": [
+        f"low.gamma={GAMMA}",
+        *MODEL,
+        "low.transition_dims=[16]",
+        "low.outcome_dims=[16]",
+        "low.num_members=2",
+        "low.num_samples=4",
+        "low.greedy_samples=4",
+        "low.num_iterations=1",
+    ],
     "qpamdp": [f"low.gamma={GAMMA}", "low.features=null", "low.warmup_frames=1", "low.phi_order=1", "low.psi_order=1"],
 }
 

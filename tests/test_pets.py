@@ -9,6 +9,7 @@ from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.low_level.pets import MEMBER, PETS
+from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.planning import Prediction, SequenceSearch, discounted_return, elite_weights
 from hpamdp.specs import PAMDPSpecs
 
@@ -25,7 +26,8 @@ OPTIONS = dict(
     linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0,
     warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
     posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, gamma=0.97,
-    planning_precision="float32", **SEARCH,
+    planning_precision="float32", end_values=False, end_value_lr=1e-3,
+    end_value_tau=0.02, end_value_expectile=0.9, **SEARCH,
 )  # fmt: skip
 
 
@@ -569,6 +571,39 @@ def test_a_greedy_plan_tries_as_many_samples_as_it_is_told(monkeypatch):
             learner.policy.plan(torch.zeros(1, SPECS.observation_dim))
         num_sequences = [size // num_samples for size in tried]
         assert num_sequences[-1] == 1 and tried == [num * num_samples for num in num_sequences]
+
+
+def test_a_plan_leads_where_its_last_state_is_worth_most_although_no_step_earns_anything(monkeypatch):
+    learner = make(end_values=True, num_iterations=5, posterior_sampling=False)
+
+    def predict(state, discrete, own, precision):
+        nothing = state[..., 0] * 0.0
+        ahead = state.clone()
+        ahead[..., 0] += own[..., 0] * (discrete == 0)
+        return Prediction(ahead, nothing, nothing, nothing - 50.0)
+
+    monkeypatch.setattr(learner.model, "forward", predict)
+    monkeypatch.setattr(learner.end_values, "forward", lambda state: -(state[..., 0] - 0.6).square())
+    for exploration in (ExplorationType.RANDOM, ExplorationType.DETERMINISTIC):
+        with set_exploration_type(exploration):
+            found = learner.policy.plan(torch.zeros(20, SPECS.observation_dim))
+        torch.testing.assert_close(found.value, torch.zeros(20), atol=0.02, rtol=0.0)
+    assert any(name.startswith("end_value.") for name in learner.policy.state_dict()), "copies need its weights, too"
+
+
+@pytest.mark.parametrize(("expectile", "expected"), [(0.5, 0.5), (0.9, 0.9)])
+def test_values_are_expectiles_of_what_the_stored_actions_led_to(expectile, expected):
+    torch.manual_seed(0)
+    values = EndValues(2, [16], tau=0.5, expectile=expectile)
+    optimizer = torch.optim.Adam(values.learned(), lr=1e-2)
+    state = torch.rand(256, 2)
+    reward = (torch.arange(256) % 2).float()
+    for _ in range(200):
+        optimizer.zero_grad()
+        loss, _ = values.loss(state, state, reward, torch.full((256,), 0.5), torch.zeros(256))
+        loss.backward()
+        optimizer.step()
+    assert values.own(state).mean().item() == pytest.approx(expected, abs=0.05)
 
 
 def test_it_learns_a_two_step_problem_within_some_hundred_steps():

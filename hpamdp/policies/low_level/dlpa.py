@@ -17,7 +17,8 @@ Differs from the source:
 - every plan starts from scratch, not from the previous one, which would have to be stored with the environments' data;
   with the true model of this project's benchmark, a warm start adds .002 to .005 of the best possible score at 5
   iterations, .006 to .01 at 3;
-- exploring actions are sampled from the plan's final distribution, a fraction of them uniformly.
+- exploring actions are sampled from the plan's final distribution, a fraction of them uniformly;
+- with `end_values` a plan also counts what its last state is worth (`policies.shared.end_values`).
 
 TorchRL's SliceSampler (`fragmented`, padded) does not fit: it samples trajectories instead of steps uniformly, and none
 of its windows starts in the last `horizon - 1` steps of a longer trajectory, so that the model learns most terminations
@@ -39,7 +40,8 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel
-from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.fractions import Expectile, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -77,6 +79,7 @@ class Planner:
         min_deviation: smallest standard deviation of a parameter, in [-1, 1] units.
         gamma: discount of a step.
         pessimism: number of standard deviations between the ensemble's members that are subtracted from a return.
+        end_value: maps the last state of a plan `[B, observation_dim]` to what it is worth, `[B]`; None: nothing.
         precision: dtype in which the model's networks predict during planning.
 
     Raises:
@@ -97,6 +100,7 @@ class Planner:
         min_deviation: float,
         gamma: float,
         pessimism: float,
+        end_value: Callable[[Tensor], Tensor] | None = None,
         precision: str = "float32",
     ) -> None:
         if num_elites > num_samples:
@@ -117,6 +121,7 @@ class Planner:
         self.min_deviation = min_deviation
         self.gamma = gamma
         self.pessimism = pessimism
+        self.end_value = end_value
         self.precision: torch.dtype = getattr(torch, precision)
 
     @torch.no_grad()
@@ -171,7 +176,7 @@ class Planner:
                 rows = predicted.next_state
                 yield predicted
 
-        total = discounted_return(steps(), self.gamma)
+        total = discounted_return(steps(), self.gamma, self.end_value)
         value = total.mean(0)
         if self.pessimism > 0.0:
             value = value - self.pessimism * total.std(0, correction=0)
@@ -215,6 +220,7 @@ class DLPAPolicy(TensorDictModuleBase):
         self.in_keys = [keys.OBSERVATION, keys.DONE]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.model = planner.model  # makes the model's weights part of the policy's state
+        self.end_value = planner.end_value  # and those of the values
         self.planner = planner
         self.specs = specs
         self.epsilon = epsilon
@@ -292,6 +298,10 @@ class DLPA(ReplayLearner):
         min_deviation: NonNegativeFloat,
         pessimism: NonNegativeFloat,
         planning_precision: Literal["float32", "bfloat16"],
+        end_values: bool,
+        end_value_lr: LearningRate,
+        end_value_tau: PositiveFraction,
+        end_value_expectile: Expectile,
     ) -> None:
         super().__init__(
             specs,
@@ -307,6 +317,11 @@ class DLPA(ReplayLearner):
         self.rho = rho
         self.horizon = horizon
         self.model = PAMDPModel(specs, form, hidden_dims, num_members)
+        self.end_values: EndValues | None = None
+        if end_values:
+            self.end_values = EndValues(
+                specs.observation_dim, hidden_dims, tau=end_value_tau, expectile=end_value_expectile
+            )
         planner = Planner(
             self.model,
             specs,
@@ -319,15 +334,28 @@ class DLPA(ReplayLearner):
             min_deviation=min_deviation,
             gamma=gamma,
             pessimism=pessimism,
+            end_value=self.end_values,
             precision=planning_precision,
         )
         self.policy = DLPAPolicy(planner, specs, epsilon)
         self.to(device)
         self.optimizers = {"model": torch.optim.Adam(self.model.parameters(), lr=lr, fused=True)}
+        if self.end_values is not None:
+            self.optimizers["end_values"] = torch.optim.Adam(self.end_values.learned(), lr=end_value_lr, fused=True)
+
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the values `[N]` of states `[N, observation_dim]` that `end_values` has learned, whatever is allowed.
+
+        Raises:
+            NotImplementedError: there are none.
+        """
+        return super().value(observation) if self.end_values is None else self.end_values.of_own(observation)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the model's inputs and targets in a batch `[*B, T]`."""
-        rows = super().transitions(batch).select(*_STORED)
+        """Return the model's inputs and targets in a batch `[*B, T]`, and those of the values, if they are learned."""
+        rows = super().transitions(batch)
+        if self.end_values is None:
+            rows = rows.select(*_STORED)
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
@@ -442,8 +470,11 @@ class DLPA(ReplayLearner):
         return parts
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update the model from windows `[batch_size, horizon]`."""
-        return self.minimise("model", self._loss, sample)
+        """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""
+        scalars = self.minimise("model", self._loss, sample.select(*_STORED, "terminated", "valid"))
+        if self.end_values is not None:
+            scalars |= self.end_values.update(self, sample[:, 0], sample[:, 0])
+        return scalars
 
     def _loss(self, windows: Mapping[str, Tensor] | TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         parts = self.losses(windows)

@@ -25,7 +25,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.fractions import Expectile, LearningRate, PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -45,7 +45,7 @@ class IQL(ReplayLearner):
         hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
         min_scale: PositiveFloat,
         max_scale: PositiveFloat,
-        expectile: Annotated[float, Field(ge=0.5, lt=1.0)],
+        expectile: Expectile,
         temperature: PositiveFloat,
         max_weight: PositiveFloat,
         gamma: PositiveFraction,

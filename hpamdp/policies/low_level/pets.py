@@ -26,7 +26,8 @@ Differs from the sources:
   are not predicted but derived from them;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
 - weight decay falls as steps come in, as the weight of a prior does;
-- the parameters of each sequence of discrete actions are searched by themselves (`policies.shared.planning`).
+- the parameters of each sequence of discrete actions are searched by themselves (`policies.shared.planning`);
+- with `end_values` a plan also counts what its last state is worth (`policies.shared.end_values`).
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
+from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.fractions import Expectile, LearningRate, PositiveFraction
 from hpamdp.policies.shared.frame import CanonicalFrame, joined
 from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.networks import EnsembleLinear
@@ -397,6 +399,7 @@ class PETSPolicy(TensorDictModuleBase):
         optimism: float,
         caution: float,
         precision: str,
+        end_value: EndValues | None,
     ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION, keys.DONE, keys.IS_DECISION, MEMBER]
@@ -411,6 +414,7 @@ class PETSPolicy(TensorDictModuleBase):
         self.optimism = optimism
         self.caution = caution
         self.precision: torch.dtype = getattr(torch, precision)
+        self.end_value = end_value
         self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
 
@@ -555,13 +559,20 @@ class PETSPolicy(TensorDictModuleBase):
                     parts = (part.unflatten(1, shape) for part in ahead[1:])
                     yield Prediction(rows, *(_each_repeated(part, num_sequences // shape[1]) for part in parts))
 
-            total = discounted_return(predictions(), self.gamma)
+            end_value = None if self.end_value is None else self._end_value_of_joined
+            total = discounted_return(predictions(), self.gamma, end_value)
             if not is_mean:
                 return total.flatten(0, 1)
             weight = -self.caution if is_greedy() else self.optimism
             return total.mean(0) if weight == 0.0 else total.mean(0) + weight * total.std(0, correction=0)
 
         return returns
+
+    def _end_value_of_joined(self, rows: Tensor) -> Tensor:
+        """Return what states `[E, observation_dim, N, Q, S]` are worth at the end of a plan, `[E, N, Q, S]`."""
+        assert self.end_value is not None
+        value: Tensor = self.end_value(rows.movedim(1, -1))
+        return value
 
     def _returns_of_single_members(self, state: Tensor) -> Returns:
         """Return what maps sequences to the returns that a single member expects, from states `[N, observation_dim]`.
@@ -627,6 +638,10 @@ class PETS(ReplayLearner):
         first_min_deviation: NonNegativeFloat,
         min_deviation: NonNegativeFloat,
         planning_precision: Literal["float32", "bfloat16"],
+        end_values: bool,
+        end_value_lr: LearningRate,
+        end_value_tau: PositiveFraction,
+        end_value_expectile: Expectile,
     ) -> None:
         uses_geometry = augment is not False
         self.entries = list(range(specs.observation_dim))
@@ -654,6 +669,11 @@ class PETS(ReplayLearner):
             uses_geometry=uses_geometry,
             linear_part=linear_part,
         )
+        self.end_values: EndValues | None = None
+        if end_values:
+            self.end_values = EndValues(
+                specs.observation_dim, outcome_dims, tau=end_value_tau, expectile=end_value_expectile
+            )
         search = SequenceSearch(
             specs.parameter_dims,
             horizon=horizon,
@@ -678,27 +698,39 @@ class PETS(ReplayLearner):
             optimism=optimism,
             caution=caution,
             precision=planning_precision,
+            end_value=self.end_values,
         )
         self.to(device)
         self.optimizers = {
             "model": torch.optim.AdamW(self.model.parameters(), lr=lr, weight_decay=weight_decay, fused=True)
         }
+        if self.end_values is not None:
+            self.optimizers["end_values"] = torch.optim.Adam(self.end_values.learned(), lr=end_value_lr, fused=True)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated."""
-        rows = super().transitions(batch).exclude("discount", "action_mask", "next_action_mask")
+        """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated.
+
+        Where values are learned, `next_observation` has all entries of the next state.
+        """
+        rows = super().transitions(batch)
+        if self.end_values is None:
+            rows = rows.exclude("discount", "action_mask", "next_action_mask")
+        else:
+            rows.set("next_observation", rows["next_state"])
         for name in ("state", "next_state"):
             rows.set(name, rows[name][..., self.entries])
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the expected returns `[N]` of the plans from observations `[N, *]`, see `PETSPolicy.value`."""
-        return self.policy.value(observation, action_mask)
+        """Return the values `[N]` of observations `[N, *]`: as `end_values` has learned them, else those of plans."""
+        if self.end_values is None:
+            return self.policy.value(observation, action_mask)
+        return self.end_values.of_own(observation[..., self.entries])
 
     def explore(self, frames: int) -> None:
-        """Let the policy plan, as soon as there are different rewards to plan for."""
+        """Let the policy plan, as soon as there are different rewards, or end values, to plan for."""
         reward = self.buffer[:]["reward"]
-        self.policy.is_trained.fill_(bool((reward != reward[0]).any()))
+        self.policy.is_trained.fill_(self.end_values is not None or bool((reward != reward[0]).any()))
 
     def updates_due(self, before: int, frames: int) -> int:
         """Return how many updates to make; the first ones make up for the warm-up."""
@@ -756,8 +788,13 @@ class PETS(ReplayLearner):
         return rows.set("unit", rows["unit"].gather(-1, self.slots[rows["discrete"]]))
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update every member from its own minibatch of a sample `[num_members, batch_size]`."""
-        return self.minimise("model", self._loss, sample)
+        """Update every member from its own minibatch of a sample `[num_members, batch_size]`; then the values."""
+        scalars = self.minimise("model", self._loss, sample)
+        if self.end_values is not None:
+            seen = self.buffer.sample(sample.numel())
+            rows = seen.copy().set("next_state", seen["next_observation"])
+            scalars |= self.end_values.update(self, rows, seen)
+        return scalars
 
     def _loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the members' losses, and the mean of each part of it."""

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 PositiveFraction = Annotated[float, Field(gt=0.0, le=1.0)]
+Expectile = Annotated[float, Field(ge=0.5, lt=1.0)]  # .5 is the mean
 
 
 def _check_rate(rate: float) -> float:

@@ -23,10 +23,17 @@ class Prediction(NamedTuple):
     logit: Tensor  # [E, B] of termination
 
 
-def discounted_return(steps: Iterable[Prediction], gamma: float) -> Tensor:
+def discounted_return(
+    steps: Iterable[Prediction], gamma: float, end_value: Callable[[Tensor], Tensor] | None = None
+) -> Tensor:
     """Return the discounted sum `[E, B]` of the expected rewards of consecutive steps.
 
     A step's reward is weighted by the probability that no step before it terminates.
+
+    Args:
+        steps: what is predicted of them.
+        gamma: discount of a step.
+        end_value: maps the last step's `next_state` to what follows it, also weighted; None: nothing.
     """
     total: Tensor | float = 0.0
     survival: Tensor | float = 1.0
@@ -35,6 +42,8 @@ def discounted_return(steps: Iterable[Prediction], gamma: float) -> Tensor:
         reward = ends * step.terminating + (1.0 - ends) * step.continuing
         total = total + gamma**h * survival * reward.float()
         survival = survival * (1.0 - ends)
+    if end_value is not None:
+        total = total + gamma ** (h + 1) * survival * end_value(step.next_state.float())
     assert isinstance(total, Tensor)
     return total
 

@@ -1,0 +1,90 @@
+"""What the last state of a plan is worth, for learners that plan a few steps ahead in a model.
+
+A plan counts what its own steps earn. Where options end inside episodes, that is too little: another option may earn
+what this one leads to. So networks learn from the stored steps what states are worth, as model-free learners do.
+
+Sources: Lowrey et al. 2019, *Plan Online, Learn Offline*, arXiv 1811.01848: plans that end in a learned value;
+Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q-Learning*, arXiv 2110.06169, equation
+5: the expectile, which gives little weight to what the worse ones of the stored actions led to.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from hpamdp.policies.shared.networks import mlp, polyak_update
+from hpamdp.policies.shared.replay import ReplayLearner
+
+
+class EndValues(nn.Module):
+    """Two values of a state: `of_own`, where this learner acts in it, and `forward`, where a plan ends in it.
+
+    The latter is that of the option which then follows: another one, where an option has just ended. It is learned by
+    itself, so that a policy's copy in another process needs neither the selector nor the other learners.
+
+    Args:
+        observation_dim: of the states.
+        hidden_dims: of both networks.
+        tau: rate at which the target network of the former follows, at each update.
+        expectile: of what the stored actions led to, from .5, their mean, towards 1, the best of them.
+    """
+
+    def __init__(self, observation_dim: int, hidden_dims: Sequence[int], *, tau: float, expectile: float) -> None:
+        super().__init__()
+        self.tau = tau
+        self.expectile = expectile
+        self.own = mlp(observation_dim, hidden_dims, 1)
+        self.end = mlp(observation_dim, hidden_dims, 1)
+        self.target_own = copy.deepcopy(self.own).requires_grad_(False)
+
+    def forward(self, state: Tensor) -> Tensor:
+        """Return what states `[*B, observation_dim]` are worth at the end of a plan, `[*B]`."""
+        value: Tensor = self.end(state).squeeze(-1)
+        return value
+
+    def of_own(self, state: Tensor) -> Tensor:
+        """Return the target network's values `[*B]` of states `[*B, observation_dim]` in which this learner acts."""
+        value: Tensor = self.target_own(state).squeeze(-1)
+        return value
+
+    def loss(
+        self, state: Tensor, next_state: Tensor, reward: Tensor, discount: Tensor, next_value: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss of both networks on stored steps, and what to log of it.
+
+        Args:
+            state, next_state: `[B, observation_dim]`.
+            reward: `[B]`.
+            discount: of the next state's value, 0 after a termination, `[B]`.
+            next_value: of the next states under the option that follows, `[B]`.
+        """
+        excess = reward + discount * next_value - self.own(state).squeeze(-1)
+        weight = torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile)
+        own = (weight * excess.square()).mean()
+        end = ((self(next_state) - next_value).square() * (discount > 0.0)).mean()
+        return own + end, {"own_value": own, "end_value": end}
+
+    def learned(self) -> Iterator[nn.Parameter]:
+        """Yield the parameters that the optimizer changes."""
+        yield from self.own.parameters()
+        yield from self.end.parameters()
+
+    def update(self, learner: ReplayLearner, rows: TensorDictBase, seen: TensorDictBase) -> dict[str, Tensor]:
+        """Take a step of the learner's optimizer `end_values`, then move the target network; return what to log.
+
+        Args:
+            learner: whose steps they are.
+            rows: stored steps `[B]`, see `ReplayLearner.transitions`.
+            seen: `state` and `next_state` `[B, observation_dim]` of these steps, as the networks see them.
+        """
+        with torch.no_grad():
+            next_value = learner.next_value(rows)
+        inputs = seen["state"], seen["next_state"], rows["reward"], rows["discount"], next_value
+        scalars = learner.minimise("end_values", self.loss, *inputs)
+        polyak_update(self.target_own, self.own, self.tau)
+        return scalars
