@@ -1,5 +1,7 @@
 """H-PPO: ratios, advantages, which rows count, and learning a problem with a known optimum."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from conftest import global_generators_unmoved
@@ -8,13 +10,14 @@ from torch.distributions import Categorical, Normal
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
+from hpamdp.geometry import PlaneGeometry
 from hpamdp.policies.low_level.hppo import HPPO, RAW
 from hpamdp.specs import PAMDPSpecs
 
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
-    hidden_dims=[32, 32], critic_hidden_dims=[32, 32], initial_parameters="none",
+    hidden_dims=[32, 32], critic_hidden_dims=[32, 32], vector_products=False, initial_parameters="none",
     initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
     max_scale=1.0, epochs=4, minibatch_size=256, clip=0.2, gamma=0.9, gae_lambda=0.8, lr=3e-3, lr_final=3e-4,
     critic_weight=0.5, discrete_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_frames=40_000,
@@ -93,6 +96,21 @@ def test_the_log_ratios_are_those_of_the_discrete_action_and_of_its_own_paramete
     for k, expected in own.items():
         torch.testing.assert_close(parameter_log_prob[discrete == k], expected[discrete == k])
     assert (before[discrete == 2] == 0).all() and (parameter_log_prob - before)[discrete != 2].abs().min() > 0
+
+
+def test_actor_and_critic_see_products_of_vectors_and_learn_with_them():
+    specs = replace(SPECS, geometry=PlaneGeometry(vectors=((0, 1), (2, 3))))
+    learner = make(specs, vector_products=True)
+    turned = torch.tensor([[1.0, 0.0, 1.0, 0.0], [1.0, 0.0, 1.0, 0.0]])
+    with torch.no_grad():
+        for net in (learner.actor.encoder[0], learner.critic[1][0]):
+            assert net.weight.shape[1] == 6
+            net.weight[:, :4] = 0.0  # only the products are left
+    value = learner.value(turned * torch.tensor([[1.0], [-1.0]]))
+    assert value[0] == value[1], "both vectors turned by half a turn have the same products"
+    td = random_rows(learner, 64, 2)
+    learner.learn(td, everything(td))
+    assert learner.portable() is None, "the page's actors have no products"
 
 
 def test_the_parameters_of_other_actions_do_not_change_the_likelihood():

@@ -6,11 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from hpamdp.geometry import PlaneGeometry
 from hpamdp.policies.shared import networks
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     HybridCritics,
     InitialLayer,
+    VectorProducts,
     mlp,
     polyak_update,
     sample_index,
@@ -142,3 +144,23 @@ def test_a_network_leaves_its_input_as_it_is():
     kept = state.clone()
     mlp(3, [5, 5], 2)(state).sum().backward()
     assert state.equal(kept)
+
+
+def test_products_of_vectors_say_how_far_a_heading_misses_a_target():
+    geometry = PlaneGeometry(vectors=((1, 2), (3, 0)), origins=((1.0, 1.0), (0.0, 0.0)))
+    products = VectorProducts(replace(specs_of(1), geometry=geometry))
+    observation = torch.randn(5, 3, 4)
+    seen = products(observation)
+    first, second = observation[..., [1, 2]] - 1.0, observation[..., [3, 0]]
+    length = first.norm(dim=-1) * second.norm(dim=-1)
+    angle = torch.atan2(second[..., 1], second[..., 0]) - torch.atan2(first[..., 1], first[..., 0])
+    torch.testing.assert_close(seen[..., :4], observation)
+    torch.testing.assert_close(seen[..., 4], length * angle.cos())
+    torch.testing.assert_close(seen[..., 5], length * angle.sin())
+    assert seen.shape[-1] == products.num_outputs == 6
+
+
+@pytest.mark.parametrize("geometry", [None, PlaneGeometry(vectors=((0, 1),))])
+def test_products_are_refused_where_there_are_no_two_vectors(geometry):
+    with pytest.raises(ValueError, match="declares no two vectors of the plane; use vector_products=false"):
+        VectorProducts(replace(specs_of(1), geometry=geometry))

@@ -11,7 +11,8 @@ Differs from the source:
 - the parameters are Gaussian in units where their bounds are [-1, 1]; the ratio is that of the raw sample, which is
   clipped only for execution, because the density of a squashed sample diverges at the bounds;
 - the Gaussian's standard deviation has a lower limit, because the ratios explode where it shrinks faster than the mean
-  moves; this limit, the learning rate and the entropy bonus are annealed over `anneal_frames` steps of the whole run.
+  moves; this limit, the learning rate and the entropy bonus are annealed over `anneal_frames` steps of the whole run;
+- with `vector_products` actors and critic see products of the vectors that the problem declares, too.
 
 The advantages are TorchRL's. Its ClipPPOLoss is not used because it multiplies the ratios of all heads and clips the
 product.
@@ -34,7 +35,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
-from hpamdp.policies.shared.networks import InitialParameters
+from hpamdp.policies.shared.networks import InitialParameters, VectorProducts
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.policies.shared.portable import portable_actor
 from hpamdp.specs import PAMDPSpecs
@@ -85,6 +86,7 @@ class HPPO(OnPolicy, Learner):
         *,
         hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
         critic_hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
+        vector_products: bool,
         initial_parameters: InitialParameters,
         initial_scale: PositiveFloat,
         min_scale: PositiveFloat,
@@ -124,9 +126,18 @@ class HPPO(OnPolicy, Learner):
         self.lr_final = lr_final
         self.anneal_frames = anneal_frames
 
-        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), initial_scale, initial_parameters)
+        self.actor = HybridActor(
+            specs,
+            hidden_dims,
+            (min_scale, max_scale),
+            initial_scale,
+            initial_parameters,
+            vector_products=vector_products,
+        )
+        products = [VectorProducts(specs)] if vector_products else []
+        num_inputs = products[0].num_outputs if products else specs.observation_dim
         self.critic = nn.Sequential(
-            encoder(specs.observation_dim, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
+            *products, encoder(num_inputs, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
         )
         self.policy = HPPOPolicy(self.actor, specs, samples_when_greedy=greedy_discrete == "sampled")
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))

@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.masks import masked_logits
-from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
+from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts, sample_index
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -108,6 +108,7 @@ class HybridActor(nn.Module):
         scale_range: smallest and largest standard deviation, in units where the bounds are [-1, 1].
         initial_scale: standard deviation at initialisation, strictly within `scale_range`.
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
+        vector_products: whether the encoder also sees `VectorProducts`.
     """
 
     log_min_scale: Tensor
@@ -120,10 +121,14 @@ class HybridActor(nn.Module):
         scale_range: tuple[float, float],
         initial_scale: float,
         initial_parameters: InitialParameters = "none",
+        *,
+        vector_products: bool = False,
     ) -> None:
         super().__init__()
         self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
-        self.encoder = encoder(specs.observation_dim, hidden_dims)
+        self.products = VectorProducts(specs) if vector_products else None
+        num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
+        self.encoder = encoder(num_inputs, hidden_dims)
         self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete)
         self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters)
         log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
@@ -144,7 +149,7 @@ class HybridActor(nn.Module):
             observation: of the states.
             mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
         """
-        hidden = self.encoder(observation)
+        hidden = self.encoder(observation if self.products is None else self.products(observation))
         mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
         mean = mean + self.initial(observation)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()

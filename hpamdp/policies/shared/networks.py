@@ -113,6 +113,48 @@ def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
         torch._foreach_lerp_(targets, sources, tau)
 
 
+class VectorProducts(nn.Module):
+    """Puts behind an observation the scalar and the cross product of every two of its vectors in the plane.
+
+    How far a heading misses a target is a sum of such products. Without them a network has to learn to multiply, and
+    learns it roughly.
+
+    Args:
+        specs: of the problem, whose geometry says which entries are vectors.
+
+    Attributes:
+        num_outputs: entries of the observation and products together.
+
+    Raises:
+        ValueError: the problem declares fewer than two vectors.
+    """
+
+    entries: Tensor
+    origins: Tensor
+    pairs: Tensor
+
+    def __init__(self, specs: PAMDPSpecs) -> None:
+        super().__init__()
+        geometry = specs.geometry
+        if geometry is None or len(geometry.vectors) < 2:
+            raise ValueError(
+                "vector_products=true: the problem declares no two vectors of the plane; use vector_products=false"
+            )
+        self.register_buffer("entries", torch.tensor(geometry.vectors), persistent=False)
+        origins = torch.tensor(geometry.origins) if geometry.origins else torch.zeros(self.entries.shape)
+        self.register_buffer("origins", origins, persistent=False)
+        self.register_buffer("pairs", torch.combinations(torch.arange(len(self.entries))).mT, persistent=False)
+        self.num_outputs = specs.observation_dim + 2 * self.pairs.shape[-1]
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """Return `[*B, num_outputs]` for observations `[*B, observation_dim]`."""
+        vectors = observation[..., self.entries] - self.origins
+        (first_x, first_y), (second_x, second_y) = (vectors[..., places, :].unbind(-1) for places in self.pairs)
+        scalar = first_x * second_x + first_y * second_y
+        cross = first_x * second_y - first_y * second_x
+        return torch.cat([observation, scalar, cross], -1)
+
+
 class InvertingGradients(torch.autograd.Function):
     """Clips to [-1, 1]; scales the gradient by the fraction of the range that is left in its direction.
 

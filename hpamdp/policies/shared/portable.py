@@ -23,8 +23,8 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def portable_actor(actor: HybridActor, specs: PAMDPSpecs) -> dict[str, Any] | None:
-    """Return a `hybrid_actor`; None if it starts from a problem's initial parameters, which the form lacks."""
-    if actor.initial.exists:
+    """Return a `hybrid_actor`; None if it has initial parameters or products of vectors, which the form lacks."""
+    if actor.initial.exists or actor.products is not None:
         return None
     num, head = specs.num_parameters, actor.parameter_head
     return {
