@@ -141,6 +141,8 @@ LEARNERS = {
     "pets": [
         "total_frames=60000",
         "agent.uniform_option_frames=40000",
+        "num_envs=64",
+        "steps_per_batch=4",
         "low.warmup_frames=10000",
         "low.updates_per_frame=0.1",
         "low.end_values=true",
