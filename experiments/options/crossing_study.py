@@ -100,8 +100,8 @@ LEARNERS = {
         "low.epsilon=0.2",
     ],
     "pets": [
-        "total_frames=8000",
-        "agent.uniform_option_frames=4000",
+        "total_frames=16000",
+        "agent.uniform_option_frames=8000",
         "low.warmup_frames=500",
         "low.updates_per_frame=0.3",
         "low.end_values=true",
