@@ -250,6 +250,31 @@ def test_a_plan_counts_what_its_last_state_is_worth_weighted_by_the_probability_
     torch.testing.assert_close(found, torch.full((1, 7), 1.0 + 0.25 * 1.0 + 0.25**2 * 20.0))
 
 
+def test_a_learner_with_end_values_plans_towards_what_they_say(monkeypatch):
+    torch.manual_seed(0)
+    learner = make(end_values=True, horizon=1, num_samples=256, num_elites=16, temperature=0.01)
+
+    def predict(state, discrete, unit):
+        nothing = torch.zeros(2, len(state))
+        ahead = state.clone()
+        ahead[:, 0] = unit[:, 0] * (discrete == 0)
+        return Prediction(ahead, nothing, nothing, nothing - 50.0)
+
+    monkeypatch.setattr(learner.model, "forward", predict)
+    monkeypatch.setattr(learner.end_values, "forward", lambda state: -(state[:, 0] - 0.6).square())
+    learner.policy.is_trained.fill_(True)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        td = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(20, 4)}, [20]))
+    assert (td[keys.DISCRETE] == 0).all()
+    unit = SPECS.to_unit(td[keys.PARAMETERS])[:, 0]
+    torch.testing.assert_close(unit, torch.full((20,), 0.6), atol=0.1, rtol=0.0)
+
+
+def test_the_copies_of_a_policy_get_the_weights_of_its_end_values():
+    names = make(end_values=True).policy.state_dict()
+    assert any(name.startswith("end_value.end.") for name in names)
+
+
 def one_step_rows(learner: DLPA, num: int) -> TensorDict:
     """Act in a one-step problem: only action 1 is rewarded, the more the nearer its parameters are to (s0, -s1)."""
     td = TensorDict({keys.OBSERVATION: torch.rand(num, 1, 4) * 2 - 1}, [num, 1])

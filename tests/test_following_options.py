@@ -120,6 +120,26 @@ def test_an_option_is_worth_the_discounted_value_of_the_option_that_follows_it(l
     assert value(agent, 0, observation) == pytest.approx(GAMMA, abs=0.15)
 
 
+@pytest.mark.parametrize("is_shared", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["per_option", "shared"])
+@pytest.mark.parametrize("low", ["dlpa", "pets"])
+def test_a_plan_ends_in_the_value_of_the_option_that_follows_and_in_nothing_after_a_termination(low, is_shared):
+    agent = make_agent(low, Fixed(SPECS, option="second"), is_shared=is_shared)
+    for _ in range(8):
+        agent.learn(two_options(agent, 64))
+    observation = torch.rand(500, 2) * 2 - 1
+    if is_shared:
+        observation = torch.cat([observation, torch.tensor([1.0, 0.0]).expand(500, 2)], -1)
+    of_first = agent.learners[0].end_values
+    with torch.no_grad():
+        assert of_first(observation).mean().item() == pytest.approx(1.0, abs=0.15), (
+            "not what the option that ended is worth"
+        )
+    nothing = torch.zeros(500)
+    loss, _ = of_first.loss(observation, observation, nothing, nothing, nothing + 5.0)
+    gradients = torch.autograd.grad(loss, [*of_first.end.parameters()])
+    assert all((gradient == 0.0).all() for gradient in gradients)
+
+
 @pytest.mark.parametrize("is_shared", [False, True], ids=["per_option", "shared"])
 def test_the_advantages_of_hppo_count_what_the_options_earn_that_follow(is_shared):
     agent = make_agent("hppo", Fixed(SPECS, option="second"), is_shared=is_shared)

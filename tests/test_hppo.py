@@ -98,19 +98,20 @@ def test_the_log_ratios_are_those_of_the_discrete_action_and_of_its_own_paramete
     assert (before[discrete == 2] == 0).all() and (parameter_log_prob - before)[discrete != 2].abs().min() > 0
 
 
-def test_actor_and_critic_see_products_of_vectors_and_learn_with_them():
+def test_actor_and_critic_see_products_of_vectors():
     specs = replace(SPECS, geometry=PlaneGeometry(vectors=((0, 1), (2, 3))))
     learner = make(specs, vector_products=True)
-    turned = torch.tensor([[1.0, 0.0, 1.0, 0.0], [1.0, 0.0, 1.0, 0.0]])
     with torch.no_grad():
+        learner.actor.parameter_head.weight.normal_()
         for net in (learner.actor.encoder[0], learner.critic[1][0]):
-            assert net.weight.shape[1] == 6
             net.weight[:, :4] = 0.0  # only the products are left
-    value = learner.value(turned * torch.tensor([[1.0], [-1.0]]))
-    assert value[0] == value[1], "both vectors turned by half a turn have the same products"
-    td = random_rows(learner, 64, 2)
-    learner.learn(td, everything(td))
-    assert learner.portable() is None, "the page's actors have no products"
+    state = torch.randn(1, 4)
+    turned = state[:, [1, 0, 3, 2]] * torch.tensor([-1.0, 1.0, -1.0, 1.0])  # both vectors, by a right angle
+    other = state * torch.tensor([1.0, 1.0, -1.0, -1.0])
+    for output in (learner.value, lambda seen: learner.actor(seen).mean):
+        torch.testing.assert_close(output(turned), output(state))
+        assert not torch.allclose(output(other), output(state), atol=1e-3)
+    assert learner.portable() is None, "the actors of pages have no products"
 
 
 def test_the_parameters_of_other_actions_do_not_change_the_likelihood():

@@ -588,7 +588,11 @@ def test_a_plan_leads_where_its_last_state_is_worth_most_although_no_step_earns_
         with set_exploration_type(exploration):
             found = learner.policy.plan(torch.zeros(20, SPECS.observation_dim))
         torch.testing.assert_close(found.value, torch.zeros(20), atol=0.02, rtol=0.0)
-    assert any(name.startswith("end_value.") for name in learner.policy.state_dict()), "copies need its weights, too"
+
+
+def test_the_copies_of_a_policy_get_the_weights_of_its_end_values():
+    names = make(end_values=True).policy.state_dict()
+    assert any(name.startswith("end_value.end.") for name in names)
 
 
 @pytest.mark.parametrize(("expectile", "expected"), [(0.5, 0.5), (0.9, 0.9)])

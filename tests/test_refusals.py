@@ -54,7 +54,8 @@ REFUSED = [
     ("env.motor_noise=[0,11]", "env: BoatDockEnv: motor_noise=11.0, but must lie between 0 and 10"),
     ("env.sensor_noise=1e9", "env: BoatDockEnv: sensor_noise=1000000000.0, but must lie between 0 and 1000"),
     # Values that contradict one another.
-    ("high=value low=dlpa", "high=value: low=dlpa has no value to compare; use another low or another high"),
+    ("high=value low=dlpa", "high=value: low=dlpa has no value to compare without low.end_values=true"),
+    ("high=value low=random", "high=value: low=random has no value to compare; use another low or another high"),
     ("low.buffer_size=4 low.batch_size=64", "low: batch_size=64: must be at most buffer_size=4"),
     ("high=meta_critic high.batch_size=60000", "high: batch_size=60000: must be at most buffer_size=50000"),
     ("low=pdqn low.n_step=5", "low.n_step=5: must be at most steps_per_batch=4, as sums of rewards end with a batch"),

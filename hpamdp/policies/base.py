@@ -314,6 +314,7 @@ class Learner(nn.Module):
         needs: what the environment must reveal beyond its observation, as in `Selector`.
         modes: what the learner can learn from. `train`: transitions that the agent collects (`mode=train`). `offline`:
             a data set (`mode=offline`, or `data=...` with `mode=train`).
+        value_option: name of the setting without which there is no `value`; None: where there is the method, there is.
         progress: the buffers, by the last part of their names, that say how far a run has come: counters of its steps
             and the exploration that follows from them. They begin afresh where a new run takes over the learner.
         following: what follows an option that ends inside its episode; the agent sets it.
@@ -321,6 +322,7 @@ class Learner(nn.Module):
 
     needs: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train",)
+    value_option: ClassVar[str | None] = None
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 
     policy: TensorDictModuleBase

@@ -353,8 +353,18 @@ def check_choice(config: Config, env: PAMDPEnv) -> None:
         _check_plans(config, env)
     else:
         _check_ends(config, env)
-    if getattr(config.high.cls, "asks_learners", False) and getattr(config.low.cls, "value", None) is Learner.value:
-        raise ConfigError(f"{config.high}: {config.low} has no value to compare; use another low or another high")
+    if getattr(config.high.cls, "asks_learners", False):
+        _check_values(config)
+
+
+def _check_values(config: Config) -> None:
+    """Refuse learners whose values the selector would ask for, but which have none."""
+    for low in config.learners:
+        option = getattr(low.cls, "value_option", None)
+        if option is not None and not low.options[option]:
+            raise ConfigError(f"{config.high}: {low} has no value to compare without low.{option}=true")
+        if getattr(low.cls, "value", None) is Learner.value:
+            raise ConfigError(f"{config.high}: {low} has no value to compare; use another low or another high")
 
 
 def _check_plans(config: Config, env: PAMDPEnv) -> None:

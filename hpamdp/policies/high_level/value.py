@@ -2,9 +2,9 @@
 
 A critic, or a plan in a learned model, tells the value of a state under each option before any of them has been chosen
 there. Bandits need thousands of decisions to learn as much. In a hierarchy it is the greedy policy over option values:
-Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, Artificial Intelligence 112. A learner such as PETS, whose
-value is that of a random member of its ensemble when exploring, makes it posterior sampling over options: Osband,
-Russo and Van Roy 2013, arXiv 1306.0940.
+Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, Artificial Intelligence 112. A learner such as PETS without
+`end_values`, whose value is that of a random member of its ensemble when exploring, makes it posterior sampling over
+options: Osband, Russo and Van Roy 2013, arXiv 1306.0940.
 """
 
 from __future__ import annotations

@@ -266,6 +266,7 @@ class DLPA(ReplayLearner):
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train",)
+    value_option = "end_values"
 
     policy: DLPAPolicy
 
@@ -473,7 +474,8 @@ class DLPA(ReplayLearner):
         """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""
         scalars = self.minimise("model", self._loss, sample.select(*_STORED, "terminated", "valid"))
         if self.end_values is not None:
-            scalars |= self.end_values.update(self, sample[:, 0], sample[:, 0])
+            first = sample[:, 0]
+            scalars |= self.end_values.update(self, first, first["state"], first["next_state"])
         return scalars
 
     def _loss(self, windows: Mapping[str, Tensor] | TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:

@@ -60,10 +60,10 @@ from hpamdp.policies.shared.networks import (
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
 
-# Latent actions that are valued at once: bounds the memory where there are many discrete actions.
-_MAX_TRIED = 1 << 14
-
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
+
+# Variations that are valued at once, if those of a state are no more: bounds the memory.
+_MAX_TRIED = 1 << 14
 
 
 class HybridCodec(nn.Module):
@@ -252,11 +252,13 @@ class HyARPolicy(TensorDictModuleBase):
         proposals = self.actor(state, self.codec.embeddings, self.noise if is_exploring else 0.0)
         if not self.actor.is_greedy:
             proposals = self.codec.of_allowed(proposals, allowed)
+        q = None
         if not is_exploring and len(self.variations) > 0:
-            proposals = self._best_variations(state, proposals)
+            proposals, q = self._best_variations(state, proposals)
         latent = proposals[:, 0]
         if proposals.shape[1] > 1:
-            best = masked_values(self.critics(state, proposals).amin(0), allowed).argmax(-1)
+            q = self.critics(state, proposals).amin(0) if q is None else q
+            best = masked_values(q, allowed).argmax(-1)
             latent = proposals[torch.arange(len(best), device=best.device), best]
         discrete, unit = self.decode(state, latent, allowed)
         if is_exploring and self.epsilon > 0.0:
@@ -269,15 +271,17 @@ class HyARPolicy(TensorDictModuleBase):
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
-    def _best_variations(self, state: Tensor, proposals: Tensor) -> Tensor:
-        """Return of each proposal `[B, K, embedding_dim + latent_dim]` the best among itself and its variations."""
-        best = []
+    def _best_variations(self, state: Tensor, proposals: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the best of each proposal `[B, K, embedding_dim + latent_dim]` and its variations, and its value."""
+        best, values = [], []
         num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * (1 + len(self.variations))))
         for some_states, some_proposals in zip(state.split(num_rows), proposals.split(num_rows), strict=True):
             tried = with_variations(some_proposals, self.variations)
             q = self.critics(some_states, tried.flatten(1, 2)).amin(0).unflatten(1, tried.shape[1:3])
-            best.append(tried.take_along_dim(q.argmax(-1)[..., None, None], 2).squeeze(2))
-        return torch.cat(best)
+            value, place = q.max(-1)
+            best.append(tried.take_along_dim(place[..., None, None], 2).squeeze(2))
+            values.append(value)
+        return torch.cat(best), torch.cat(values)
 
     def decode(self, state: Tensor, latent: Tensor, allowed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the discrete action `[B]` and the parameters `[B, num_parameters]` in [-1, 1] of a latent action.

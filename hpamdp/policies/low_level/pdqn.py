@@ -54,6 +54,9 @@ from hpamdp.policies.shared.networks import (
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
 
+# Parameters, or values, of the variations that are tried at once: bounds the memory where discrete actions are many.
+_MAX_TRIED = 1 << 22
+
 
 class ParameterActor(nn.Module):
     """The parameters of all discrete actions: `[*B, observation_dim]` -> `[*B, num_parameters]` in [-1, 1]."""
@@ -130,13 +133,19 @@ class PDQNPolicy(TensorDictModuleBase):
 
     def _best_variation(self, state: Tensor, unit: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the discrete actions `[B]` and the parameters `[B, P]` that are best among x(s) and its variations."""
-        tried = with_variations(unit, self.variations)
-        num_tried = tried.shape[1]
-        q = self.critics(state.repeat_interleave(num_tried, 0), tried.flatten(0, 1)).amin(0)
-        best, place = q.unflatten(0, (-1, num_tried)).max(1)
-        discrete = masked_values(best, allowed).argmax(-1)
-        place = place.gather(-1, discrete.unsqueeze(-1))
-        return discrete, tried.take_along_dim(place.unsqueeze(-1), 1).squeeze(1)
+        num_tried = 1 + len(self.variations)
+        num_rows = max(1, _MAX_TRIED // (num_tried * max(unit.shape[-1], self.specs.num_discrete)))
+        values, places = [], []
+        for some_states, some_units in zip(state.split(num_rows), unit.split(num_rows), strict=True):
+            tried = with_variations(some_units, self.variations).flatten(0, 1)
+            q = self.critics(some_states.repeat_interleave(num_tried, 0), tried).amin(0)
+            best, place = q.unflatten(0, (-1, num_tried)).max(1)
+            values.append(best)
+            places.append(place)
+        discrete = masked_values(torch.cat(values), allowed).argmax(-1)
+        place = torch.cat(places).gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
+        none = unit.new_zeros(1, unit.shape[-1])
+        return discrete, (unit + torch.cat([none, self.variations])[place]).clamp(-1.0, 1.0)
 
 
 class PDQN(ReplayLearner):

@@ -722,15 +722,21 @@ class PETS(ReplayLearner):
         return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))
 
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the values `[N]` of observations `[N, *]`: as `end_values` has learned them, else those of plans."""
+        """Return the values `[N]` of observations `[N, *]`.
+
+        With `end_values` they are what these have learned, whatever a mask allows; else see `PETSPolicy.value`.
+        """
         if self.end_values is None:
             return self.policy.value(observation, action_mask)
         return self.end_values.of_own(observation[..., self.entries])
 
     def explore(self, frames: int) -> None:
         """Let the policy plan, as soon as there are different rewards, or end values, to plan for."""
-        reward = self.buffer[:]["reward"]
-        self.policy.is_trained.fill_(self.end_values is not None or bool((reward != reward[0]).any()))
+        if self.end_values is None:
+            reward = self.buffer[:]["reward"]
+            self.policy.is_trained.fill_(bool((reward != reward[0]).any()))
+        else:
+            self.policy.is_trained.fill_(True)
 
     def updates_due(self, before: int, frames: int) -> int:
         """Return how many updates to make; the first ones make up for the warm-up."""
@@ -748,7 +754,7 @@ class PETS(ReplayLearner):
 
     def prepared(self) -> TensorDict:
         """Fit the model's scales to all stored steps; return these in the canonical frame, as the model sees them."""
-        stored = self.buffer[:]
+        stored = self.buffer[:].select("state", "discrete", "unit", "next_state", "reward", "terminated")
         frame = self.model.frame
         if self.symmetry is not None and not frame.turns:
             stored = self._with_all_maps(stored)
@@ -788,12 +794,16 @@ class PETS(ReplayLearner):
         return rows.set("unit", rows["unit"].gather(-1, self.slots[rows["discrete"]]))
 
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update every member from its own minibatch of a sample `[num_members, batch_size]`; then the values."""
+        """Update every member from its own minibatch of a sample `[num_members, batch_size]`.
+
+        Then update the values, if they are learned, from as many steps as they were, mapped by no symmetry.
+        """
         scalars = self.minimise("model", self._loss, sample)
         if self.end_values is not None:
-            seen = self.buffer.sample(sample.numel())
-            rows = seen.copy().set("next_state", seen["next_observation"])
-            scalars |= self.end_values.update(self, rows, seen)
+            rows = self.buffer.sample(sample.numel())
+            state, next_state = rows["state"], rows["next_state"]
+            rows.set("next_state", rows["next_observation"])
+            scalars |= self.end_values.update(self, rows, state, next_state)
         return scalars
 
     def _loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:

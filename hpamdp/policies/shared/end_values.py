@@ -22,10 +22,12 @@ from hpamdp.policies.shared.replay import ReplayLearner
 
 
 class EndValues(nn.Module):
-    """Two values of a state: `of_own`, where this learner acts in it, and `forward`, where a plan ends in it.
+    """Two values of a state: `of_own`, if this learner acts there, and `forward`, if a plan ends there.
 
-    The latter is that of the option which then follows: another one, where an option has just ended. It is learned by
-    itself, so that a policy's copy in another process needs neither the selector nor the other learners.
+    A network of its own learns the latter: the value under the option that holds after the step, which is another one
+    where this learner's option has ended. So a policy's copy in another process needs neither the selector nor the
+    other learners. Where observations do not tell whether the option ends, it is the mean of both cases. A plan of
+    several steps runs on past the end of its option.
 
     Args:
         observation_dim: of the states.
@@ -55,7 +57,7 @@ class EndValues(nn.Module):
     def loss(
         self, state: Tensor, next_state: Tensor, reward: Tensor, discount: Tensor, next_value: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of both networks on stored steps, and what to log of it.
+        """Return the loss of both networks on stored steps, a scalar, and its parts `own_value` and `end_value`.
 
         Args:
             state, next_state: `[B, observation_dim]`.
@@ -74,17 +76,19 @@ class EndValues(nn.Module):
         yield from self.own.parameters()
         yield from self.end.parameters()
 
-    def update(self, learner: ReplayLearner, rows: TensorDictBase, seen: TensorDictBase) -> dict[str, Tensor]:
+    def update(
+        self, learner: ReplayLearner, rows: TensorDictBase, state: Tensor, next_state: Tensor
+    ) -> dict[str, Tensor]:
         """Take a step of the learner's optimizer `end_values`, then move the target network; return what to log.
 
         Args:
             learner: whose steps they are.
             rows: stored steps `[B]`, see `ReplayLearner.transitions`.
-            seen: `state` and `next_state` `[B, observation_dim]` of these steps, as the networks see them.
+            state, next_state: of these steps, as the networks see them, `[B, observation_dim]`.
         """
         with torch.no_grad():
             next_value = learner.next_value(rows)
-        inputs = seen["state"], seen["next_state"], rows["reward"], rows["discount"], next_value
+        inputs = state, next_state, rows["reward"], rows["discount"], next_value
         scalars = learner.minimise("end_values", self.loss, *inputs)
         polyak_update(self.target_own, self.own, self.tau)
         return scalars

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.quasirandom import SobolEngine
 
 from hpamdp.specs import PAMDPSpecs
 
@@ -95,8 +96,18 @@ def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
 
 
 def even_normal(num: int, dim: int, deviation: float) -> Tensor:
-    """Return normal vectors `[num, dim]` with mean 0, the same at each call, that cover the space evenly."""
-    uniform = torch.quasirandom.SobolEngine(max(dim, 1), scramble=True, seed=0).draw(max(num, 1))[:num, :dim]
+    """Return normal vectors `[num, dim]` with mean 0, the same at each call, that cover the space evenly.
+
+    Raises:
+        ValueError: there are too many dimensions.
+    """
+    if num == 0 or dim == 0:
+        return torch.zeros(num, dim)
+    if dim > SobolEngine.MAXDIM:
+        raise ValueError(
+            f"greedy_samples={num}: {dim} parameters are more than {SobolEngine.MAXDIM}; use greedy_samples=0"
+        )
+    uniform = SobolEngine(dim, scramble=True, seed=0).draw(num)
     return deviation * torch.special.ndtri(uniform.clamp(1e-6, 1.0 - 1e-6))
 
 

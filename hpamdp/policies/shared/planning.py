@@ -33,17 +33,20 @@ def discounted_return(
     Args:
         steps: what is predicted of them.
         gamma: discount of a step.
-        end_value: maps the last step's `next_state` to what follows it, also weighted; None: nothing.
+        end_value: maps the last step's `next_state`, whatever its shape, to what follows it, `[B]` or `[E, B]`, which
+            is weighted in the same way; None: nothing.
     """
     total: Tensor | float = 0.0
     survival: Tensor | float = 1.0
-    for h, step in enumerate(steps):
+    discount, state = 1.0, None
+    for step in steps:
         ends = step.logit.float().sigmoid()
         reward = ends * step.terminating + (1.0 - ends) * step.continuing
-        total = total + gamma**h * survival * reward.float()
+        total = total + discount * survival * reward.float()
         survival = survival * (1.0 - ends)
-    if end_value is not None:
-        total = total + gamma ** (h + 1) * survival * end_value(step.next_state.float())
+        discount, state = discount * gamma, step.next_state
+    if end_value is not None and state is not None:
+        total = total + discount * survival * end_value(state.float())
     assert isinstance(total, Tensor)
     return total
 
