@@ -98,16 +98,12 @@ def learner(run: Run) -> str:
 def merged(stored: Rows, new: Rows) -> Rows:
     """Return the stored rows without those of runs that were made anew, and the new rows, by domain and learner."""
     made_anew = {tuple(str(row[name]) for name in KEY) for row in new}
-    kept = [row for row in stored if tuple(_text(row[name]) for name in KEY) not in made_anew]
+    kept = [row for row in stored if tuple(str(row[name]) for name in KEY) not in made_anew]
     rows = kept + new
     order = {name: number for number, name in enumerate(DOMAINS)}
     return sorted(
         rows, key=lambda row: (order[row["domain"]], row["learner"], float(row["frames"]), float(row["seed"]))
     )
-
-
-def _text(value: Any) -> str:
-    return f"{value:.0f}" if isinstance(value, float) else str(value)
 
 
 def at_published_steps(results: Rows) -> Rows:

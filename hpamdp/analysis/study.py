@@ -78,10 +78,12 @@ def read_csv(path: Path) -> Rows:
 
 
 def _number(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text
 
 
 def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
