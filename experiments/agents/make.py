@@ -25,7 +25,7 @@ AGENTS = {
     "hppo_congruent": [*ONE_BOAT, "env.controller=congruent"],
     "hppo_incongruent": [*ONE_BOAT, "env.controller=incongruent"],
     "hppo_platform": ["high=none", "low=hppo", "env=platform", "eval.every=20000"],
-    "pdqn_goal": [*GOAL, "env=goal"],
+    "pdqn_goal": [*GOAL, "env=goal", "seed=3"],
     "pdqn_hard_goal": [*GOAL, "env=hard_goal"],
     "hppo_catch_point": ["high=none", "low=hppo", "env=catch_point", "eval.every=100000", "seed=1"],
     "hppo_hard_move_4": [*HARD_MOVE, "env.n=4"],
