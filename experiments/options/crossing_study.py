@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from study import add, learned_values, make_config, tabulate, trained, value_errors
+from study import DLPA_PLANS, PETS_PLANS, add, learned_values, make_config, tabulate, trained, value_errors
 from tensordict import TensorDictBase
 
 from hpamdp import keys
@@ -83,35 +83,21 @@ LEARNERS = {
     "hyar": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.codec_pretrain_updates=300"],
     "paddpg": [*REPLAY, "low.tau=0.05", "low.epsilon_frames=5000", "low.actor_lr=1e-3"],
     "hsac": [*REPLAY, "low.tau=0.05", "low.discrete_temperature=0.002", "low.parameter_temperature=0.001"],
-    # Plans of one step: what their last state is worth says the rest, and tells lengths of steps apart more clearly.
     "dlpa": [
         "low.hidden_dims=[64]",
         "low.warmup_frames=1000",
         "low.batch_size=128",
         "low.updates_per_frame=0.1",
-        "low.end_values=true",
         "low.end_value_lr=3e-3",
-        "low.end_value_tau=0.05",
-        "low.horizon=1",
-        "low.temperature=0.01",
-        "low.num_samples=32",
-        "low.num_elites=8",
-        "low.num_iterations=3",
-        "low.epsilon=0.2",
+        *DLPA_PLANS,
     ],
     "pets": [
         "total_frames=16000",
         "agent.uniform_option_frames=8000",
         "low.warmup_frames=500",
         "low.updates_per_frame=0.3",
-        "low.end_values=true",
         "low.end_value_lr=3e-3",
-        "low.end_value_tau=0.05",
-        "low.horizon=1",
-        "low.temperature=0.01",
-        "low.greedy_samples=12",
-        "low.num_iterations=3",
-        "low.parameter_noise=0.2",
+        *PETS_PLANS,
     ],
     "qpamdp": [
         "total_frames=300000",

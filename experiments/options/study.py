@@ -72,6 +72,16 @@ REPLAY = [
     "agent.uniform_option_frames=120000",
     "low.hidden_dims=[64,64]",
 ]
+# Plans of one step: what their last state is worth says the rest, and tells lengths of steps apart more clearly.
+ONE_STEP_PLANS = [
+    "low.end_values=true",
+    "low.end_value_tau=0.05",
+    "low.horizon=1",
+    "low.temperature=0.01",
+    "low.num_iterations=3",
+]
+DLPA_PLANS = [*ONE_STEP_PLANS, "low.num_samples=32", "low.num_elites=8", "low.epsilon=0.2"]
+PETS_PLANS = [*ONE_STEP_PLANS, "low.greedy_samples=12", "low.parameter_noise=0.2"]
 LEARNERS = {
     # Small batches, for many updates of a policy that must go through the rooms before it finds a reward.
     "hppo": [
@@ -122,21 +132,13 @@ LEARNERS = {
         "low.discrete_target_entropy=0.5",
         "low.parameter_target_entropy=-1.0",
     ],
-    # Plans of one step: what their last state is worth says the rest.
     "dlpa": [
         "total_frames=100000",
         "agent.uniform_option_frames=60000",
         "low.hidden_dims=[64,64]",
         "low.warmup_frames=15000",
         "low.updates_per_frame=0.1",
-        "low.end_values=true",
-        "low.end_value_tau=0.05",
-        "low.horizon=1",
-        "low.temperature=0.01",
-        "low.num_samples=32",
-        "low.num_elites=8",
-        "low.num_iterations=3",
-        "low.epsilon=0.2",
+        *DLPA_PLANS,
     ],
     "pets": [
         "total_frames=100000",
@@ -148,13 +150,7 @@ LEARNERS = {
         "low.batch_size=256",
         "low.weight_decay=0.1",
         "low.optimism=0",
-        "low.end_values=true",
-        "low.end_value_tau=0.05",
-        "low.horizon=1",
-        "low.temperature=0.01",
-        "low.greedy_samples=12",
-        "low.num_iterations=3",
-        "low.parameter_noise=0.2",
+        *PETS_PLANS,
     ],
     # All entries, two in a feature: with the one-hot vectors this makes a value for each cell. Episodes are options.
     "qpamdp": [

@@ -318,11 +318,11 @@ class DLPA(ReplayLearner):
         self.rho = rho
         self.horizon = horizon
         self.model = PAMDPModel(specs, form, hidden_dims, num_members)
-        self.end_values: EndValues | None = None
-        if end_values:
-            self.end_values = EndValues(
-                specs.observation_dim, hidden_dims, tau=end_value_tau, expectile=end_value_expectile
-            )
+        self.end_values = (
+            EndValues(specs.observation_dim, hidden_dims, tau=end_value_tau, expectile=end_value_expectile)
+            if end_values
+            else None
+        )
         planner = Planner(
             self.model,
             specs,

@@ -35,7 +35,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
-from hpamdp.policies.shared.networks import InitialParameters, VectorProducts
+from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy
 from hpamdp.policies.shared.portable import portable_actor
 from hpamdp.specs import PAMDPSpecs
@@ -134,10 +134,9 @@ class HPPO(OnPolicy, Learner):
             initial_parameters,
             vector_products=vector_products,
         )
-        products = [VectorProducts(specs)] if vector_products else []
-        num_inputs = products[0].num_outputs if products else specs.observation_dim
+        products = [] if self.actor.products is None else [self.actor.products]
         self.critic = nn.Sequential(
-            *products, encoder(num_inputs, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
+            *products, encoder(self.actor.num_inputs, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
         )
         self.policy = HPPOPolicy(self.actor, specs, samples_when_greedy=greedy_discrete == "sampled")
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))

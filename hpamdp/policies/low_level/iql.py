@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp.policies.shared.fractions import Expectile, LearningRate, PositiveFraction
+from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
@@ -103,7 +104,7 @@ class IQL(ReplayLearner):
     def _value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of V from the expectile of the values `[B]` of the data's actions."""
         excess = q - self.value(state)
-        loss = (torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile) * excess.square()).mean()
+        loss = expectile_loss(excess, self.expectile)
         return loss, {"value": loss}
 
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:

@@ -669,11 +669,11 @@ class PETS(ReplayLearner):
             uses_geometry=uses_geometry,
             linear_part=linear_part,
         )
-        self.end_values: EndValues | None = None
-        if end_values:
-            self.end_values = EndValues(
-                specs.observation_dim, outcome_dims, tau=end_value_tau, expectile=end_value_expectile
-            )
+        self.end_values = (
+            EndValues(specs.observation_dim, outcome_dims, tau=end_value_tau, expectile=end_value_expectile)
+            if end_values
+            else None
+        )
         search = SequenceSearch(
             specs.parameter_dims,
             horizon=horizon,

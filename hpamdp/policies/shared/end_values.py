@@ -17,6 +17,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 
@@ -66,8 +67,7 @@ class EndValues(nn.Module):
             next_value: of the next states under the option that follows, `[B]`.
         """
         excess = reward + discount * next_value - self.own(state).squeeze(-1)
-        weight = torch.where(excess > 0.0, self.expectile, 1.0 - self.expectile)
-        own = (weight * excess.square()).mean()
+        own = expectile_loss(excess, self.expectile)
         end = ((self(next_state) - next_value).square() * (discount > 0.0)).mean()
         return own + end, {"own_value": own, "end_value": end}
 

@@ -62,6 +62,16 @@ class Descent:
         return scalars
 
 
+def expectile_loss(excess: Tensor, expectile: float) -> Tensor:
+    """Return a scalar, least where a prediction is the expectile of its targets: Kostrikov et al. 2021, equation 5.
+
+    Args:
+        excess: of the targets over the predictions, `[B]`.
+        expectile: of the targets, from .5, their mean, towards 1, the largest.
+    """
+    return (torch.where(excess > 0.0, expectile, 1.0 - expectile) * excess.square()).mean()
+
+
 def gradients_of(
     loss_of: LossFunction, parameters: Sequence[Tensor], *inputs: Inputs, precision: torch.dtype = torch.float32
 ) -> tuple[dict[str, Tensor], tuple[Tensor | None, ...]]:

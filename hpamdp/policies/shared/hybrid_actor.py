@@ -109,6 +109,10 @@ class HybridActor(nn.Module):
         initial_scale: standard deviation at initialisation, strictly within `scale_range`.
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
         vector_products: whether the encoder also sees `VectorProducts`.
+
+    Attributes:
+        products: appends these to observations; None: there are none.
+        num_inputs: how many numbers the encoder sees.
     """
 
     log_min_scale: Tensor
@@ -127,8 +131,8 @@ class HybridActor(nn.Module):
         super().__init__()
         self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.products = VectorProducts(specs) if vector_products else None
-        num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
-        self.encoder = encoder(num_inputs, hidden_dims)
+        self.num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
+        self.encoder = encoder(self.num_inputs, hidden_dims)
         self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete)
         self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters)
         log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
