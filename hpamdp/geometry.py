@@ -146,7 +146,7 @@ class Symmetries(Contexts):
         sign: `[G, num_parameters]`: 1 or -1, of the parameter that takes the place.
         shift: `[G, num_parameters]`: what is added to it then.
         is_periodic: bool `[num_parameters]`: whether -1 and 1 are the same.
-        contexts: int64 `[G, num_contexts]`: what each context becomes.
+        contexts: int64 `[G, num_contexts]`: what each context becomes; the maps of one option keep all columns.
     """
 
     weight: Tensor
@@ -195,6 +195,10 @@ class Symmetries(Contexts):
         periodic = (moved + 1.0).remainder(2.0) - 1.0
         return self.discrete[number, context, discrete], torch.where(self.is_periodic, periodic, moved)
 
+    def map_option(self, number: Tensor, option: Tensor) -> Tensor:
+        """Return options `[*B]` under the maps int64 `[*B]`; they stay as they are where they are no contexts."""
+        return option if self.contexts.shape[-1] == 1 else self.contexts[number, option]
+
     def of_option(self, option: int) -> Symmetries:
         """Return the maps of a learner that serves one option: those that keep it."""
         if self.num_contexts == 1:
@@ -203,7 +207,6 @@ class Symmetries(Contexts):
         tables = {name: value[kept] for name, value in self._tensors().items() if name != "is_periodic"}
         for name in ("discrete", "source"):
             tables[name] = tables[name][:, option : option + 1]
-        tables["contexts"] = torch.zeros(len(tables["weight"]), 1, dtype=torch.long)
         return replace(self, **tables, num_contexts=1, context_entry=None)  # type: ignore[arg-type]
 
     def with_option_observed(self, observation_dim: int, num_options: int) -> Symmetries:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from tensordict import TensorDict
+from torch.nn.functional import one_hot
 
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -217,6 +218,48 @@ def test_a_map_that_swaps_the_options_is_left_out_for_one_and_permutes_the_obser
     assert (shared.map_observation(swaps, seen)[:, 7] == 1.0).all()
 
 
+def boat_rows(env: BoatDockEnv, option: torch.Tensor, next_option: torch.Tensor) -> TensorDict:
+    """Return steps in whose observations the boat has been chosen, with the options before and after them."""
+    seen = torch.rand(len(option), PAMDPSpecs.from_env(env).observation_dim)
+    after = seen.clone()
+    seen[:, 7], after[:, 7] = option.float(), next_option.float()
+    return TensorDict(
+        {
+            "state": seen,
+            "next_state": after,
+            "discrete": torch.zeros(len(option), dtype=torch.long),
+            "unit": torch.zeros(len(option), 3),
+            "option": option,
+            "next_option": next_option,
+        },
+        [len(option)],
+    )
+
+
+def test_random_symmetries_that_swap_the_boats_swap_the_options_of_a_sample_as_well():
+    env = BoatDockEnv(1, controller="choose")
+    rows = boat_rows(env, torch.randint(2, (100,)), torch.randint(2, (100,)))
+    rows["state"] = torch.cat([rows["state"], one_hot(rows["option"], 2).float()], -1)
+    rows["next_state"] = torch.cat([rows["next_state"], one_hot(rows["next_option"], 2).float()], -1)
+    shared = PAMDPSpecs.from_env(env).with_option_observed()
+    mapped = RandomSymmetry(shared, torch.device("cpu"))(rows)
+    assert (mapped["option"] != rows["option"]).any()
+    assert mapped["option"].equal(mapped["state"][:, 16:].argmax(-1))
+    assert mapped["next_option"].equal(mapped["next_state"][:, 16:].argmax(-1))
+
+
+def test_maps_that_keep_one_of_three_boats_swap_the_others_in_the_option_that_follows():
+    turned = {"congruent": [150, 270, 30], "port": [170, 290, 50], "starboard": [130, 250, 10]}
+    env = BoatDockEnv(1, controller="choose", boats=[*turned], controllers=turned)
+    augment = RandomSymmetry(PAMDPSpecs.from_env(env).of_option(0), torch.device("cpu"))
+    rows = boat_rows(env, torch.zeros(100, dtype=torch.long), torch.arange(100) % 3)
+    mapped = [augment.mapped(torch.full((100,), number), rows) for number in range(len(augment.maps))]
+    assert all((each["option"] == 0).all() for each in mapped)
+    swapped = [each for each in mapped if not each["next_option"].equal(rows["next_option"])]
+    assert len(swapped) == len(mapped) // 2
+    assert all(each["next_option"].equal(torch.tensor([0, 2, 1])[rows["next_option"]]) for each in swapped)
+
+
 def test_motor_noise_that_differs_between_the_boats_leaves_no_map_that_swaps_them():
     maps = BoatDockEnv(1, controller="choose", motor_noise=[0.1, 0.2]).symmetries
     assert len(maps) == 6 and maps.contexts.equal(torch.tensor([0, 1]).expand(6, 2))
@@ -243,15 +286,15 @@ def test_a_declaration_that_does_not_fit_is_refused_in_one_line():
 def test_random_symmetries_map_whole_rows_and_windows_by_one_map():
     specs = PAMDPSpecs.from_env(CatchPointEnv(1))
     augment = RandomSymmetry(specs, torch.device("cpu"))
-    state = torch.tensor([1.0, 0.0, 0.0, 2.0]).expand(50, 3, 4)
+    state = torch.tensor([1.0, 0.0, 0.0, 2.0]).expand(500, 3, 4)
     rows = TensorDict(
         {
             "state": state,
             "next_state": state,
-            "discrete": torch.zeros(50, 3, dtype=torch.long),
-            "unit": torch.zeros(50, 3, 1),
+            "discrete": torch.zeros(500, 3, dtype=torch.long),
+            "unit": torch.zeros(500, 3, 1),
         },
-        [50, 3],
+        [500, 3],
     )
     mapped = augment(rows)
     assert torch.equal(mapped["state"], mapped["next_state"])

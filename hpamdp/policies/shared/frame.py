@@ -135,7 +135,7 @@ class RandomSymmetry:
         self.maps: Symmetries = specs.symmetries.to(device)
 
     def __call__(self, rows: TensorDictBase) -> TensorDictBase:
-        """Return rows `[N, *]` with `state`, `discrete`, `unit` and `next_state` mapped, each row by one map."""
+        """Return rows `[N, *]`, each with states, action and options (where it has any) mapped by one map."""
         number = torch.randint(len(self.maps), rows.batch_size[:1], device=rows["state"].device)
         shape = rows.batch_size
         number = number.reshape(-1, *[1] * (len(shape) - 1)).expand(shape)
@@ -148,4 +148,7 @@ class RandomSymmetry:
         rows = rows.copy()
         for name in ("state", "next_state"):
             rows.set(name, self.maps.map_observation(number, rows[name]))
+        for name in ("option", "next_option"):
+            if name in rows.keys():
+                rows.set(name, self.maps.map_option(number, rows[name]))
         return rows.set("discrete", discrete).set("unit", unit)
