@@ -182,6 +182,28 @@ def test_the_targets_of_the_option_critic_equal_those_by_hand(decides):
     assert critic._target(rows).tolist() == pytest.approx([expected.item(), 2.0, 3.0])
 
 
+def test_ends_that_are_sure_and_wrong_are_learned_anew():
+    critic = make_critic()
+    with torch.no_grad():
+        critic.critic[-1].weight.zero_()
+        critic.critic[-1].bias.copy_(torch.tensor([0.0, 0.2]))  # so that option 0 has to end, and option 1 has not
+        critic.termination[-1].weight.zero_()
+        critic.termination[-1].bias.copy_(torch.tensor([-20.0, 20.0]))
+    rows = TensorDict(
+        {
+            "next_state": torch.rand(64, SPECS.observation_dim),
+            "option": torch.arange(64) % 2,
+            "discount": torch.full((64,), GAMMA),
+        },
+        [64],
+    )
+    critic.deliberation_cost = 0.01
+    for _ in range(1000):
+        critic._update_termination(rows)
+    beta = critic._beta(rows["next_state"], rows["option"], None)
+    assert (beta[0::2] > 0.9).all() and (beta[1::2] < 0.1).all()
+
+
 def test_options_end_with_the_initial_probability():
     critic = make_critic(initial_termination=0.3)
     td = TensorDict({keys.OBSERVATION: torch.rand(4000, SPECS.observation_dim), keys.OPTION: torch.zeros(4000).long()})

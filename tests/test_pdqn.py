@@ -20,6 +20,7 @@ OPTIONS = dict(
     updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
     max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1, epsilon_frames=3000,
     epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0, lr_frames=1000,
+    preactivation_penalty=0.0,
 )  # fmt: skip
 PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
 
@@ -281,6 +282,24 @@ def test_parameters_start_at_the_problems_initial_ones_and_can_move(bounding):
     torch.testing.assert_close(before, expected, atol=0.02, rtol=0.0)
     learner._update_actor(state, None)
     assert (learner.actor(state) != before).any()
+
+
+@pytest.mark.parametrize("penalty", [0.0, 0.1])
+def test_a_penalty_on_preactivations_frees_parameters_that_tanh_holds_at_a_bound(penalty):
+    torch.manual_seed(0)
+    learner = make(preactivation_penalty=penalty, actor_lr=1e-2)
+    state = states(64)[keys.OBSERVATION]
+    with torch.no_grad():
+        learner.actor.net[-1].bias.fill_(20.0)  # the tanh of which is 1
+    for _ in range(200):
+        learner._update_actor(state, None)
+    is_free = learner.actor(state) < 0.99
+    assert is_free.all() if penalty > 0.0 else not is_free.any()
+
+
+def test_a_penalty_on_preactivations_is_refused_where_nothing_is_squashed():
+    with pytest.raises(ValueError, match=r"preactivation_penalty=0\.1: needs bounding=tanh"):
+        make(preactivation_penalty=0.1, bounding="inverting_gradients")
 
 
 def test_epsilon_can_fall_with_the_episodes():

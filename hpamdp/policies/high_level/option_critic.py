@@ -12,6 +12,8 @@ Differs from the sources:
 - Q and beta are learned from a replay buffer of steps, Q with a target network;
 - the value of a state is max_o Q(s, o), without the share of random choices;
 - where a time limit ends an episode, nothing follows;
+- beta is learned by logistic regression, weighed by the size of the advantage: its gradient has the sign of the
+  source's, but does not vanish where beta is sure and wrong, as it can be from values learned early;
 - exploring, an option ends with `initial_termination` as often as options are random, else with beta;
 - greedily, an option ends where beta is above 1/2.
 """
@@ -25,6 +27,7 @@ import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
@@ -224,6 +227,9 @@ class OptionCritic(Selector):
     def _update_termination(self, rows: TensorDictBase) -> Tensor:
         """Make one step of the terminations against the advantage of going on; return their mean probability.
 
+        The loss is the logistic one: of an end where going on is better, of no end where it is not, each weighed by how
+        much. Forbidden options end in any case.
+
         Args:
             rows: steps `[batch_size]`.
         """
@@ -232,9 +238,13 @@ class OptionCritic(Selector):
             q = self.critic(state)
             best = masked_values(q, mask).amax(-1)
             advantage = q.gather(-1, option.unsqueeze(-1)).squeeze(-1) - best + self.deliberation_cost
-        beta = self._beta(state, option, mask)
-        loss = (beta * advantage * (rows["discount"] > 0.0)).mean()
+            is_open = rows["discount"] > 0.0
+            if mask is not None:
+                is_open &= mask.gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        logit = self.termination(state).gather(-1, option.unsqueeze(-1)).squeeze(-1)
+        regret = advantage.abs() * F.softplus(torch.where(advantage > 0.0, logit, -logit))
+        loss = (regret * is_open).mean()
         self.optimizers["termination"].zero_grad(set_to_none=True)
         loss.backward()
         self.optimizers["termination"].step()
-        return beta.detach().mean()
+        return logit.detach().sigmoid().mean()

@@ -7,7 +7,8 @@ Source: Xiong et al., *Parametrized Deep Q-Networks Learning: Reinforcement Lear
 Action Space*, 2018, arXiv 1810.06394, algorithm 1. Multi-pass: Bester, James and Konidaris, *Multi-Pass Q-Networks for
 Deep Reinforcement Learning with Parameterised Action Spaces*, 2019, arXiv 1905.04388. Twin critics, target smoothing,
 delayed actor: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477 (TD3). Double Q: van Hasselt, Guez and Silver 2016,
-arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.04143.
+arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.04143. Penalty on preactivations:
+Andrychowicz et al. 2017, arXiv 1707.01495, appendix A.
 
 Differs from the source:
 - one learner with uniform replay and target networks, which move at a rate each, as in Bester et al., instead of
@@ -72,7 +73,14 @@ class ParameterActor(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """Return the bounded parameters."""
-        raw = self.net(state) + self.initial(state)
+        return self.bounded(self.raw(state))
+
+    def raw(self, state: Tensor) -> Tensor:
+        """Return the parameters before they are bounded: with tanh, the preactivations."""
+        return self.net(state) + self.initial(state)
+
+    def bounded(self, raw: Tensor) -> Tensor:
+        """Return the parameters of raw ones."""
         return InvertingGradients.apply(raw) if self.is_inverting else raw.tanh()
 
 
@@ -183,6 +191,7 @@ class PDQN(ReplayLearner):
         actor_tau: PositiveFraction,
         critic_tau: PositiveFraction,
         max_grad_norm: PositiveFloat | None,
+        preactivation_penalty: NonNegativeFloat,
         parameter_noise: NonNegativeFloat,
         greedy_samples: NonNegativeInt,
         greedy_noise: NonNegativeFloat,
@@ -190,6 +199,8 @@ class PDQN(ReplayLearner):
         epsilon_frames: NonNegativeInt,
         epsilon_episodes: PositiveInt | None,
     ) -> None:
+        if preactivation_penalty > 0.0 and bounding != "tanh":
+            raise ValueError(f"preactivation_penalty={preactivation_penalty}: needs bounding=tanh; {bounding=}")
         super().__init__(
             specs,
             device,
@@ -212,6 +223,7 @@ class PDQN(ReplayLearner):
         self.actor_tau = actor_tau
         self.critic_tau = critic_tau
         self.max_grad_norm = max_grad_norm
+        self.preactivation_penalty = preactivation_penalty
         self.reward_scale = reward_scale
         self.epsilon_final = epsilon_final
         self.epsilon_frames = epsilon_frames
@@ -290,8 +302,11 @@ class PDQN(ReplayLearner):
         return self.minimise("actor", self._actor_loss, state, allowed, max_grad_norm=self.max_grad_norm)
 
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
-        q = self.critics(state, self.actor(state)).amin(0)
+        raw = self.actor.raw(state)
+        q = self.critics(state, self.actor.bounded(raw)).amin(0)
         loss = -(q if allowed is None else q * allowed).sum(-1).mean()
+        if self.preactivation_penalty > 0.0:
+            loss = loss + self.preactivation_penalty * raw.square().sum(-1).mean()
         return loss, {"actor": loss}
 
     @torch.no_grad()
