@@ -20,7 +20,7 @@ OPTIONS = dict(
     updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
     max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1, epsilon_frames=3000,
     epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0, lr_frames=1000,
-    preactivation_penalty=0.0,
+    preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
 )  # fmt: skip
 PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
 
@@ -300,6 +300,42 @@ def test_a_penalty_on_preactivations_frees_parameters_that_tanh_holds_at_a_bound
 def test_a_penalty_on_preactivations_is_refused_where_nothing_is_squashed():
     with pytest.raises(ValueError, match=r"preactivation_penalty=0\.1: needs bounding=tanh"):
         make(preactivation_penalty=0.1, bounding="inverting_gradients")
+
+
+class TwoHills(torch.nn.Module):
+    """Values that have a high hill at -0.7 and a low one at 0.6 in every parameter."""
+
+    def forward(self, state: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
+        return torch.maximum(1.0 - 2.0 * (unit + 0.7).abs(), 0.5 - 2.0 * (unit - 0.6).abs()).unsqueeze(0)
+
+
+@pytest.mark.parametrize("bounding", ["tanh", "inverting_gradients"])
+@pytest.mark.parametrize("search_samples", [0, 8])
+def test_the_search_brings_the_actor_to_a_higher_hill_that_its_gradient_does_not_see(search_samples, bounding):
+    torch.manual_seed(0)
+    specs = replace(SPECS, parameter_dims=(1, 1, 1))
+    learner = make(specs, search_samples=search_samples, search_weight=10.0, bounding=bounding, actor_lr=1e-2)
+    learner.critics = TwoHills()
+    state = states(64)[keys.OBSERVATION]
+    with torch.no_grad():
+        learner.actor.net[-1].weight.zero_()
+        learner.actor.net[-1].bias.fill_(0.5)
+    for _ in range(300):
+        learner._update_actor(state, None)
+    expected = -0.7 if search_samples else 0.6
+    torch.testing.assert_close(learner.actor(state), torch.full((64, 3), expected), atol=0.1, rtol=0.0)
+
+
+def test_the_search_leaves_forbidden_actions_parameters_alone():
+    torch.manual_seed(0)
+    specs = replace(SPECS, parameter_dims=(1, 1, 1))
+    learner = make(specs, search_samples=8)
+    learner.critics = TwoHills()
+    state = states(64)[keys.OBSERVATION]
+    allowed = torch.tensor([True, False, True]).expand(64, -1)
+    loss, _ = learner._actor_loss(state, allowed)
+    gradient = torch.autograd.grad(loss, learner.actor.net[-1].bias)[0]
+    assert (gradient != 0.0).tolist() == [True, False, True]
 
 
 def test_epsilon_can_fall_with_the_episodes():

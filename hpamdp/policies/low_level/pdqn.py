@@ -8,13 +8,16 @@ Action Space*, 2018, arXiv 1810.06394, algorithm 1. Multi-pass: Bester, James an
 Deep Reinforcement Learning with Parameterised Action Spaces*, 2019, arXiv 1905.04388. Twin critics, target smoothing,
 delayed actor: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477 (TD3). Double Q: van Hasselt, Guez and Silver 2016,
 arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.04143. Penalty on preactivations:
-Andrychowicz et al. 2017, arXiv 1707.01495, appendix A.
+Andrychowicz et al. 2017, arXiv 1707.01495, appendix A. Towards the best of random actions: Neumann et al. 2018,
+*Greedy Actor-Critic*, arXiv 1810.09103.
 
 Differs from the source:
 - one learner with uniform replay and target networks, which move at a rate each, as in Bester et al., instead of
   asynchronous learners;
 - with `greedy_samples` the greedy policy also values variations of x(s) and takes the best of them all: the critics
   often know better parameters than those that the actor's gradient has led to. It makes no difference in training;
+- with `search_samples` the actor is also drawn to the best of uniformly random parameters of each discrete action, the
+  more the better they are by the critics than its own. A gradient alone stays on the hill that it began on;
 - where only the chosen action's value matters, only its pass is computed; passes share what they have in common;
 - networks start as PyTorch's, not as Kaiming et al. proposed;
 - by default, that is with `pdqn.yaml`: twin critics, whose minimum is Q everywhere (in the targets, in the actor's loss
@@ -55,6 +58,9 @@ from hpamdp.policies.shared.networks import (
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
 
+# Beyond it tanh needs preactivations that it does not come back from; where the actor is drawn to lies within.
+_LARGEST_DRAWN_TO = 0.97
+
 # Parameters, or values, of the variations that are tried at once: bounds the memory where discrete actions are many.
 _MAX_TRIED = 1 << 22
 
@@ -82,6 +88,10 @@ class ParameterActor(nn.Module):
     def bounded(self, raw: Tensor) -> Tensor:
         """Return the parameters of raw ones."""
         return InvertingGradients.apply(raw) if self.is_inverting else raw.tanh()
+
+    def unbounded(self, unit: Tensor) -> Tensor:
+        """Return the raw parameters of bounded ones in [-1, 1], or of some close to them."""
+        return unit if self.is_inverting else unit.clamp(-_LARGEST_DRAWN_TO, _LARGEST_DRAWN_TO).atanh()
 
 
 class PDQNPolicy(TensorDictModuleBase):
@@ -192,6 +202,8 @@ class PDQN(ReplayLearner):
         critic_tau: PositiveFraction,
         max_grad_norm: PositiveFloat | None,
         preactivation_penalty: NonNegativeFloat,
+        search_samples: NonNegativeInt,
+        search_weight: NonNegativeFloat,
         parameter_noise: NonNegativeFloat,
         greedy_samples: NonNegativeInt,
         greedy_noise: NonNegativeFloat,
@@ -224,6 +236,8 @@ class PDQN(ReplayLearner):
         self.critic_tau = critic_tau
         self.max_grad_norm = max_grad_norm
         self.preactivation_penalty = preactivation_penalty
+        self.search_samples = search_samples
+        self.search_weight = search_weight
         self.reward_scale = reward_scale
         self.epsilon_final = epsilon_final
         self.epsilon_frames = epsilon_frames
@@ -307,7 +321,31 @@ class PDQN(ReplayLearner):
         loss = -(q if allowed is None else q * allowed).sum(-1).mean()
         if self.preactivation_penalty > 0.0:
             loss = loss + self.preactivation_penalty * raw.square().sum(-1).mean()
+        if self.search_samples > 0 and self.search_weight > 0.0:
+            found, gain = self._best_of_random(state, q)
+            gain = gain if allowed is None else gain * allowed
+            distance = (raw - self.actor.unbounded(found)).square()
+            loss = loss + self.search_weight * (gain[:, self.owner] * distance).sum(-1).mean()
         return loss, {"actor": loss}
+
+    @torch.no_grad()
+    def _best_of_random(self, state: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return for every discrete action the best of random parameters, by the critics, and its gain.
+
+        Args:
+            state: `[B, observation_dim]`.
+            q: values of the actor's parameters there, `[B, num_discrete]`.
+
+        Returns:
+            Parameters `[B, num_parameters]` in [-1, 1], and by how much each discrete action is better with its own of
+            them than with the actor's, `[B, num_discrete]`, at least 0.
+        """
+        num_tried = self.search_samples
+        tried = 2.0 * torch.rand(len(state), num_tried, self.specs.num_parameters, device=state.device) - 1.0
+        values = self.critics(state.repeat_interleave(num_tried, 0), tried.flatten(0, 1)).amin(0)
+        best, place = values.unflatten(0, (-1, num_tried)).max(1)
+        found = tried.gather(1, place[:, self.owner].unsqueeze(1)).squeeze(1)
+        return found, (best - q).clamp(min=0.0)
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
