@@ -16,8 +16,8 @@ OPTIONS = dict(
     embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000,
     codec_pretrain_updates=700, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, relabelling="mean",
-    buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, tau=0.02, actor_lr=1e-3, critic_lr=1e-3,
-    augment=False,
+    buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
+    critic_lr=1e-3, augment=False,
     lr_final=1.0, lr_frames=0, policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1,
     greedy_samples=0, greedy_noise=0.3, epsilon_final=0.05, epsilon_frames=3000,
 )  # fmt: skip
@@ -137,6 +137,13 @@ def test_only_masked_transitions_are_stored():
     learner = make(warmup_frames=10_000)
     learner.learn(one_step_rows(learner, 100), torch.arange(100) < 30)
     assert learner.frames == 30 and len(learner.buffer) == 30
+
+
+def test_rewards_are_stored_scaled():
+    learner = make(reward_scale=0.1, warmup_frames=10_000)
+    rows = one_step_rows(learner, 50)
+    learner.learn(rows, torch.ones(rows.shape, dtype=torch.bool))
+    torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * rows["next", keys.REWARD].flatten())
 
 
 def test_targets_bootstrap_past_truncation_and_not_past_termination(trained):

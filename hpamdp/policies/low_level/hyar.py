@@ -330,6 +330,7 @@ class HyAR(ReplayLearner):
         updates_per_frame: PositiveFloat,
         augment: bool,
         gamma: PositiveFraction,
+        reward_scale: PositiveFloat,
         tau: PositiveFraction,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
@@ -358,6 +359,7 @@ class HyAR(ReplayLearner):
         self.codec_every = codec_every
         self.kl_weight = kl_weight
         self.dynamics_weight = dynamics_weight
+        self.reward_scale = reward_scale
         self.latent_coverage = latent_coverage
         self.correction_factor = correction_factor
         self.relabels_with_noise = relabelling == "sample"
@@ -398,8 +400,10 @@ class HyAR(ReplayLearner):
         }
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the rows to store, with the latent actions that the actor gave."""
-        return super().transitions(batch).set(LATENT, batch[LATENT])
+        """Return the rows to store, with scaled rewards and the latent actions that the actor gave."""
+        rows = super().transitions(batch)
+        rows["reward"] = self.reward_scale * rows["reward"]
+        return rows.set(LATENT, batch[LATENT])
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample mapped by random symmetries; the latent actions are to be encoded anew."""
