@@ -204,6 +204,23 @@ def test_ends_that_are_sure_and_wrong_are_learned_anew():
     assert (beta[0::2] > 0.9).all() and (beta[1::2] < 0.1).all()
 
 
+def test_ends_are_not_learned_where_the_episode_is_over_or_the_option_forbidden():
+    critic = make_critic()
+    before = [parameter.clone() for parameter in critic.termination.parameters()]
+    rows = TensorDict(
+        {
+            "next_state": torch.rand(64, SPECS.observation_dim),
+            "option": torch.arange(64) % 2,
+            "discount": torch.where(torch.arange(64) < 32, 0.0, GAMMA),
+            "next_option_mask": torch.arange(64).unsqueeze(-1) % 2 != torch.arange(2),
+        },
+        [64],
+    )
+    rows["next_option_mask"][:32] = True
+    critic._update_termination(rows)
+    assert all(torch.equal(old, new) for old, new in zip(before, critic.termination.parameters(), strict=True))
+
+
 def test_options_end_with_the_initial_probability():
     critic = make_critic(initial_termination=0.3)
     td = TensorDict({keys.OBSERVATION: torch.rand(4000, SPECS.observation_dim), keys.OPTION: torch.zeros(4000).long()})

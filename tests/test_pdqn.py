@@ -303,18 +303,26 @@ def test_a_penalty_on_preactivations_is_refused_where_nothing_is_squashed():
 
 
 class TwoHills(torch.nn.Module):
-    """Values that have a high hill at -0.7 and a low one at 0.6 in every parameter."""
+    """Values that have a high hill at `high` and a low one at 0.6 in every parameter of the discrete action.
+
+    The first discrete action has no parameters, the second two, the third one.
+    """
+
+    high = torch.tensor([-0.7, -0.4, -0.2])
 
     def forward(self, state: torch.Tensor, unit: torch.Tensor) -> torch.Tensor:
-        return torch.maximum(1.0 - 2.0 * (unit + 0.7).abs(), 0.5 - 2.0 * (unit - 0.6).abs()).unsqueeze(0)
+        hills = torch.maximum(1.0 - 2.0 * (unit - self.high).abs(), 0.5 - 2.0 * (unit - 0.6).abs())
+        return torch.stack([torch.zeros(len(unit)), hills[:, :2].sum(-1), hills[:, 2]], -1).unsqueeze(0)
+
+
+TWO_HILLS = replace(SPECS, parameter_dims=(0, 2, 1))
 
 
 @pytest.mark.parametrize("bounding", ["tanh", "inverting_gradients"])
-@pytest.mark.parametrize("search_samples", [0, 8])
+@pytest.mark.parametrize("search_samples", [0, 16])
 def test_the_search_brings_the_actor_to_a_higher_hill_that_its_gradient_does_not_see(search_samples, bounding):
     torch.manual_seed(0)
-    specs = replace(SPECS, parameter_dims=(1, 1, 1))
-    learner = make(specs, search_samples=search_samples, search_weight=10.0, bounding=bounding, actor_lr=1e-2)
+    learner = make(TWO_HILLS, search_samples=search_samples, search_weight=10.0, bounding=bounding, actor_lr=1e-2)
     learner.critics = TwoHills()
     state = states(64)[keys.OBSERVATION]
     with torch.no_grad():
@@ -322,20 +330,23 @@ def test_the_search_brings_the_actor_to_a_higher_hill_that_its_gradient_does_not
         learner.actor.net[-1].bias.fill_(0.5)
     for _ in range(300):
         learner._update_actor(state, None)
-    expected = -0.7 if search_samples else 0.6
-    torch.testing.assert_close(learner.actor(state), torch.full((64, 3), expected), atol=0.1, rtol=0.0)
+    expected = TwoHills.high if search_samples else torch.full((3,), 0.6)
+    torch.testing.assert_close(learner.actor(state), expected.expand(64, -1), atol=0.1, rtol=0.0)
 
 
 def test_the_search_leaves_forbidden_actions_parameters_alone():
     torch.manual_seed(0)
-    specs = replace(SPECS, parameter_dims=(1, 1, 1))
-    learner = make(specs, search_samples=8)
+    learner = make(TWO_HILLS, search_samples=8)
     learner.critics = TwoHills()
-    state = states(64)[keys.OBSERVATION]
     allowed = torch.tensor([True, False, True]).expand(64, -1)
-    loss, _ = learner._actor_loss(state, allowed)
+    loss, _ = learner._actor_loss(states(64)[keys.OBSERVATION], allowed)
     gradient = torch.autograd.grad(loss, learner.actor.net[-1].bias)[0]
-    assert (gradient != 0.0).tolist() == [True, False, True]
+    assert (gradient != 0.0).tolist() == [False, False, True]
+
+
+def test_the_search_is_refused_where_values_depend_on_other_actions_parameters():
+    with pytest.raises(ValueError, match="search_samples=8: needs multipass=true"):
+        make(search_samples=8, multipass=False)
 
 
 def test_epsilon_can_fall_with_the_episodes():

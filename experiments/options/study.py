@@ -140,12 +140,13 @@ LEARNERS = {
         "low.updates_per_frame=0.1",
         *DLPA_PLANS,
     ],
+    # As of PADDPG, and more of them for models that learn from few arrivals.
     "pets": [
-        "total_frames=100000",
-        "agent.uniform_option_frames=70000",
+        "total_frames=140000",
+        "agent.uniform_option_frames=110000",
         "num_envs=64",
         "steps_per_batch=4",
-        "low.warmup_frames=25000",
+        "low.warmup_frames=40000",
         "low.updates_per_frame=0.15",
         "low.batch_size=256",
         "low.weight_decay=0.1",

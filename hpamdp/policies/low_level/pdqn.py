@@ -8,7 +8,7 @@ Action Space*, 2018, arXiv 1810.06394, algorithm 1. Multi-pass: Bester, James an
 Deep Reinforcement Learning with Parameterised Action Spaces*, 2019, arXiv 1905.04388. Twin critics, target smoothing,
 delayed actor: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477 (TD3). Double Q: van Hasselt, Guez and Silver 2016,
 arXiv 1509.06461. Inverting gradients: Hausknecht and Stone 2016, arXiv 1511.04143. Penalty on preactivations:
-Andrychowicz et al. 2017, arXiv 1707.01495, appendix A. Towards the best of random actions: Neumann et al. 2018,
+Andrychowicz et al. 2017, arXiv 1707.01495, appendix A. Towards the best of random actions: Neumann et al. 2023,
 *Greedy Actor-Critic*, arXiv 1810.09103.
 
 Differs from the source:
@@ -58,7 +58,7 @@ from hpamdp.policies.shared.networks import (
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
 
-# Beyond it tanh needs preactivations that it does not come back from; where the actor is drawn to lies within.
+# Nothing is drawn nearer to a bound than this, since the gradient of tanh vanishes there.
 _LARGEST_DRAWN_TO = 0.97
 
 # Parameters, or values, of the variations that are tried at once: bounds the memory where discrete actions are many.
@@ -213,6 +213,10 @@ class PDQN(ReplayLearner):
     ) -> None:
         if preactivation_penalty > 0.0 and bounding != "tanh":
             raise ValueError(f"preactivation_penalty={preactivation_penalty}: needs bounding=tanh; {bounding=}")
+        if search_samples > 0 and not multipass:
+            raise ValueError(
+                f"{search_samples=}: needs multipass=true, as values else depend on other actions' parameters"
+            )
         super().__init__(
             specs,
             device,
@@ -318,7 +322,8 @@ class PDQN(ReplayLearner):
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         raw = self.actor.raw(state)
         q = self.critics(state, self.actor.bounded(raw)).amin(0)
-        loss = -(q if allowed is None else q * allowed).sum(-1).mean()
+        value_loss = -(q if allowed is None else q * allowed).sum(-1).mean()
+        loss = value_loss
         if self.preactivation_penalty > 0.0:
             loss = loss + self.preactivation_penalty * raw.square().sum(-1).mean()
         if self.search_samples > 0 and self.search_weight > 0.0:
@@ -326,7 +331,7 @@ class PDQN(ReplayLearner):
             gain = gain if allowed is None else gain * allowed
             distance = (raw - self.actor.unbounded(found)).square()
             loss = loss + self.search_weight * (gain[:, self.owner] * distance).sum(-1).mean()
-        return loss, {"actor": loss}
+        return loss, {"actor": value_loss}
 
     @torch.no_grad()
     def _best_of_random(self, state: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:

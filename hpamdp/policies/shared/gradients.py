@@ -29,9 +29,9 @@ class Descent:
         self._gradients_of: Gradients = gradients_of
         self.precision = torch.float32
 
-    def compile(self, *, any_size: bool) -> None:
+    def compile(self, device: torch.device, *, any_size: bool) -> None:
         """Compile the gradients of each loss at the first step down it; see `compiled`."""
-        self._gradients_of = compiled(any_size=any_size)
+        self._gradients_of = compiled(device, any_size=any_size)
 
     def lower_precision(self) -> None:
         """Have matrix products in bfloat16; parameters and what sums over many terms stay in float32."""
@@ -98,13 +98,14 @@ def _is_to_be_checked(guards: Sequence[GuardFilterEntry]) -> list[bool]:
     return [not guard.is_global and guard.guard_type not in never_changes for guard in guards]
 
 
-def compiled(*, any_size: bool) -> Gradients:
+def compiled(device: torch.device, *, any_size: bool) -> Gradients:
     """Return `gradients_of` compiled at its first call for each loss, in a few seconds of CPU time.
 
     What was compiled is kept on disk by PyTorch (`TORCHINDUCTOR_CACHE_DIR`), so that the same losses compile faster in
     later runs. Compiled code draws other random numbers from the same seed, and sums in another order.
 
     Args:
+        device: of the parameters.
         any_size: whether the inputs of a loss are not of the same size at every call.
 
     Raises:
@@ -123,9 +124,9 @@ def compiled(*, any_size: bool) -> Gradients:
     config.trace_autograd_ops = True
     # Each loss of each kind of learner is another version of the same function.
     config.recompile_limit = max(config.recompile_limit, 64)
-    # A wrapper in C++ calls the products and kernels sooner than one in Python.
+    # A wrapper in C++ calls the products and kernels sooner than one in Python. For a GPU it would take a CUDA toolkit.
     options: dict[str, str | int | bool | Callable[..., Any]] = {
-        "cpp_wrapper": True,
+        "cpp_wrapper": device.type == "cpu",
         "guard_filter_fn": _is_to_be_checked,
     }
     fast = torch.compile(gradients_of, dynamic=any_size, fullgraph=True, options=options)

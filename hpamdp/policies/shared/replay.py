@@ -98,7 +98,7 @@ class ReplayLearner(Learner):
 
     def compile_updates(self) -> None:
         """Compile what `minimise` does but for the optimizer's step, each loss at the first update that needs it."""
-        self.descent.compile(any_size=False)
+        self.descent.compile(self.frames.device, any_size=False)
 
     def lower_precision(self) -> None:
         """Have the matrix products of what `minimise` does in bfloat16."""
