@@ -195,9 +195,9 @@ class OptionCritic(Selector):
             mask: the options that may be chosen, bool `[*B, num_options]`; None: all.
             random_share: of `initial_termination` in the probabilities, in [0, 1].
         """
-        beta = self.termination(state).gather(-1, option.unsqueeze(-1)).squeeze(-1).sigmoid()
+        beta = _of_option(self.termination(state), option).sigmoid()
         beta = (1.0 - random_share) * beta + random_share * self.initial_termination
-        return beta if mask is None else torch.where(mask.gather(-1, option.unsqueeze(-1)).squeeze(-1), beta, 1.0)
+        return beta if mask is None else torch.where(_of_option(mask, option), beta, 1.0)
 
     def _target(self, rows: TensorDictBase) -> Tensor:
         """Return r + discount ((1 - beta) Q'(s', o) + beta max Q'(s', .)), `[B]`.
@@ -206,7 +206,7 @@ class OptionCritic(Selector):
         """
         with torch.no_grad():
             q = self.target_critic(rows["next_state"])
-            held = q.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
+            held = _of_option(q, rows["option"])
             mask = rows.get("next_option_mask", None)
             beta = rows["is_ended"].float()
             if self.decides_ends:
@@ -216,7 +216,7 @@ class OptionCritic(Selector):
 
     def _update_critic(self, rows: TensorDictBase) -> Tensor:
         """Make one update of Q from steps `[batch_size]`; return the loss."""
-        q = self.critic(rows["state"]).gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
+        q = _of_option(self.critic(rows["state"]), rows["option"])
         loss = (q - self._target(rows)).square().mean()
         self.optimizers["critic"].zero_grad(set_to_none=True)
         loss.backward()
@@ -237,14 +237,19 @@ class OptionCritic(Selector):
         with torch.no_grad():
             q = self.critic(state)
             best = masked_values(q, mask).amax(-1)
-            advantage = q.gather(-1, option.unsqueeze(-1)).squeeze(-1) - best + self.deliberation_cost
+            advantage = _of_option(q, option) - best + self.deliberation_cost
             is_open = rows["discount"] > 0.0
             if mask is not None:
-                is_open &= mask.gather(-1, option.unsqueeze(-1)).squeeze(-1)
-        logit = self.termination(state).gather(-1, option.unsqueeze(-1)).squeeze(-1)
-        regret = advantage.abs() * F.softplus(torch.where(advantage > 0.0, logit, -logit))
-        loss = (regret * is_open).mean()
+                is_open &= _of_option(mask, option)
+        logit = _of_option(self.termination(state), option)
+        should_end = (advantage < 0.0).float()
+        loss = F.binary_cross_entropy_with_logits(logit, should_end, weight=advantage.abs() * is_open)
         self.optimizers["termination"].zero_grad(set_to_none=True)
         loss.backward()
         self.optimizers["termination"].step()
         return logit.detach().sigmoid().mean()
+
+
+def _of_option(table: Tensor, option: Tensor) -> Tensor:
+    """Return the entries `[*B]` of a table `[*B, num_options]` for options `[*B]`."""
+    return table.gather(-1, option.unsqueeze(-1)).squeeze(-1)

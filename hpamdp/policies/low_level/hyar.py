@@ -400,10 +400,8 @@ class HyAR(ReplayLearner):
         }
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the rows to store, with scaled rewards and the latent actions that the actor gave."""
-        rows = super().transitions(batch)
-        rows["reward"] = self.reward_scale * rows["reward"]
-        return rows.set(LATENT, batch[LATENT])
+        """Return the rows to store, with the latent actions that the actor gave."""
+        return super().transitions(batch).set(LATENT, batch[LATENT])
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample mapped by random symmetries; the latent actions are to be encoded anew."""

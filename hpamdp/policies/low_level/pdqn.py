@@ -94,6 +94,20 @@ class ParameterActor(nn.Module):
         return unit if self.is_inverting else unit.clamp(-_LARGEST_DRAWN_TO, _LARGEST_DRAWN_TO).atanh()
 
 
+def best_of_tried(critics: HybridCritics, state: Tensor, tried: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the highest value of every discrete action and which of the tried parameters has it, `[B, num_discrete]`.
+
+    Args:
+        critics: value the parameters; the lowest of their values counts.
+        state: `[B, observation_dim]`.
+        tried: in each state, `[B, T, num_parameters]` in [-1, 1].
+    """
+    num_tried = tried.shape[1]
+    q = critics(state.repeat_interleave(num_tried, 0), tried.flatten(0, 1)).amin(0)
+    value, place = q.unflatten(0, (-1, num_tried)).max(1)
+    return value, place
+
+
 class PDQNPolicy(TensorDictModuleBase):
     """Takes the discrete action with the highest Q; explores with random actions and noise on the parameters.
 
@@ -155,9 +169,7 @@ class PDQNPolicy(TensorDictModuleBase):
         num_rows = max(1, _MAX_TRIED // (num_tried * max(unit.shape[-1], self.specs.num_discrete)))
         values, places = [], []
         for some_states, some_units in zip(state.split(num_rows), unit.split(num_rows), strict=True):
-            tried = with_variations(some_units, self.variations).flatten(0, 1)
-            q = self.critics(some_states.repeat_interleave(num_tried, 0), tried).amin(0)
-            best, place = q.unflatten(0, (-1, num_tried)).max(1)
+            best, place = best_of_tried(self.critics, some_states, with_variations(some_units, self.variations))
             values.append(best)
             places.append(place)
         discrete = masked_values(torch.cat(values), allowed).argmax(-1)
@@ -282,7 +294,6 @@ class PDQN(ReplayLearner):
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state that follows and the discount of that state's value."""
         rows = super().transitions(batch)
-        rows["reward"] = self.reward_scale * rows["reward"]
         done = option_ends(batch).squeeze(-1)
         terminated = batch["next", keys.TERMINATED].squeeze(-1)
         reward, last = n_step_returns(rows["reward"], done, self.n_step, self.gamma)
@@ -345,10 +356,9 @@ class PDQN(ReplayLearner):
             Parameters `[B, num_parameters]` in [-1, 1], and by how much each discrete action is better with its own of
             them than with the actor's, `[B, num_discrete]`, at least 0.
         """
-        num_tried = self.search_samples
-        tried = 2.0 * torch.rand(len(state), num_tried, self.specs.num_parameters, device=state.device) - 1.0
-        values = self.critics(state.repeat_interleave(num_tried, 0), tried.flatten(0, 1)).amin(0)
-        best, place = values.unflatten(0, (-1, num_tried)).max(1)
+        shape = len(state), self.search_samples, self.specs.num_parameters
+        tried = 2.0 * torch.rand(shape, device=state.device) - 1.0
+        best, place = best_of_tried(self.critics, state, tried)
         found = tried.gather(1, place[:, self.owner].unsqueeze(1)).squeeze(1)
         return found, (best - q).clamp(min=0.0)
 

@@ -36,10 +36,12 @@ class ReplayLearner(Learner):
         symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
         stores_own_parameters: whether the buffer holds the parameters of the discrete action taken alone, which is less
             where there are many; samples then have 0 for the others.
+        reward_scale: factor on the rewards that are stored.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     stores_own_parameters: bool = False
+    reward_scale: float = 1.0
 
     optimizers: dict[str, torch.optim.Optimizer]
     frames: Tensor
@@ -154,13 +156,16 @@ class ReplayLearner(Learner):
         return own.new_zeros(len(own), self.specs.num_parameters).scatter(-1, slots, own * is_own)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return what is stored of a batch `[*B, T]`; `discount` is 0 where the step terminated, else gamma."""
+        """Return what is stored of a batch `[*B, T]`, with scaled rewards.
+
+        `discount` is 0 where the step terminated, else gamma.
+        """
         rows = TensorDict(
             {
                 "state": batch[keys.OBSERVATION],
                 "discrete": batch[keys.DISCRETE],
                 "unit": self.specs.to_unit(batch[keys.PARAMETERS]),
-                "reward": batch["next", keys.REWARD].squeeze(-1),
+                "reward": self.reward_scale * batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
                 "discount": self.gamma * ~batch["next", keys.TERMINATED].squeeze(-1),
             },
