@@ -19,6 +19,7 @@ OPTIONS = dict(
     buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
     critic_lr=1e-3, augment=False,
     lr_final=1.0, lr_frames=0, policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1,
+    preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
     greedy_samples=0, greedy_noise=0.3, epsilon_final=0.05, epsilon_frames=3000,
 )  # fmt: skip
 
@@ -187,14 +188,19 @@ def test_the_target_of_the_greedy_form_is_the_maximum_over_discrete_actions():
     torch.testing.assert_close(learner.target(rows), torch.cat(each, -1).amin(0).amax(-1))
 
 
-@pytest.mark.parametrize(("discrete", "is_left"), [("nearest", False), ("greedy", True)])
-def test_only_the_greedy_form_leaves_a_discrete_action_whose_neighbours_are_worse(discrete, is_left):
+@pytest.mark.parametrize(
+    ("discrete", "search_samples", "is_left"), [("nearest", 0, False), ("nearest", 8, True), ("greedy", 0, True)]
+)
+def test_the_greedy_form_or_a_search_leaves_a_discrete_action_whose_neighbours_are_worse(
+    discrete, search_samples, is_left
+):
     # On the line of embeddings the rewards are .5, -1 and 1: the gradient leads back to the first.
     torch.manual_seed(0)
     specs = PAMDPSpecs(1, (), (1, 1, 1), (-1.0,) * 3, (1.0,) * 3)
     learner = make(
-        specs, discrete=discrete, embedding_dim=1, latent_dim=1, codec_every=10**9, actor_lr=2e-3, critic_lr=3e-3
-    )
+        specs, discrete=discrete, embedding_dim=1, latent_dim=1, codec_every=10**9, actor_lr=2e-3, critic_lr=3e-3,
+        search_samples=search_samples, search_weight=1.0,
+    )  # fmt: skip
     with torch.no_grad():
         learner.codec.table.copy_(torch.tensor([[-0.8], [0.0], [0.8]]).atanh())
         if discrete == "nearest":
@@ -213,6 +219,59 @@ def test_only_the_greedy_form_leaves_a_discrete_action_whose_neighbours_are_wors
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acted = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(1, 1)}, [1]))
     assert acted[keys.DISCRETE].item() == (2 if is_left else 0)
+
+
+class TwoHills(torch.nn.Module):
+    """Values of z, whatever e: a high hill at -.5 in every entry, and a low one at .6."""
+
+    def forward(self, state, latent, num_members=None):
+        z = latent[..., 3:]
+        hills = torch.maximum(1.0 - 2.0 * (z + 0.5).abs(), 0.5 - 2.0 * (z - 0.6).abs())
+        return hills.sum(-1).unsqueeze(0)
+
+
+@pytest.mark.parametrize("discrete", ["greedy", "nearest"])
+@pytest.mark.parametrize(("search_samples", "expected"), [(0, 0.6), (16, -0.5)])
+def test_the_search_brings_z_to_a_higher_hill_that_the_gradient_does_not_see(discrete, search_samples, expected):
+    torch.manual_seed(0)
+    learner = make(discrete=discrete, search_samples=search_samples, search_weight=10.0, actor_lr=1e-2, latent_dim=2)
+    learner.critics = TwoHills()
+    state = torch.rand(64, 4) * 2 - 1
+    with torch.no_grad():
+        learner.actor.net[-1].weight.zero_()
+        learner.actor.net[-1].bias.fill_(0.5)
+    for _ in range(300):
+        learner.minimise("actor", learner._actor_loss, state, None)
+    z = learner.actor(state, learner.codec.embeddings)[..., 3:]
+    torch.testing.assert_close(z, torch.full_like(z, expected), atol=0.1, rtol=0.0)
+
+
+@pytest.mark.parametrize("discrete", ["greedy", "nearest"])
+def test_the_search_tries_no_forbidden_action(discrete):
+    torch.manual_seed(0)
+    learner = make(discrete=discrete, search_samples=8)
+    allowed = torch.tensor([True, False, True]).expand(64, -1)
+    asked = []
+    learner.critics.register_forward_pre_hook(lambda _, inputs: asked.append(inputs[1]))
+    state = torch.rand(64, 4) * 2 - 1
+    loss, _ = learner._actor_loss(state, allowed)
+    gradient = torch.autograd.grad(loss, learner.actor.net[-1].bias)[0]
+    if discrete == "greedy":
+        assert (gradient.unflatten(0, (3, 3)) != 0.0).any(-1).tolist() == [True, False, True]
+    else:
+        tried = learner.codec.nearest_discrete(torch.cat(asked, 1)[..., :3].flatten(0, 1))
+        assert tried.unique().tolist() == [0, 2]
+
+
+def test_the_penalty_brings_the_actor_back_from_the_bounds():
+    torch.manual_seed(0)
+    learner = make(preactivation_penalty=0.1, actor_lr=1e-2)
+    with torch.no_grad():
+        learner.actor.net[-1].bias.fill_(8.0)
+    state = torch.rand(64, 4) * 2 - 1
+    for _ in range(300):
+        learner.minimise("actor", learner._actor_loss, state, None)
+    assert learner.actor.raw(state).abs().max() < 3.0
 
 
 def test_ddpg_has_one_critic_an_actor_update_each_time_and_no_noise_in_its_targets():

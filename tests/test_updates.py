@@ -6,6 +6,7 @@ from functools import partial
 
 import pytest
 import test_hppo
+import test_hsac
 import test_hyar
 import test_paddpg
 import test_pdqn
@@ -150,6 +151,28 @@ def test_updates_in_bfloat16_make_all_products_in_it_and_have_nearly_the_same_gr
     assert products.seen == {torch.bfloat16}
     assert all(gradient.dtype == torch.float32 for gradient in both)
     assert torch.cosine_similarity(*both, dim=0) > 0.99
+
+
+@pytest.mark.parametrize("name", ["pdqn", "hyar", "hsac"])
+def test_in_bfloat16_parameters_near_a_bound_still_have_a_gradient(name):
+    # tanh of 4 is 1 in bfloat16, where its gradient is 0.
+    torch.manual_seed(0)
+    learner = test_hsac.make() if name == "hsac" else MAKE[name]()
+    last = learner.actor.net[-1]
+    with torch.no_grad():
+        last.weight.zero_()
+        last.bias.fill_(4.0)
+    state = sample(64)["state"]
+    with torch.autocast("cpu", torch.bfloat16):
+        if name == "hsac":
+            learner.actor.log_max_scale = learner.actor.log_min_scale  # hardly any noise
+            unit = learner.actor(state).sample_squashed()[0]
+        elif name == "hyar":
+            unit = learner.actor(state, learner.codec.embeddings)[..., -learner.codec.latent_dim :]
+        else:
+            unit = learner.actor(state)
+    gradient = torch.autograd.grad(unit.sum(), last.bias)[0]
+    assert gradient[-1] > 0.0 if name != "hsac" else gradient[SPECS.num_discrete] > 0.0
 
 
 SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4"]

@@ -37,7 +37,14 @@ from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridDistribution
 from hpamdp.policies.shared.masks import masked_logits, random_choice
-from hpamdp.policies.shared.networks import HybridCritics, InitialLayer, InitialParameters, mlp, polyak_update
+from hpamdp.policies.shared.networks import (
+    HybridCritics,
+    InitialLayer,
+    InitialParameters,
+    before_tanh,
+    mlp,
+    polyak_update,
+)
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
@@ -77,7 +84,7 @@ class HSACActor(nn.Module):
             state: the observations.
             mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
         """
-        logits, mean, raw_scale = self.net(state).split(self.sizes, -1)
+        logits, mean, raw_scale = before_tanh(self.net(state)).split(self.sizes, -1)
         mean = mean + self.initial(state)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
         return HybridDistribution(masked_logits(logits, mask).log_softmax(-1), mean, log_scale, self.owner)

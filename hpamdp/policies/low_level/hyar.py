@@ -23,6 +23,8 @@ Differs from the source:
 - the correction compares the error of a stored action with a running mean of the codec's error, over its last hundred
   or so updates, instead of the error of the last update;
 - with `greedy_samples` the greedy policy also values variations of z and takes the best of them all;
+- with `search_samples` the actor is also drawn to the best of random latent actions, the more the better they are than
+  its own by the critics, and `preactivation_penalty` keeps it from the bounds; both as in P-DQN;
 - tanh bounds the actor's output; the published code multiplies the gradient by the range that is left (inverting
   gradients) besides, and clips its norm at 10;
 - exploration is by random actions, ever fewer, and by Gaussian noise of a constant scale; in the published code it is
@@ -51,9 +53,11 @@ from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFra
 from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
+    before_tanh,
     even_normal,
     mlp,
     polyak_update,
+    unsquashed,
     with_clipped_noise,
     with_variations,
 )
@@ -131,7 +135,7 @@ class HybridCodec(nn.Module):
     def decode(self, state: Tensor, discrete: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the parameters `[B, num_parameters]` in [-1, 1] and the predicted change of the state, scaled."""
         hidden = self._hidden(state, discrete, z)
-        return self.parameter_head(hidden).tanh(), self.dynamics_head(hidden)
+        return before_tanh(self.parameter_head(hidden)).tanh(), self.dynamics_head(hidden)
 
     def change(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
         """Return the predicted change of the state alone, scaled, `[B, observation_dim]`."""
@@ -161,9 +165,9 @@ class LatentActor(nn.Module):
     ) -> None:
         super().__init__()
         self.is_greedy = is_greedy
-        self.latent_dim = latent_dim
-        output_dim = specs.num_discrete * latent_dim if is_greedy else embedding_dim + latent_dim
-        self.net = mlp(specs.observation_dim, hidden_dims, output_dim)
+        self.num_proposals = specs.num_discrete if is_greedy else 1
+        self.num_given = latent_dim if is_greedy else embedding_dim + latent_dim
+        self.net = mlp(specs.observation_dim, hidden_dims, self.num_proposals * self.num_given)
 
     def forward(self, state: Tensor, embeddings: Tensor, noise: float = 0.0, noise_clip: float = math.inf) -> Tensor:
         """Return the proposals, `[B, num_proposals, embedding_dim + latent_dim]`.
@@ -174,11 +178,19 @@ class LatentActor(nn.Module):
             noise: standard deviation of the Gaussian noise on what the actor gives.
             noise_clip: bound of this noise.
         """
-        output = with_clipped_noise(self.net(state).tanh(), noise, noise_clip)
-        if not self.is_greedy:
-            return output.unsqueeze(1)
-        z = output.unflatten(-1, (-1, self.latent_dim))
-        return torch.cat([embeddings.expand(len(z), -1, -1), z], -1)
+        return self.proposals(with_clipped_noise(self.raw(state).tanh(), noise, noise_clip), embeddings)
+
+    def raw(self, state: Tensor) -> Tensor:
+        """Return what the actor gives before tanh, `[B, num_proposals, num_given]`."""
+        return before_tanh(self.net(state)).unflatten(-1, (self.num_proposals, self.num_given))
+
+    def proposals(self, given: Tensor, embeddings: Tensor) -> Tensor:
+        """Return the proposals of what the actor gave, `[B, num_proposals, num_given]` in [-1, 1]."""
+        return torch.cat([embeddings.expand(len(given), -1, -1), given], -1) if self.is_greedy else given
+
+    def given(self, proposals: Tensor) -> Tensor:
+        """Return the part of proposals that the actor gives."""
+        return proposals[..., -self.num_given :]
 
 
 class LatentCritics(nn.Module):
@@ -199,6 +211,26 @@ class LatentCritics(nn.Module):
         batch_size, num_latents, _ = latent.shape
         rows = torch.cat([state.unsqueeze(1).expand(-1, num_latents, -1), latent], -1)
         return self.net(rows.flatten(0, 1), num_members).reshape(-1, batch_size, num_latents)
+
+
+def best_of_tried(critics: LatentCritics, state: Tensor, tried: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the best of T latent actions for each of P proposals, by the lowest of the critics' values, and its value.
+
+    Args:
+        critics: value the latent actions.
+        state: `[B, observation_dim]`.
+        tried: in each state, `[B, P, T, embedding_dim + latent_dim]`.
+
+    Returns:
+        Latent actions `[B, P, embedding_dim + latent_dim]` and values `[B, P]`.
+    """
+    num_rows = max(1, _MAX_TRIED // tried[0, ..., 0].numel())
+    if len(state) > num_rows:
+        pieces = zip(state.split(num_rows), tried.split(num_rows), strict=True)
+        best, values = zip(*(best_of_tried(critics, *piece) for piece in pieces), strict=True)
+        return torch.cat(best), torch.cat(values)
+    value, place = critics(state, tried.flatten(1, 2)).amin(0).unflatten(1, tried.shape[1:3]).max(-1)
+    return tried.take_along_dim(place[..., None, None], 2).squeeze(2), value
 
 
 class HyARPolicy(TensorDictModuleBase):
@@ -272,15 +304,11 @@ class HyARPolicy(TensorDictModuleBase):
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
     def _best_variations(self, state: Tensor, proposals: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best of each proposal `[B, K, embedding_dim + latent_dim]` and its variations, and its value."""
-        best, values = [], []
+        """Return the best of each proposal `[B, P, embedding_dim + latent_dim]` and its variations, and its value."""
         num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * (1 + len(self.variations))))
-        for some_states, some_proposals in zip(state.split(num_rows), proposals.split(num_rows), strict=True):
-            tried = with_variations(some_proposals, self.variations)
-            q = self.critics(some_states, tried.flatten(1, 2)).amin(0).unflatten(1, tried.shape[1:3])
-            value, place = q.max(-1)
-            best.append(tried.take_along_dim(place[..., None, None], 2).squeeze(2))
-            values.append(value)
+        pieces = zip(state.split(num_rows), proposals.split(num_rows), strict=True)
+        found = [best_of_tried(self.critics, some, with_variations(its, self.variations)) for some, its in pieces]
+        best, values = zip(*found, strict=True)
         return torch.cat(best), torch.cat(values)
 
     def decode(self, state: Tensor, latent: Tensor, allowed: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -339,6 +367,9 @@ class HyAR(ReplayLearner):
         policy_delay: PositiveInt,
         target_noise: NonNegativeFloat,
         target_noise_clip: NonNegativeFloat,
+        preactivation_penalty: NonNegativeFloat,
+        search_samples: NonNegativeInt,
+        search_weight: NonNegativeFloat,
         exploration_noise: NonNegativeFloat,
         greedy_samples: NonNegativeInt,
         greedy_noise: NonNegativeFloat,
@@ -370,6 +401,9 @@ class HyAR(ReplayLearner):
         self.policy_delay = policy_delay if is_td3 else 1
         self.target_noise = target_noise if is_td3 else 0.0
         self.target_noise_clip = target_noise_clip
+        self.preactivation_penalty = preactivation_penalty
+        self.search_samples = search_samples
+        self.search_weight = search_weight
         self.epsilon_final = epsilon_final
         self.epsilon_frames = epsilon_frames
 
@@ -493,12 +527,48 @@ class HyAR(ReplayLearner):
 
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""
-        proposals = self.actor(state, self.codec.embeddings.detach())
+        raw = self.actor.raw(state)
+        proposals = self.actor.proposals(raw.tanh(), self.codec.embeddings.detach())
         if not self.actor.is_greedy:
             proposals = self.codec.of_allowed(proposals, allowed)
+        is_counted = allowed if self.actor.is_greedy else None
         q = self.critics(state, proposals, num_members=1)
-        loss = -(q if allowed is None or not self.actor.is_greedy else q * allowed).sum(-1).mean()
-        return loss, {"actor": loss}
+        value_loss = -(q if is_counted is None else q * is_counted).sum(-1).mean()
+        loss = value_loss
+        if self.preactivation_penalty > 0.0:
+            loss = loss + self.preactivation_penalty * raw.square().sum((-2, -1)).mean()
+        if self.search_samples > 0 and self.search_weight > 0.0:
+            found, gain = self._best_of_random(state, proposals.detach(), allowed)
+            gain = gain if is_counted is None else gain * is_counted
+            distance = (raw - unsquashed(self.actor.given(found))).square().sum(-1)
+            loss = loss + self.search_weight * (gain * distance).sum(-1).mean()
+        return loss, {"actor": value_loss}
+
+    @torch.no_grad()
+    def _best_of_random(self, state: Tensor, proposals: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Return for every proposal the best of it and of random latent actions, by the critics, and its gain.
+
+        The random ones differ from the proposal in z; where the actor gives one proposal alone, also in the discrete
+        action, one of the allowed.
+
+        Args:
+            state: `[B, observation_dim]`.
+            proposals: of the actor, `[B, P, embedding_dim + latent_dim]`.
+            allowed: bool `[B, num_discrete]`; None: all.
+
+        Returns:
+            Latent actions like the proposals, and by how much each is better than the actor's, `[B, P]`.
+        """
+        tried = proposals.unsqueeze(2).repeat(1, 1, self.search_samples, 1)
+        if not self.actor.is_greedy:
+            shape, num_discrete = tried.shape[:-1], self.specs.num_discrete
+            of_tried = None if allowed is None else allowed[:, None, None].expand(*shape, -1)
+            discrete = random_choice(shape, num_discrete, of_tried, state.device)
+            tried[..., : -self.codec.latent_dim] = self.codec.embeddings[discrete]
+        tried[..., -self.codec.latent_dim :].uniform_(-1.0, 1.0)
+        tried = torch.cat([proposals.unsqueeze(2), tried], 2)
+        best, value = best_of_tried(self.critics, state, tried)
+        return best, value - self.critics(state, proposals).amin(0)
 
     def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the codec; return the parts of its loss."""

@@ -49,17 +49,16 @@ from hpamdp.policies.shared.networks import (
     InitialLayer,
     InitialParameters,
     InvertingGradients,
+    before_tanh,
     even_normal,
     mlp,
     polyak_update,
+    unsquashed,
     with_clipped_noise,
     with_variations,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.specs import PAMDPSpecs
-
-# Nothing is drawn nearer to a bound than this, since the gradient of tanh vanishes there.
-_LARGEST_DRAWN_TO = 0.97
 
 # Parameters, or values, of the variations that are tried at once: bounds the memory where discrete actions are many.
 _MAX_TRIED = 1 << 22
@@ -83,7 +82,7 @@ class ParameterActor(nn.Module):
 
     def raw(self, state: Tensor) -> Tensor:
         """Return the parameters before they are bounded: with tanh, the preactivations."""
-        return self.net(state) + self.initial(state)
+        return before_tanh(self.net(state)) + self.initial(state)
 
     def bounded(self, raw: Tensor) -> Tensor:
         """Return the parameters of raw ones."""
@@ -91,7 +90,7 @@ class ParameterActor(nn.Module):
 
     def unbounded(self, unit: Tensor) -> Tensor:
         """Return the raw parameters of bounded ones in [-1, 1], or of some close to them."""
-        return unit if self.is_inverting else unit.clamp(-_LARGEST_DRAWN_TO, _LARGEST_DRAWN_TO).atanh()
+        return unit if self.is_inverting else unsquashed(unit)
 
 
 def best_of_tried(critics: HybridCritics, state: Tensor, tried: Tensor) -> tuple[Tensor, Tensor]:

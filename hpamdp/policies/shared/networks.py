@@ -16,8 +16,9 @@ from hpamdp.specs import PAMDPSpecs
 # What parameters start with: the problem's own convention, where it has one, or whatever the network begins with.
 InitialParameters = Literal["domain", "none"]
 
-# Past these a squashed parameter hardly moves any more, so none starts there.
-_LARGEST_SQUASHED = 0.99
+# Past the first a squashed parameter hardly moves any more, so none starts there; none is drawn past the second.
+_LARGEST_INITIAL = 0.99
+_LARGEST_DRAWN_TO = 0.97
 
 # Passes of multi-pass critics that are computed at once: bounds the memory where there are many discrete actions.
 _MAX_PASSES = 1 << 13
@@ -77,6 +78,16 @@ def sample_index(logits: Tensor) -> Tensor:
     """Sample an index from the softmax of logits `[*B, K]`, int64 `[*B]`."""
     # The Gumbel-max trick: faster than torch.multinomial, and works for any batch shape.
     return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
+
+
+def before_tanh(output: Tensor) -> Tensor:
+    """Return a network's output in float32: in bfloat16 tanh is 1 from 3.3 on, and has no gradient."""
+    return output.float()
+
+
+def unsquashed(unit: Tensor, largest: float = _LARGEST_DRAWN_TO) -> Tensor:
+    """Return what tanh maps to values in [-1, 1], none of which counts as nearer to a bound than `largest`."""
+    return unit.clamp(-largest, largest).atanh()
 
 
 def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
@@ -215,7 +226,7 @@ class InitialLayer(nn.Module):
         if not self.exists:
             return 0.0
         unit = nn.functional.linear(observation, self.weight, self.bias)
-        return unit.clamp(-_LARGEST_SQUASHED, _LARGEST_SQUASHED).atanh() if self.is_squashed else unit
+        return unsquashed(unit, _LARGEST_INITIAL) if self.is_squashed else unit
 
     def shrink(self, output: nn.Module, rows: slice = slice(None)) -> None:
         """Bring the parameters' rows of a network's linear output near 0 where this layer adds something."""
