@@ -87,6 +87,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     reset_returns_all_rows = True
     num_envs: int
     rows: Rows | None = None  # what the kernel moves; None where the tensor functions do
+    limit_terminates = False  # whether values stop at the time limit, as at any other end
 
     def __init__(
         self,
@@ -387,9 +388,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         leaves = {
             keys.OBSERVATION: self._pure_observe(self._state),
             keys.OUTCOME: outcome,
-            keys.DONE: done,
-            keys.TERMINATED: done & ~truncated,
-            keys.TRUNCATED: truncated,
+            **self._flags(done, done & ~truncated, truncated),
         }
         return self._with_oracle(TensorDict(leaves, batch_size=self.batch_size, device=self.device))
 
@@ -402,14 +401,18 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             **(kept or {}),
             keys.OBSERVATION: torch.from_numpy(results.observations[number]),
             keys.OUTCOME: torch.from_numpy(results.outcomes[number]),
-            keys.DONE: flags[0],
-            keys.TERMINATED: flags[1],
-            keys.TRUNCATED: flags[2],
+            **self._flags(*flags.unbind(0)),
         }
         if has_reward:
             leaves[keys.REWARD] = torch.from_numpy(results.rewards).unsqueeze(-1)
         # The checks of the constructor would take longer than a hundred rows.
         return self._with_oracle(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
+
+    def _flags(self, done: Tensor, terminated: Tensor, truncated: Tensor) -> dict[Any, Tensor]:
+        """Return the flags `[N, 1]` as leaves."""
+        if self.limit_terminates:
+            terminated, truncated = done.clone(), torch.zeros_like(done)
+        return {keys.DONE: done, keys.TERMINATED: terminated, keys.TRUNCATED: truncated}
 
     def _with_oracle(self, seen: TensorDict) -> TensorDict:
         if self._has_oracle:

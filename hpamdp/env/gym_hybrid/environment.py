@@ -6,7 +6,7 @@ Source: Xiong et al. 2018, arXiv:1810.06394, in the version of gym-hybrid; see `
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor
@@ -35,12 +35,15 @@ class _VehicleEnv(PointEnv[VehicleState]):
         num_envs: int = 1,
         *,
         max_steps: int = rules.PUBLISHED_STEPS,
+        limit: Literal["truncated", "terminated"] = "truncated",
         compile_rules: bool = False,
         oracle: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
     ) -> None:
+        if limit not in ("truncated", "terminated"):
+            raise ValueError(f"{type(self).__name__}: {limit=}, but must be truncated or terminated")
         super().__init__(
             num_envs,
             max_steps=max_steps,
@@ -52,6 +55,7 @@ class _VehicleEnv(PointEnv[VehicleState]):
             oracle=oracle,
             compile_rules=compile_rules,
         )
+        self.limit_terminates = limit == "terminated"
         self._use_kernel(kernel.advance, _VehicleEnv, [self.slides])
 
     @property
@@ -125,7 +129,8 @@ class MovingEnv(_VehicleEnv):
 
     Args:
         num_envs: number of fields.
-        max_steps: actions after which an episode is truncated; gym-hybrid has 201.
+        max_steps: actions after which an episode ends; gym-hybrid has 201.
+        limit: what this end counts as. `truncated`: values go on past it. `terminated`: they stop there.
         compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
         oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
         device: of the tensors.
