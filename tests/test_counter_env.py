@@ -128,6 +128,22 @@ def test_a_finished_episode_stays_finished_and_earns_nothing(problem):
     assert (after[keys.REWARD] == 0.0).all()
 
 
+@pytest.mark.parametrize("by_kernel", [True, False])
+@pytest.mark.parametrize("problem", [MovingEnv, SlidingEnv])
+def test_the_limit_of_a_vehicle_may_terminate_instead(problem, by_kernel):
+    env = problem(64, max_steps=2, limit="terminated")
+    if not by_kernel:
+        env._columns, env.rows = env.state, None
+    last, _ = play(env, random_player(), 2)
+    assert (last[keys.OUTCOME] == len(env.outcomes) - 1).any()
+    assert last[keys.TERMINATED].all() and last[keys.DONE].all() and not last[keys.TRUNCATED].any()
+
+
+def test_a_limit_of_another_name_is_refused():
+    with pytest.raises(ValueError, match="limit='cut', but must be truncated or terminated"):
+        MovingEnv(limit="cut")
+
+
 @each_problem
 def test_the_time_limit_truncates(problem):
     env = problem(64, max_steps=2)
