@@ -110,6 +110,20 @@ def test_compiled_updates_are_the_same_up_to_rounding(name):
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize(("name", "settings"), [("pdqn", {}), ("hyar", {}), ("hyar", {"discrete": "nearest"})])
+def test_compiled_updates_may_search(name, settings):
+    torch.manual_seed(0)
+    learner = MAKE[name](search_samples=4, search_weight=1e3, **settings)
+    learner.updates.fill_(2)
+    before = copy.deepcopy(learner.actor.state_dict())
+    learner.compile_updates()
+    learner.lower_precision()
+    learner.train_step(batch_for(name))
+    assert all(not after.equal(before[key]) for key, after in learner.actor.state_dict().items() if "net" in key)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 def test_compiled_updates_of_hppo_are_the_same_up_to_rounding_for_batches_of_any_size():
     learner = test_hppo.make(minibatch_size=32)
     compiled = copy.deepcopy(learner)

@@ -559,14 +559,15 @@ class HyAR(ReplayLearner):
         Returns:
             Latent actions like the proposals, and by how much each is better than the actor's, `[B, P]`.
         """
-        tried = proposals.unsqueeze(2).repeat(1, 1, self.search_samples, 1)
-        if not self.actor.is_greedy:
-            shape, num_discrete = tried.shape[:-1], self.specs.num_discrete
+        shape = (*proposals.shape[:2], self.search_samples)
+        if self.actor.is_greedy:
+            e = proposals[..., : -self.codec.latent_dim].unsqueeze(2).expand(*shape, -1)
+        else:
             of_tried = None if allowed is None else allowed[:, None, None].expand(*shape, -1)
-            discrete = random_choice(shape, num_discrete, of_tried, state.device)
-            tried[..., : -self.codec.latent_dim] = self.codec.embeddings[discrete]
-        tried[..., -self.codec.latent_dim :].uniform_(-1.0, 1.0)
-        tried = torch.cat([proposals.unsqueeze(2), tried], 2)
+            discrete = random_choice(torch.Size(shape), self.specs.num_discrete, of_tried, state.device)
+            e = self.codec.embeddings[discrete]
+        z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device) - 1.0
+        tried = torch.cat([proposals.unsqueeze(2), torch.cat([e, z], -1)], 2)
         best, value = best_of_tried(self.critics, state, tried)
         return best, value - self.critics(state, proposals).amin(0)
 
