@@ -1,0 +1,140 @@
+"""Nothing is made on the CPU unasked: on the `meta` device a mixture of devices is an error, as it is on a GPU.
+
+Tensors there have no values. A question for one is answered with 1 or True, and one for places with all places.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import pytest
+import test_hsac
+import test_hyar
+import test_paddpg
+import test_pdqn
+import torch
+from conftest import choices, make_config
+from tensordict import TensorDict
+from torch.fx.experimental import _config
+from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from toy_steps import SPECS, sample
+
+from hpamdp import keys
+from hpamdp.env import counter_rng
+from hpamdp.env.boatdock import episode
+from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.task import BoatState
+from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
+from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.policies.low_level.hyar import LATENT
+from hpamdp.policies.low_level.paddpg import SCORES
+from hpamdp.policies.shared.gradients import gradients_of
+from hpamdp.run.assemble import make_agent
+from hpamdp.specs import PAMDPSpecs
+
+META = torch.device("meta")
+
+
+class Answers(TorchDispatchMode):
+    """Says 1, or True, where a program asks for the value of a `meta` tensor."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is torch.ops.aten._local_scalar_dense.default and args[0].is_meta:
+            return True if args[0].dtype == torch.bool else 1
+        return func(*args, **(kwargs or {}))
+
+
+def agent_of(words: list[str]):
+    """Return an agent for boats that is built on the CPU and moved, since fused optimizers refuse the device."""
+    specs = PAMDPSpecs.from_env(BoatDockEnv(1))
+    return make_agent(make_config(words), specs, torch.device("cpu")).to(META), specs
+
+
+@pytest.fixture(autouse=True)
+def everywhere():
+    """Let `nonzero` find every place."""
+    with _config.patch(meta_nonzero_assume_all_nonzero=True):
+        yield
+
+
+def observed(specs: PAMDPSpecs) -> TensorDict:
+    flags = {name: torch.ones(5, 1, dtype=torch.bool, device=META) for name in (keys.IS_DECISION, keys.DONE)}
+    seen = {keys.OBSERVATION: torch.zeros(5, specs.observation_dim, device=META), **flags}
+    return TensorDict(seen, [5], device=META)
+
+
+# DLPA's plans use autocast, which knows no such device.
+@pytest.mark.parametrize("mode", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
+@pytest.mark.parametrize("low", sorted({*choices("low")} - {"planner", "dlpa"}))
+def test_policies_stay_on_their_device(low, mode):
+    agent, specs = agent_of(["high=uniform", f"low={low}"])
+    with Answers(), set_exploration_type(mode):
+        acted = agent.learners[0].policy(observed(specs))
+    assert acted[keys.DISCRETE].device == acted[keys.PARAMETERS].device == META
+
+
+@pytest.mark.parametrize("mode", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
+@pytest.mark.parametrize("high", sorted({*choices("high")} - {"none", "oracle", "human", "value"}))
+def test_selectors_stay_on_their_device(high, mode):
+    agent, specs = agent_of([f"high={high}", "low=random"])
+    with Answers(), set_exploration_type(mode):
+        assert agent.selector(observed(specs))[keys.OPTION].device == META
+
+
+def on_meta(values: TensorDict) -> TensorDict:
+    return values.apply(lambda tensor: torch.empty_like(tensor, device=META), device=META)
+
+
+REPLAY = {
+    "pdqn": partial(test_pdqn.make, search_samples=2, preactivation_penalty=0.1),
+    "pdqn published": partial(test_pdqn.make, multipass=False, bounding="inverting_gradients"),
+    "hyar": partial(test_hyar.make, search_samples=2, preactivation_penalty=0.1, relabelling="sample"),
+    "hyar nearest": partial(test_hyar.make, search_samples=2, discrete="nearest"),
+    "paddpg": test_paddpg.make,
+    "hsac": test_hsac.make,
+}
+
+
+@pytest.mark.parametrize("name", REPLAY)
+def test_losses_and_their_gradients_stay_on_their_device(name):
+    learner = REPLAY[name]().to(META)
+    rows = sample(8)
+    if name == "paddpg":
+        rows[SCORES] = torch.rand(8, SPECS.num_discrete)
+    if name.startswith("hyar"):
+        rows[LATENT] = torch.rand(8, test_hyar.OPTIONS["embedding_dim"] + test_hyar.OPTIONS["latent_dim"])
+    rows = on_meta(rows)
+    losses = {"critics": (learner._critic_loss, rows), "actor": (learner._actor_loss, rows["state"], None)}
+    for part, (loss_of, *inputs) in losses.items():
+        with Answers():
+            _, gradients = gradients_of(loss_of, list(getattr(learner, part).parameters()), *inputs)
+        assert {gradient.device for gradient in gradients if gradient is not None} == {META}
+
+
+@pytest.mark.parametrize("problem", [CatchPointEnv, HardMoveEnv, MovingEnv, SlidingEnv])
+def test_rules_stay_on_their_device(problem):
+    # Not those of Goal and Platform, whose ticks go on for as long as a tensor says so.
+    env = problem(4)
+    if problem is HardMoveEnv:
+        env._motions = env._motions.to(META)
+    number = torch.zeros(4, dtype=torch.int32, device=META)
+    rng = counter_rng.key_for(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
+    state = env.start(number, rng)
+    parameters = torch.zeros(4, max(env.parameter_dims), device=META)
+    after, reward = env.act(state, number.long(), parameters, rng, number.bool())
+    assert {column.device for column in (*state, *after, reward, env.observe(after))} == {META}
+
+
+def test_the_boats_rules_stay_on_their_device():
+    env = BoatDockEnv(4)
+    number = torch.zeros(4, dtype=torch.int32, device=META)
+    seed = counter_rng.seed_tensor(0, META)
+    state = BoatState(*(torch.empty_like(column, device=META) for column in env.state))
+    state = episode.reset(state, number.bool(), seed, number, env.rules)
+    durations = torch.zeros(4, 3, device=META)
+    after, reward, _ = episode.step(state, number, number.long(), durations, seed, number, env.rules)
+    reading = episode.read(after, seed, number, env.rules)
+    assert {column.device for column in (*after, reward, *reading)} == {META}
