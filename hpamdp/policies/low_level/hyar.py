@@ -38,6 +38,7 @@ from __future__ import annotations
 
 import copy
 import math
+from functools import partial
 from typing import ClassVar, Literal
 
 import torch
@@ -55,6 +56,7 @@ from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     before_tanh,
     even_normal,
+    in_pieces,
     mlp,
     polyak_update,
     unsquashed,
@@ -224,11 +226,6 @@ def best_of_tried(critics: LatentCritics, state: Tensor, tried: Tensor) -> tuple
     Returns:
         Latent actions `[B, P, embedding_dim + latent_dim]` and values `[B, P]`.
     """
-    num_rows = max(1, _MAX_TRIED // tried[0, ..., 0].numel())
-    if len(state) > num_rows:
-        pieces = zip(state.split(num_rows), tried.split(num_rows), strict=True)
-        best, values = zip(*(best_of_tried(critics, *piece) for piece in pieces), strict=True)
-        return torch.cat(best), torch.cat(values)
     value, place = critics(state, tried.flatten(1, 2)).amin(0).unflatten(1, tried.shape[1:3]).max(-1)
     return tried.take_along_dim(place[..., None, None], 2).squeeze(2), value
 
@@ -305,11 +302,13 @@ class HyARPolicy(TensorDictModuleBase):
 
     def _best_variations(self, state: Tensor, proposals: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best of each proposal `[B, P, embedding_dim + latent_dim]` and its variations, and its value."""
+
+        def best_of(some_states: Tensor, some_proposals: Tensor) -> tuple[Tensor, Tensor]:
+            return best_of_tried(self.critics, some_states, with_variations(some_proposals, self.variations))
+
         num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * (1 + len(self.variations))))
-        pieces = zip(state.split(num_rows), proposals.split(num_rows), strict=True)
-        found = [best_of_tried(self.critics, some, with_variations(its, self.variations)) for some, its in pieces]
-        best, values = zip(*found, strict=True)
-        return torch.cat(best), torch.cat(values)
+        best, values = in_pieces(best_of, num_rows, state, proposals)
+        return best, values
 
     def decode(self, state: Tensor, latent: Tensor, allowed: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return the discrete action `[B]` and the parameters `[B, num_parameters]` in [-1, 1] of a latent action.
@@ -546,7 +545,7 @@ class HyAR(ReplayLearner):
 
     @torch.no_grad()
     def _best_of_random(self, state: Tensor, proposals: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return for every proposal the best of it and of random latent actions, by the critics, and its gain.
+        """Return for every proposal the best of random latent actions, by the critics, and its gain.
 
         The random ones differ from the proposal in z; where the actor gives one proposal alone, also in the discrete
         action, one of the allowed.
@@ -557,7 +556,7 @@ class HyAR(ReplayLearner):
             allowed: bool `[B, num_discrete]`; None: all.
 
         Returns:
-            Latent actions like the proposals, and by how much each is better than the actor's, `[B, P]`.
+            Latent actions like the proposals, and by how much each is better than the actor's, `[B, P]`, at least 0.
         """
         shape = (*proposals.shape[:2], self.search_samples)
         if self.actor.is_greedy:
@@ -567,9 +566,9 @@ class HyAR(ReplayLearner):
             discrete = random_choice(torch.Size(shape), self.specs.num_discrete, of_tried, state.device)
             e = self.codec.embeddings[discrete]
         z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device) - 1.0
-        tried = torch.cat([proposals.unsqueeze(2), torch.cat([e, z], -1)], 2)
-        best, value = best_of_tried(self.critics, state, tried)
-        return best, value - self.critics(state, proposals).amin(0)
+        num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * self.search_samples))
+        best, value = in_pieces(partial(best_of_tried, self.critics), num_rows, state, torch.cat([e, z], -1))
+        return best, (value - self.critics(state, proposals).amin(0)).clamp(min=0.0)
 
     def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the codec; return the parts of its loss."""

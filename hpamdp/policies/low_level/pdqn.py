@@ -51,6 +51,7 @@ from hpamdp.policies.shared.networks import (
     InvertingGradients,
     before_tanh,
     even_normal,
+    in_pieces,
     mlp,
     polyak_update,
     unsquashed,
@@ -166,13 +167,13 @@ class PDQNPolicy(TensorDictModuleBase):
         """Return the discrete actions `[B]` and the parameters `[B, P]` that are best among x(s) and its variations."""
         num_tried = 1 + len(self.variations)
         num_rows = max(1, _MAX_TRIED // (num_tried * max(unit.shape[-1], self.specs.num_discrete)))
-        values, places = [], []
-        for some_states, some_units in zip(state.split(num_rows), unit.split(num_rows), strict=True):
-            best, place = best_of_tried(self.critics, some_states, with_variations(some_units, self.variations))
-            values.append(best)
-            places.append(place)
-        discrete = masked_values(torch.cat(values), allowed).argmax(-1)
-        place = torch.cat(places).gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
+
+        def best_of(some_states: Tensor, some_units: Tensor) -> tuple[Tensor, Tensor]:
+            return best_of_tried(self.critics, some_states, with_variations(some_units, self.variations))
+
+        values, places = in_pieces(best_of, num_rows, state, unit)
+        discrete = masked_values(values, allowed).argmax(-1)
+        place = places.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
         none = unit.new_zeros(1, unit.shape[-1])
         return discrete, (unit + torch.cat([none, self.variations])[place]).clamp(-1.0, 1.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -126,6 +126,12 @@ def with_variations(unit: Tensor, variations: Tensor) -> Tensor:
     """Return actions in [-1, 1], `[*B, D]`, and behind each its sums with the variations `[S, D]`: `[*B, 1 + S, D]`."""
     unit = unit.unsqueeze(-2)
     return torch.cat([unit, (unit + variations).clamp(-1.0, 1.0)], -2)
+
+
+def in_pieces(function: Callable[..., tuple[Tensor, ...]], num_rows: int, *rows: Tensor) -> tuple[Tensor, ...]:
+    """Return what a function makes of rows, each `[N, ...]`, given to it `num_rows` at a time: bounds the memory."""
+    pieces = [function(*piece) for piece in zip(*(each.split(num_rows) for each in rows), strict=True)]
+    return tuple(torch.cat(made) for made in zip(*pieces, strict=True))
 
 
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
