@@ -144,6 +144,46 @@ def test_a_subclass_with_rules_of_its_own_has_no_kernel():
     assert (env.reset()["observation"] == 0.0).all()
 
 
+def test_angles_and_sines_are_accurate_to_the_last_digits():
+    @njit
+    def compute(y, x, angles, sines):
+        for i in range(len(x)):
+            angles[i] = kernels.atan2(y[i], x[i])
+            sines[0, i], sines[1, i] = kernels.sin_cos(x[i])
+
+    rng = np.random.default_rng(0)
+    num = 200_000
+    # Of all sizes and, in the second half, near the diagonals and the axes.
+    x, y = (rng.choice([-1.0, 1.0], num) * 10.0 ** rng.uniform(-12.0, 8.0, num) for _ in range(2))
+    slope = rng.choice([0.0, 1.0], num // 2) + 10.0 ** rng.uniform(-9.0, -1.0, num // 2)
+    y[num // 2 :] = slope * x[num // 2 :]
+    x, y = x.astype(np.float32), y.astype(np.float32)
+    angles, sines = np.empty(num, np.float32), np.empty((2, num), np.float32)
+    compute(y, x, angles, sines)
+    right = np.arctan2(y.astype(np.float64), x.astype(np.float64))
+    large = np.abs(right) > 1e-30
+    assert (np.abs(angles - right)[large] <= 2.5 * np.spacing(np.abs(angles[large]))).all()
+    x = rng.uniform(-50.0, 50.0, num).astype(np.float32)
+    compute(y, x, angles, sines)
+    wide = x.astype(np.float64)
+    assert np.abs(sines - np.stack([np.sin(wide), np.cos(wide)])).max() < 1.2e-7
+
+
+def test_the_angle_of_a_vector_along_an_axis_has_numpys_signs():
+    @njit
+    def compute(y, x, angles):
+        for i in range(len(x)):
+            angles[i] = kernels.atan2(y[i], x[i])
+
+    sides = np.array([-2.0, -0.0, 0.0, 2.0], np.float32)
+    y, x = (side.ravel() for side in np.meshgrid(sides, sides))
+    angles = np.empty(16, np.float32)
+    compute(y, x, angles)
+    right = np.arctan2(y, x)
+    np.testing.assert_array_max_ulp(angles, right, 1)
+    assert (np.signbit(angles) == np.signbit(right)).all()
+
+
 def test_a_new_episode_is_counted_and_has_the_keys_of_the_tensor_functions():
     @njit
     def begin(integers, settings, bits, steps):

@@ -40,6 +40,13 @@ _ROUNDING = np.float32(1.5 * 2.0**23)  # added and taken away again, it rounds t
 _QUARTER_LOW = np.float32(math.pi / 2.0 - 1.5703125)
 _SIN_3, _SIN_5, _SIN_7 = np.float32(-1.6666654611e-1), np.float32(8.3321608736e-3), np.float32(-1.9515295891e-4)
 _COS_4, _COS_6, _COS_8 = np.float32(4.1666645683e-2), np.float32(-1.3887316255e-3), np.float32(2.4433157118e-5)
+# Of the arc tangent: the polynomial that approximates (arctan(s) - s) / s^3 in s^2 for s in [0, 1], relative to the arc
+# tangent within 2e-8.
+_ATAN_3, _ATAN_5, _ATAN_7 = np.float32(-0.33333153), np.float32(0.19993773), np.float32(-0.14211056)
+_ATAN_9, _ATAN_11, _ATAN_13 = np.float32(0.106660046), np.float32(-0.07552215), np.float32(0.043211862)
+_ATAN_15, _ATAN_17 = np.float32(-0.016367929), np.float32(0.0029206923)
+_PI, _QUARTER = np.float32(math.pi), np.float32(math.pi / 2.0)
+_TINY = np.float32(1e-38)
 
 
 @cache
@@ -136,6 +143,23 @@ def sin_cos(angle: Any) -> Any:
     of_sine = cosine if swapped else sine
     of_cosine = sine if swapped else cosine
     return (-of_sine if quadrant & 2 != 0 else of_sine), (-of_cosine if (quadrant + 1) & 2 != 0 else of_cosine)
+
+
+@inlined
+def atan2(y: Any, x: Any) -> Any:
+    """Return the angle of a finite float32 vector, within 2.5 units in the last place; without a branch or a call."""
+    width, height = abs(x), abs(y)
+    ratio = min(width, height) / max(max(width, height), _TINY)
+    # Pairs of terms do not wait for one another.
+    square = ratio * ratio
+    fourth = square * square
+    low = (_ATAN_3 + square * _ATAN_5) + fourth * (_ATAN_7 + square * _ATAN_9)
+    high = (_ATAN_11 + square * _ATAN_13) + fourth * (_ATAN_15 + square * _ATAN_17)
+    series = low + fourth * fourth * high
+    angle = ratio + ratio * square * series
+    angle = _QUARTER - angle if height > width else angle
+    angle = _PI - angle if np.signbit(x) else angle
+    return -angle if np.signbit(y) else angle
 
 
 # What the kernels of all `CounterEnv`s share: the modes, the first places in their settings, and the last rows of their

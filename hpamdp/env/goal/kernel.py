@@ -1,7 +1,8 @@
-"""The rules of Goal and Hard Goal for one row, and the loop over all rows that Numba compiles.
+"""The rules of Goal and Hard Goal as loops over rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two. An action's ticks are a loop of its
-row, so that no row waits for another's.
+It states what `rules` says of columns, for the CPU alone; a test compares the two. Ticks are played in lanes, a row in
+each: a tick of all lanes is loops without branches, which become vector instructions. Where an action is over, the next
+row takes the lane, so that no row waits for another's. Every lane does the same, so that no row depends on its lane.
 """
 
 from __future__ import annotations
@@ -10,17 +11,32 @@ import math
 from typing import Any
 
 import numpy as np
+from numba import int32, uint32
 
 from hpamdp.env import kernels
 from hpamdp.env.goal import rules
-from hpamdp.env.kernels import EPISODE_ROW, HALF, ONE, OUTCOME_ROW, STEPS_ROW, TURN, TWO, ZERO, inlined, kernel, part
+from hpamdp.env.kernels import (
+    EPISODE_ROW,
+    HALF,
+    ONE,
+    OUTCOME_ROW,
+    STEPS_ROW,
+    TURN,
+    TWO,
+    ZERO,
+    atan2,
+    inlined,
+    kernel,
+    part,
+    sin_cos,
+)
 
 # The problem's own settings.
 NOISE, IS_SCALED, KICKS_TO_POINT, REPAIRS_DISTANCE, REPAIRS_PROJECTION, HAS_MIDDLE, IS_HARD = range(
     kernels.OWN, kernels.OWN + 7
 )
 
-# Rows of the state, and of a row's bodies while its action lasts.
+# Rows of the state, and the first columns of the lanes.
 (
     _PLAYER_X,
     _PLAYER_Y,
@@ -37,13 +53,25 @@ NOISE, IS_SCALED, KICKS_TO_POINT, REPAIRS_DISTANCE, REPAIRS_PROJECTION, HAS_MIDD
     _PLAYER_ANGLE,
     _KEEPER_ANGLE,
 ) = range(14)
-_GOING = -1  # the end of an action that is not over
+_NUM_BODIES = 14
+
+_LANES = 16  # as many as the widest vectors have float32
+# Further columns of the lanes' float32: where the action aims, and the random numbers of a tick.
+_AIM_X, _AIM_Y, _DRAWN = 14, 15, 16
+_NUM_FLOATS = _DRAWN + rules.NUMBERS_PER_TICK
+# Columns of the lanes' int32: the row, or -1 in a lane that has none, whether its action is a kick, the bits of its
+# key, the index of its next random number, and the end.
+_ROW, _IS_KICK, _BITS, _INDEX, _END = range(5)
+_NUM_INTEGERS = 5
+_GOING = np.int32(rules._GOING)
 
 _F = np.float32
 _LENGTH, _HALF_WIDTH, _POST = _F(rules.LENGTH), _F(rules.HALF_WIDTH), _F(rules.GOAL_HALF_WIDTH)
 _DEPTH = _F(rules.LENGTH + rules.GOAL_DEPTH)
 _REACH, _REACH_WITH_SLACK = _F(rules.REACH), _F(rules.REACH + rules._REACH_SLACK)
-_COAST, _STILL, _CATCH = _F(rules._COAST), _F(rules._STILL), _F(rules.CATCH)
+_REACH_WITH_SLACK_2 = _F((rules.REACH + rules._REACH_SLACK) ** 2)
+_COAST, _COASTED, _TURNS = _F(rules._COAST), _F(1.0 / rules._COAST), _F(0.5 / math.pi)
+_STILL_2, _CATCH_2 = _F(rules._STILL**2), _F(rules.CATCH**2)
 _DASH, _SAVE, _FOLLOW = _F(rules._DASH), _F(rules._SAVE), _F(rules._FOLLOW)
 _PLAYER_NOISE, _BALL_NOISE = _F(rules._PLAYER_NOISE), _F(rules._BALL_NOISE)
 _PLAYER_SPEED, _BALL_SPEED = _F(rules._PLAYER_SPEED), _F(rules._BALL_SPEED)
@@ -52,7 +80,7 @@ _KICK = _F(rules._MAX_POWER * rules._BALL_RATE)
 _FACING, _KEEPER_START = _F(rules._FACING), _F(rules._KEEPER_START)
 _OFF_SHARE, _FAR_SHARE = _F(0.25 / math.pi), _F(0.25 / rules.REACH)
 _SAVED = _F(rules.GOAL_HALF_WIDTH + rules._KEEPER_MARGIN)
-_AIM_X = _F(rules.LENGTH + rules._SHOT_DEPTH)
+_SHOT_X = _F(rules.LENGTH + rules._SHOT_DEPTH)
 _PLAYERS, _PLAYER_BALL = _F(rules.PLAYER_SIZE + rules.KEEPER_SIZE), _F(rules.PLAYER_SIZE + rules.BALL_SIZE)
 _KEEPER_BALL = _F(rules.KEEPER_SIZE + rules.BALL_SIZE)
 _FIVE, _TINY = _F(5.0), _F(1e-12)
@@ -64,8 +92,13 @@ _REPAIRED = np.array([*rules.STRETCHES[:2], rules.REPAIRED_MIDDLE, *rules.STRETC
 
 
 @inlined
+def _squared(x: Any, y: Any) -> Any:
+    return x * x + y * y
+
+
+@inlined
 def _length(x: Any, y: Any) -> Any:
-    return math.sqrt(x * x + y * y)
+    return math.sqrt(_squared(x, y))
 
 
 @inlined
@@ -73,105 +106,172 @@ def _clip(value: Any, limit: Any) -> Any:
     return min(max(value, -limit), limit)
 
 
-@part
-def _push(body: Any, at: Any, effort: Any, angle: Any, drawn: Any, first: Any, noise: Any, limit: Any) -> None:
-    """Change the velocity at `at` of the bodies: `rules._accelerate`."""
-    angle = angle + angle * noise * drawn[first]
-    jolt = noise * _length(body[at], body[at + 1])
-    push_x = _clip(effort * math.cos(angle) + jolt * drawn[first + 1], limit)
-    push_y = _clip(effort * math.sin(angle) + jolt * drawn[first + 2], limit)
-    body[at] = _clip(body[at] + push_x, limit)
-    body[at + 1] = _clip(body[at + 1] + push_y, limit)
+@inlined
+def _pushed(
+    vx: Any, vy: Any, effort: Any, angle: Any, drawn: Any, drawn_x: Any, drawn_y: Any, noise: Any, limit: Any
+) -> Any:
+    """Return a velocity after a push: `rules._accelerate`."""
+    sin, cos = sin_cos(angle + angle * noise * drawn)
+    jolt = noise * _length(vx, vy)
+    push_x = _clip(effort * cos + jolt * drawn_x, limit)
+    push_y = _clip(effort * sin + jolt * drawn_y, limit)
+    return _clip(vx + push_x, limit), _clip(vy + push_y, limit)
 
 
-@part
-def _play(body: Any, aim_x: Any, aim_y: Any, drawn: Any, noise: Any) -> None:
-    """Let the player move: `rules._play`."""
-    to_x, to_y = body[_BALL_X] - body[_PLAYER_X], body[_BALL_Y] - body[_PLAYER_Y]
+@inlined
+def _draw(lanes: Any, numbers: Any, j: Any, step: Any) -> None:
+    """Draw the random numbers in (-1, 1) of a tick: `rules.random_numbers`."""
+    bits, index = uint32(numbers[_BITS * _LANES + j]), numbers[_INDEX * _LANES + j]
+    for place in range(rules.NUMBERS_PER_TICK):
+        lanes[(_DRAWN + place) * _LANES + j] = TWO * kernels.uniform(bits, step, index + place) - ONE
+    numbers[_INDEX * _LANES + j] = int32(index + rules.NUMBERS_PER_TICK)
+
+
+@inlined
+def _play(lanes: Any, j: Any, noise: Any) -> None:
+    """Let the players move: `rules._play`."""
+    player_noise, ball_noise = noise * _PLAYER_NOISE, noise * _BALL_NOISE
+    player_x, player_y = lanes[_PLAYER_X * _LANES + j], lanes[_PLAYER_Y * _LANES + j]
+    player_vx, player_vy = lanes[_PLAYER_VX * _LANES + j], lanes[_PLAYER_VY * _LANES + j]
+    ball_vx, ball_vy = lanes[_BALL_VX * _LANES + j], lanes[_BALL_VY * _LANES + j]
+    angle = lanes[_PLAYER_ANGLE * _LANES + j]
+    to_x, to_y = lanes[_BALL_X * _LANES + j] - player_x, lanes[_BALL_Y * _LANES + j] - player_y
     distance = _length(to_x, to_y)
-    angle = body[_PLAYER_ANGLE]
-    turn = math.atan2(to_y, to_x) - angle
-    turn -= TURN * _F(np.rint(turn / TURN))
+    turn = atan2(to_y, to_x) - angle
+    turn -= TURN * _F(np.rint(_TURNS * turn))
     off = abs(turn)
-    if distance <= _REACH_WITH_SLACK:
-        wish_x = _COAST * (aim_x - body[_PLAYER_X]) - body[_BALL_VX]
-        wish_y = _COAST * (aim_y - body[_PLAYER_Y]) - body[_BALL_VY]
-        share = ONE - _OFF_SHARE * off - _FAR_SHARE * distance
-        kick = min(_length(wish_x, wish_y), _KICK * share)
-        _push(body, _BALL_VX, kick, math.atan2(wish_y, wish_x), drawn, 0, noise * _BALL_NOISE, _BALL_SPEED)
-    elif off < _FACING:
-        _push(body, _PLAYER_VX, _DASH, angle, drawn, 0, noise * _PLAYER_NOISE, _PLAYER_SPEED)
-    else:
-        body[_PLAYER_ANGLE] = angle + turn / (ONE + _FIVE * _length(body[_PLAYER_VX], body[_PLAYER_VY]))
-
-
-@part
-def _keep(body: Any, drawn: Any, noise: Any) -> None:
-    """Let the keeper move: `rules._keep`."""
-    roll_x, roll_y = body[_BALL_VX] / _COAST, body[_BALL_VY] / _COAST
-    end_x, end_y = body[_BALL_X] + roll_x, body[_BALL_Y] + roll_y
-    slope = ZERO if roll_x == ZERO else roll_y / roll_x
-    height = body[_BALL_Y] + slope * (_LENGTH - body[_BALL_X])
-    if (end_x > _LENGTH) & (abs(height) <= _SAVED) & (slope != ZERO):
-        side = roll_x * (body[_BALL_Y] - body[_KEEPER_Y]) - roll_y * (body[_BALL_X] - body[_KEEPER_X])
-        angle = math.atan2(side * roll_x, -side * roll_y)
-        effort = _SAVE
-    else:
-        angle = math.atan2(end_y - body[_KEEPER_Y], end_x - body[_KEEPER_X])
-        effort = _FOLLOW
-    _push(body, _KEEPER_VX, effort, angle, drawn, 3, noise * _PLAYER_NOISE, _PLAYER_SPEED)
-    body[_KEEPER_ANGLE] = angle
+    in_reach = distance <= _REACH_WITH_SLACK
+    is_dash = (off < _FACING) & (not in_reach)
+    is_turn = (not in_reach) & (not is_dash)
+    wish_x = _COAST * (lanes[_AIM_X * _LANES + j] - player_x) - ball_vx
+    wish_y = _COAST * (lanes[_AIM_Y * _LANES + j] - player_y) - ball_vy
+    share = ONE - _OFF_SHARE * off - _FAR_SHARE * distance
+    kick = min(_length(wish_x, wish_y), _KICK * share)
+    kick_angle = atan2(wish_y, wish_x)
+    pushed_x, pushed_y = _pushed(
+        ball_vx if in_reach else player_vx,
+        ball_vy if in_reach else player_vy,
+        kick if in_reach else _DASH,
+        kick_angle if in_reach else angle,
+        lanes[_DRAWN * _LANES + j],
+        lanes[(_DRAWN + 1) * _LANES + j],
+        lanes[(_DRAWN + 2) * _LANES + j],
+        ball_noise if in_reach else player_noise,
+        _BALL_SPEED if in_reach else _PLAYER_SPEED,
+    )
+    turned = angle + turn / (ONE + _FIVE * _length(player_vx, player_vy))
+    lanes[_PLAYER_VX * _LANES + j] = pushed_x if is_dash else player_vx
+    lanes[_PLAYER_VY * _LANES + j] = pushed_y if is_dash else player_vy
+    lanes[_BALL_VX * _LANES + j] = pushed_x if in_reach else ball_vx
+    lanes[_BALL_VY * _LANES + j] = pushed_y if in_reach else ball_vy
+    lanes[_PLAYER_ANGLE * _LANES + j] = turned if is_turn else angle
 
 
 @inlined
-def _roll(body: Any, place: Any, velocity: Any, decay: Any) -> None:
+def _keep(lanes: Any, j: Any, noise: Any) -> None:
+    """Let the keepers move: `rules._keep`."""
+    keeper_noise = noise * _PLAYER_NOISE
+    keeper_x, keeper_y = lanes[_KEEPER_X * _LANES + j], lanes[_KEEPER_Y * _LANES + j]
+    ball_x, ball_y = lanes[_BALL_X * _LANES + j], lanes[_BALL_Y * _LANES + j]
+    roll_x, roll_y = _COASTED * lanes[_BALL_VX * _LANES + j], _COASTED * lanes[_BALL_VY * _LANES + j]
+    end_x, end_y = ball_x + roll_x, ball_y + roll_y
+    # The height at which the ball meets the goal line, times `roll_x`, which is positive if `end_x` is beyond it.
+    height = ball_y * roll_x + roll_y * (_LENGTH - ball_x)
+    is_shot = (end_x > _LENGTH) & (abs(height) <= _SAVED * roll_x) & (roll_x != ZERO) & (roll_y != ZERO)
+    side = roll_x * (ball_y - keeper_y) - roll_y * (ball_x - keeper_x)
+    across_x, across_y = -side * roll_y, side * roll_x
+    after_x, after_y = end_x - keeper_x, end_y - keeper_y
+    angle = atan2(across_y if is_shot else after_y, across_x if is_shot else after_x)
+    keeper_vx, keeper_vy = _pushed(
+        lanes[_KEEPER_VX * _LANES + j],
+        lanes[_KEEPER_VY * _LANES + j],
+        _SAVE if is_shot else _FOLLOW,
+        angle,
+        lanes[(_DRAWN + 3) * _LANES + j],
+        lanes[(_DRAWN + 4) * _LANES + j],
+        lanes[(_DRAWN + 5) * _LANES + j],
+        keeper_noise,
+        _PLAYER_SPEED,
+    )
+    lanes[_KEEPER_VX * _LANES + j], lanes[_KEEPER_VY * _LANES + j] = keeper_vx, keeper_vy
+    lanes[_KEEPER_ANGLE * _LANES + j] = angle
+
+
+@inlined
+def _roll(lanes: Any, j: Any, place: Any, velocity: Any, decay: Any) -> None:
     for axis in range(2):
-        body[place + axis] += body[velocity + axis]
-        body[velocity + axis] *= decay
+        lanes[(place + axis) * _LANES + j] += lanes[(velocity + axis) * _LANES + j]
+        lanes[(velocity + axis) * _LANES + j] *= decay
 
 
 @inlined
-def _collide(body: Any, one: Any, other: Any, one_v: Any, other_v: Any, touch: Any) -> None:
-    """Let two bodies bounce off each other, if they overlap: `rules._collide`."""
-    apart_x, apart_y = body[one] - body[other], body[one + 1] - body[other + 1]
+def _overlap(lanes: Any, j: Any, one: Any, other: Any, touch: Any) -> Any:
+    apart_x = lanes[one * _LANES + j] - lanes[other * _LANES + j]
+    apart_y = lanes[(one + 1) * _LANES + j] - lanes[(other + 1) * _LANES + j]
+    return _squared(apart_x, apart_y) < touch * touch
+
+
+@inlined
+def _collide(lanes: Any, j: Any, one: Any, other: Any, one_v: Any, other_v: Any, touch: Any) -> None:
+    """Let two bodies bounce off each other where they overlap: `rules._collide`."""
+    overlap = _overlap(lanes, j, one, other, touch)
+    one_x, one_y = lanes[one * _LANES + j], lanes[(one + 1) * _LANES + j]
+    other_x, other_y = lanes[other * _LANES + j], lanes[(other + 1) * _LANES + j]
+    apart_x, apart_y = one_x - other_x, one_y - other_y
     distance = _length(apart_x, apart_y)
-    if distance < touch:
-        share = HALF * (touch - distance) / max(distance, _TINY)
-        body[one] += apart_x * share
-        body[one + 1] += apart_y * share
-        body[other] -= apart_x * share
-        body[other + 1] -= apart_y * share
-        for axis in range(2):
-            body[one_v + axis] = -body[one_v + axis]
-            body[other_v + axis] = -body[other_v + axis]
+    share = HALF * (touch - distance) / max(distance, _TINY)
+    push_x, push_y = apart_x * share, apart_y * share
+    lanes[one * _LANES + j] = one_x + push_x if overlap else one_x
+    lanes[(one + 1) * _LANES + j] = one_y + push_y if overlap else one_y
+    lanes[other * _LANES + j] = other_x - push_x if overlap else other_x
+    lanes[(other + 1) * _LANES + j] = other_y - push_y if overlap else other_y
+    sign = -ONE if overlap else ONE
+    for axis in range(2):
+        lanes[(one_v + axis) * _LANES + j] *= sign
+        lanes[(other_v + axis) * _LANES + j] *= sign
 
 
-@part
-def _tick(body: Any, aim_x: Any, aim_y: Any, drawn: Any, noise: Any) -> None:
-    """Move the bodies of a row by one tick: `rules.tick`."""
-    _play(body, aim_x, aim_y, drawn, noise)
-    _keep(body, drawn, noise)
-    _roll(body, _PLAYER_X, _PLAYER_VX, _PLAYER_DECAY)
-    _roll(body, _KEEPER_X, _KEEPER_VX, _PLAYER_DECAY)
-    _roll(body, _BALL_X, _BALL_VX, _BALL_DECAY)
-    _collide(body, _PLAYER_X, _KEEPER_X, _PLAYER_VX, _KEEPER_VX, _PLAYERS)
-    _collide(body, _PLAYER_X, _BALL_X, _PLAYER_VX, _BALL_VX, _PLAYER_BALL)
-    _collide(body, _KEEPER_X, _BALL_X, _KEEPER_VX, _BALL_VX, _KEEPER_BALL)
-
-
-@part
-def _end(body: Any, is_kick: Any) -> Any:
+@inlined
+def _end(lanes: Any, j: Any, is_kick: Any) -> Any:
     """Return the outcome after a tick: PLAYING where only the action is over, _GOING where it goes on."""
-    x, y = body[_BALL_X], body[_BALL_Y]
-    if (x >= _LENGTH) & (x <= _DEPTH) & (abs(y) <= _POST):
-        return rules.GOAL
-    if _length(body[_KEEPER_X] - x, body[_KEEPER_Y] - y) < _CATCH:
-        return rules.CAUGHT
-    if not ((x >= ZERO) & (x <= _LENGTH) & (abs(y) <= _HALF_WIDTH)):
-        return rules.OUT
-    is_still = _length(body[_BALL_VX], body[_BALL_VY]) <= _STILL
-    in_reach = _length(body[_PLAYER_X] - x, body[_PLAYER_Y] - y) <= _REACH_WITH_SLACK
-    return rules.PLAYING if is_kick & is_still & in_reach else _GOING
+    x, y = lanes[_BALL_X * _LANES + j], lanes[_BALL_Y * _LANES + j]
+    to_keeper = _squared(lanes[_KEEPER_X * _LANES + j] - x, lanes[_KEEPER_Y * _LANES + j] - y)
+    to_player = _squared(lanes[_PLAYER_X * _LANES + j] - x, lanes[_PLAYER_Y * _LANES + j] - y)
+    speed = _squared(lanes[_BALL_VX * _LANES + j], lanes[_BALL_VY * _LANES + j])
+    end = int32(rules.PLAYING) if is_kick & (speed <= _STILL_2) & (to_player <= _REACH_WITH_SLACK_2) else _GOING
+    # Asked this way round, a position that is not finite ends the episode.
+    is_inside = (x >= ZERO) & (x <= _LENGTH) & (abs(y) <= _HALF_WIDTH)
+    end = end if is_inside else int32(rules.OUT)
+    end = int32(rules.CAUGHT) if to_keeper < _CATCH_2 else end
+    return int32(rules.GOAL) if (x >= _LENGTH) & (x <= _DEPTH) & (abs(y) <= _POST) else end
+
+
+@part
+def _tick(lanes: Any, numbers: Any, step: Any, noise: Any) -> Any:
+    """Move the bodies in all lanes by one tick, `rules.tick`, and return how many of their actions are over."""
+    num_touching = int32(0)
+    for j in range(_LANES):
+        _draw(lanes, numbers, j, step)
+        _play(lanes, j, noise)
+        _keep(lanes, j, noise)
+        _roll(lanes, j, _PLAYER_X, _PLAYER_VX, _PLAYER_DECAY)
+        _roll(lanes, j, _KEEPER_X, _KEEPER_VX, _PLAYER_DECAY)
+        _roll(lanes, j, _BALL_X, _BALL_VX, _BALL_DECAY)
+        touch = _overlap(lanes, j, _PLAYER_X, _KEEPER_X, _PLAYERS)
+        touch |= _overlap(lanes, j, _PLAYER_X, _BALL_X, _PLAYER_BALL)
+        touch |= _overlap(lanes, j, _KEEPER_X, _BALL_X, _KEEPER_BALL)
+        num_touching = int32(num_touching + int32(touch & (numbers[_ROW * _LANES + j] >= 0)))
+    if num_touching > 0:  # this changes nothing in the other lanes
+        for j in range(_LANES):
+            _collide(lanes, j, _PLAYER_X, _KEEPER_X, _PLAYER_VX, _KEEPER_VX, _PLAYERS)
+            _collide(lanes, j, _PLAYER_X, _BALL_X, _PLAYER_VX, _BALL_VX, _PLAYER_BALL)
+            _collide(lanes, j, _KEEPER_X, _BALL_X, _KEEPER_VX, _BALL_VX, _KEEPER_BALL)
+    num_over = int32(0)
+    for j in range(_LANES):
+        end = _end(lanes, j, numbers[_IS_KICK * _LANES + j] != 0)
+        numbers[_END * _LANES + j] = end
+        num_over = int32(num_over + int32((end != _GOING) & (numbers[_ROW * _LANES + j] >= 0)))
+    return num_over
 
 
 @part
@@ -186,7 +286,7 @@ def _aim(action: Any, first: Any, second: Any, settings: Any) -> Any:
     else:
         shot, kick_x, kick_y = first, first, second
     if action != rules.KICK_TO:
-        return _AIM_X, _clip(shot, _POST)
+        return _SHOT_X, _clip(shot, _POST)
     kick_x = min(max(kick_x, ZERO), TWO * _LENGTH)
     return kick_x, _clip(kick_y, _HALF_WIDTH) if settings[KICKS_TO_POINT] != 0.0 else kick_x
 
@@ -238,18 +338,60 @@ def _observe(body: Any, settings: Any, observation: Any) -> None:
 
 
 @part
-def _act(body: Any, steps: Any, aim_x: Any, aim_y: Any, is_kick: Any, bits: Any, step: Any, noise: Any) -> Any:
-    """Play the ticks of an action and return its end."""
-    drawn = np.empty(rules.NUMBERS_PER_TICK, np.float32)
-    index = steps * rules._NUMBERS_PER_ACTION
-    end = _GOING
-    while end == _GOING:
-        for place in range(rules.NUMBERS_PER_TICK):
-            drawn[place] = TWO * kernels.uniform(bits, step, index + place) - ONE
-        index += rules.NUMBERS_PER_TICK
-        _tick(body, aim_x, aim_y, drawn, noise)
-        end = _end(body, is_kick)
-    return end
+def _begin(
+    integers: Any, discrete: Any, parameters: Any, places: Any, bounds: Any, mask: Any, settings: Any, aims: Any
+) -> Any:
+    """Count the steps of the rows that act, write where they aim, `[2, N]`, and return those whose action is played."""
+    rows = np.empty(len(mask), np.int64)
+    num_rows = 0
+    for row in range(len(mask)):
+        if mask[row] and integers[OUTCOME_ROW, row] == rules.PLAYING:
+            integers[STEPS_ROW, row] += 1
+            if integers[STEPS_ROW, row] < settings[kernels.MAX_STEPS]:
+                action = discrete[row]
+                first = kernels.parameter(parameters, row, 0, action, places, bounds)
+                second = kernels.parameter(parameters, row, 1, action, places, bounds)
+                aims[0, row], aims[1, row] = _aim(action, first, second, settings)
+                rows[num_rows] = row
+                num_rows += 1
+            else:  # the last action is not played
+                integers[OUTCOME_ROW, row] = rules.TIME_LIMIT
+    return rows[:num_rows]
+
+
+@part
+def _act(floats: Any, integers: Any, discrete: Any, rows: Any, aims: Any, settings: Any) -> None:
+    """Play the actions of these rows, int64 `[M]`."""
+    lanes = np.zeros(_NUM_FLOATS * _LANES, np.float32)
+    numbers = np.full(_NUM_INTEGERS * _LANES, -1, np.int32)
+    noise = _F(settings[NOISE])
+    step = kernels.stream_step(int32(settings[kernels.NOISE_STREAM]))
+    num_started, num_ended, num_rows = 0, 0, len(rows)
+    while True:
+        for j in range(_LANES):
+            row = numbers[_ROW * _LANES + j]
+            if row >= 0:
+                if numbers[_END * _LANES + j] == _GOING:
+                    continue
+                for column in range(_NUM_BODIES):
+                    floats[column, row] = lanes[column * _LANES + j]
+                integers[OUTCOME_ROW, row] = numbers[_END * _LANES + j]
+                numbers[_ROW * _LANES + j] = -1
+                num_ended += 1
+            if num_started < num_rows:
+                row = rows[num_started]
+                num_started += 1
+                numbers[_ROW * _LANES + j] = row
+                for column in range(_NUM_BODIES):
+                    lanes[column * _LANES + j] = floats[column, row]
+                lanes[_AIM_X * _LANES + j], lanes[_AIM_Y * _LANES + j] = aims[0, row], aims[1, row]
+                numbers[_IS_KICK * _LANES + j] = discrete[row] == rules.KICK_TO
+                numbers[_BITS * _LANES + j], _ = kernels.noise_key(settings, row, integers[EPISODE_ROW, row])
+                numbers[_INDEX * _LANES + j] = (integers[STEPS_ROW, row] - 1) * rules._NUMBERS_PER_ACTION
+        if num_ended == num_rows:
+            return
+        while _tick(lanes, numbers, step, noise) == 0:
+            pass
 
 
 @kernel
@@ -272,28 +414,19 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    noise = _F(settings[NOISE])
-    body = np.empty(14, np.float32)
+    before = integers[OUTCOME_ROW].copy()
+    if mode != kernels.RESTART:
+        aims = np.empty((2, len(mask)), np.float32)
+        rows = _begin(integers, discrete, parameters, places, bounds, mask, settings, aims)
+        _act(floats, integers, discrete, rows, aims, settings)
+    body = np.empty(_NUM_BODIES, np.float32)
     for row in range(len(mask)):
-        was_over = integers[OUTCOME_ROW, row] != rules.PLAYING
+        was_over = before[row] != rules.PLAYING
+        end = integers[OUTCOME_ROW, row]
         body[:] = floats[:, row]
-        if mode != kernels.RESTART and mask[row] and not was_over:
-            steps = integers[STEPS_ROW, row]
-            integers[STEPS_ROW, row] = steps + 1
-            end = rules.TIME_LIMIT  # the last action is not played
-            if steps + 1 < settings[kernels.MAX_STEPS]:
-                action = discrete[row]
-                first = kernels.parameter(parameters, row, 0, action, places, bounds)
-                second = kernels.parameter(parameters, row, 1, action, places, bounds)
-                aim_x, aim_y = _aim(action, first, second, settings)
-                bits, step = kernels.noise_key(settings, row, integers[EPISODE_ROW, row])
-                end = _act(body, steps, aim_x, aim_y, action == rules.KICK_TO, bits, step, noise)
-                floats[:, row] = body
-            integers[OUTCOME_ROW, row] = end
-            if end == rules.GOAL:
-                rewards[row] = _GOAL_REWARD
-            elif end != rules.PLAYING:
-                rewards[row] = -_goal_distance(body, settings[REPAIRS_DISTANCE] != 0.0)
+        if end != rules.PLAYING and not was_over:
+            is_repaired = settings[REPAIRS_DISTANCE] != 0.0
+            rewards[row] = _GOAL_REWARD if end == rules.GOAL else -_goal_distance(body, is_repaired)
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 bits, step = kernels.new_episode(integers, row, settings)
