@@ -147,8 +147,9 @@ def test_a_mapped_transition_is_the_mapped_states_transition(name):
     env = make()
     maps = env.symmetries
     assert maps is not None and len(maps) == num_maps
-    # Places that are not scaled have larger rounding errors: 3e-5 of a pixel.
-    assert worst_error(env, columns_of, maps) < (1e-4 if "pixels" in name or "raw" in name else 1e-5)
+    # Places that are not scaled have larger rounding errors, 3e-5 of a pixel, and so have Goal's actions of many ticks.
+    is_rough = "pixels" in name or "raw" in name or name == "goal"
+    assert worst_error(env, columns_of, maps) < (1e-4 if is_rough else 1e-5)
 
 
 @pytest.mark.parametrize("n", [6, 8, 10])
