@@ -53,16 +53,16 @@ NOISE, IS_SCALED, KICKS_TO_POINT, REPAIRS_DISTANCE, REPAIRS_PROJECTION, HAS_MIDD
     _PLAYER_ANGLE,
     _KEEPER_ANGLE,
 ) = range(14)
-_NUM_BODIES = 14
+_NUM_COLUMNS = _KEEPER_ANGLE + 1
 
 _LANES = 16  # as many as the widest vectors have float32
 # Further columns of the lanes' float32: where the action aims, and the random numbers of a tick.
-_AIM_X, _AIM_Y, _DRAWN = 14, 15, 16
+_AIM_X, _AIM_Y, _DRAWN = range(_NUM_COLUMNS, _NUM_COLUMNS + 3)
 _NUM_FLOATS = _DRAWN + rules.NUMBERS_PER_TICK
 # Columns of the lanes' int32: the row, or -1 in a lane that has none, whether its action is a kick, the bits of its
 # key, the index of its next random number, and the end.
 _ROW, _IS_KICK, _BITS, _INDEX, _END = range(5)
-_NUM_INTEGERS = 5
+_NUM_INTEGERS = _END + 1
 _GOING = np.int32(rules._GOING)
 
 _F = np.float32
@@ -373,7 +373,7 @@ def _act(floats: Any, integers: Any, discrete: Any, rows: Any, aims: Any, settin
             if row >= 0:
                 if numbers[_END * _LANES + j] == _GOING:
                     continue
-                for column in range(_NUM_BODIES):
+                for column in range(_NUM_COLUMNS):
                     floats[column, row] = lanes[column * _LANES + j]
                 integers[OUTCOME_ROW, row] = numbers[_END * _LANES + j]
                 numbers[_ROW * _LANES + j] = -1
@@ -382,7 +382,7 @@ def _act(floats: Any, integers: Any, discrete: Any, rows: Any, aims: Any, settin
                 row = rows[num_started]
                 num_started += 1
                 numbers[_ROW * _LANES + j] = row
-                for column in range(_NUM_BODIES):
+                for column in range(_NUM_COLUMNS):
                     lanes[column * _LANES + j] = floats[column, row]
                 lanes[_AIM_X * _LANES + j], lanes[_AIM_Y * _LANES + j] = aims[0, row], aims[1, row]
                 numbers[_IS_KICK * _LANES + j] = discrete[row] == rules.KICK_TO
@@ -419,7 +419,7 @@ def advance(
         aims = np.empty((2, len(mask)), np.float32)
         rows = _begin(integers, discrete, parameters, places, bounds, mask, settings, aims)
         _act(floats, integers, discrete, rows, aims, settings)
-    body = np.empty(_NUM_BODIES, np.float32)
+    body = np.empty(_NUM_COLUMNS, np.float32)
     for row in range(len(mask)):
         was_over = before[row] != rules.PLAYING
         end = integers[OUTCOME_ROW, row]
