@@ -50,7 +50,7 @@ REFUSED = [
     ("total_frames=100000000000000000000", "total_frames=100000000000000000000: must lie between "),
     (PLATFORM + "env.max_steps=1000000000000000000000", "env.max_steps=1000000000000000000000: must lie between "),
     (PLATFORM + "env.noise=1e9", "env: PlatformEnv: noise=1000000000.0, but must lie between 0 and 100"),
-    ("env=goal high=none low=random env.noise=30", "env: GoalEnv: noise=30.0, but must lie between 0 and 10"),
+    ("env=goal high=none low=random env.noise=11", "env: GoalEnv: noise=11.0, but must lie between 0 and 5"),
     ("env.motor_noise=1e9", "env: BoatDockEnv: motor_noise=1000000000.0, but must lie between 0 and 10"),
     ("env.motor_noise=[0,11]", "env: BoatDockEnv: motor_noise=11.0, but must lie between 0 and 10"),
     ("env.sensor_noise=1e9", "env: BoatDockEnv: sensor_noise=1000000000.0, but must lie between 0 and 1000"),

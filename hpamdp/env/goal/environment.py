@@ -48,8 +48,8 @@ class GoalEnv(CounterEnv[GoalState]):
         max_steps: actions after which an episode is truncated. The last one is not played, as in gym-goal, which has
             100.
         observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
-        noise: factor on the published noise of the motions; 0 is none. Starts are random all the same. From about 30 on
-            players hardly ever meet the ball, and actions do not end; so at most 10.
+        noise: factor on the published noise of the motions; 0 is none. Starts are random all the same. At most 5: from
+            about 10 on, a run towards -x gets nowhere on average, and an action may never end.
         repaired: the slips to take out; `slips` are those that the problem has.
         compile_rules: compile the ticks (takes about a minute) instead of using the kernel, for a GPU.
         device: of the tensors.
@@ -237,8 +237,8 @@ class GoalEnv(CounterEnv[GoalState]):
         name = type(self).__name__
         if observation not in ("scaled", "raw"):
             raise ValueError(f"{name}: observation={observation!r}, but must be scaled or raw")
-        if not 0.0 <= noise <= 10.0:
-            raise ValueError(f"{name}: noise={noise}, but must lie between 0 and 10")
+        if not 0.0 <= noise <= 5.0:
+            raise ValueError(f"{name}: noise={noise}, but must lie between 0 and 5")
         unknown = [slip for slip in repaired if slip not in self.slips]
         if unknown:
             raise ValueError(f"{name}: repaired={list(repaired)}, but may only have {', '.join(self.slips)}")
