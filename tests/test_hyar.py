@@ -13,9 +13,9 @@ SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
     rl="td3", discrete="greedy",
-    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], warmup_frames=2000,
+    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], layer_norm=False, warmup_frames=2000,
     codec_pretrain_updates=700, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
-    latent_coverage=0.96, correction_factor=5.0, relabelling="mean",
+    latent_coverage=0.96, correction_factor=5.0, parameter_tolerance=None, relabelling="mean",
     buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
     critic_lr=1e-3, augment=False,
     lr_final=1.0, lr_frames=0, policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1,
@@ -301,6 +301,41 @@ def test_a_latent_is_outdated_by_the_codecs_own_error(trained):
     trained.dynamics_error.copy_(usual)
     assert shares[0] > shares[1] > shares[2] == 0.0
     assert 0.0 < usual < 1.0
+
+
+def test_with_a_tolerance_a_latent_is_outdated_exactly_where_it_decodes_to_other_parameters(trained):
+    rows = trained.buffer.sample(1000)
+    codec, discrete = trained.codec, rows["discrete"]
+    rows["latent"] = torch.cat([codec.embeddings[discrete].detach(), torch.rand(1000, 3) * 2 - 1], -1)
+
+    def decoding_error(latent: torch.Tensor) -> torch.Tensor:
+        with torch.no_grad():
+            unit, _ = codec.decode(rows["state"], discrete, codec.z_from_unit(latent[:, 3:]))
+        return ((unit - rows["unit"]) * codec.mask[discrete]).abs().amax(-1)
+
+    trained.parameter_tolerance = 0.2
+    latent, is_corrected = trained.corrected_latent(rows)
+    trained.parameter_tolerance = None
+    error = decoding_error(rows["latent"])
+    assert torch.equal(is_corrected, error > 0.2)
+    assert 0.3 < is_corrected[discrete != 2].float().mean() < 1.0, "the third action has no parameter"
+    assert (decoding_error(latent) < 0.2).float().mean() > 0.9
+    usual = trained.dynamics_error.clone()
+    trained.dynamics_error.fill_(1e6)  # any change of the state will do
+    _, is_corrected = trained.corrected_latent(rows)
+    trained.dynamics_error.copy_(usual)
+    assert not is_corrected.any()
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_layer_norm_bounds_what_critics_promise_far_from_all_they_have_seen(layer_norm):
+    torch.manual_seed(0)
+    critics = make(layer_norm=layer_norm).critics
+    last = critics.net.layers[-1]
+    bound = (last.weight.norm(dim=1) * 64**0.5 + last.bias.abs().squeeze(-1)).amax()
+    with torch.no_grad():
+        q = critics(1e4 * torch.randn(500, 4), 1e4 * torch.randn(500, 1, 6))
+    assert (q.abs().amax() <= bound) == layer_norm
 
 
 def test_relabelling_by_samples_spreads_over_the_latent_space():

@@ -33,10 +33,11 @@ def passes_one_by_one(critics: HybridCritics, specs: PAMDPSpecs, state: Tensor, 
 
 @pytest.mark.parametrize("dims", [(1, 1, 1), (2, 0, 1), (0, 3), (0, 0), (1,) * 40])
 @pytest.mark.parametrize("hidden_dims", [[], [16], [16, 8]])
-def test_multi_pass_values_and_their_gradients_are_those_of_separate_passes(dims, hidden_dims):
+@pytest.mark.parametrize("layer_norm", [False, True])
+def test_multi_pass_values_and_their_gradients_are_those_of_separate_passes(dims, hidden_dims, layer_norm):
     torch.manual_seed(0)
     specs = specs_of(*dims)
-    critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
+    critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True, layer_norm=layer_norm)
     state, unit = torch.randn(7, 4), (torch.rand(7, sum(dims)) * 2 - 1).requires_grad_()
     inputs = [unit, *critics.parameters()]
     results = []

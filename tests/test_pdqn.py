@@ -16,11 +16,11 @@ from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
     multipass=True, twin_q=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
-    n_step=1, bounding="tanh", hidden_dims=[64, 64], warmup_frames=1000, buffer_size=20_000, batch_size=64,
-    updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02, critic_tau=0.02,
-    max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1, epsilon_frames=3000,
-    epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0, lr_frames=1000,
-    preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
+    n_step=1, bounding="tanh", hidden_dims=[64, 64], layer_norm=False, warmup_frames=1000, buffer_size=20_000,
+    batch_size=64, updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02,
+    critic_tau=0.02, max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1,
+    epsilon_frames=3000, epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0,
+    lr_frames=1000, preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
 )  # fmt: skip
 PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
 

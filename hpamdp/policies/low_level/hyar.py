@@ -22,6 +22,11 @@ Differs from the source:
   encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones;
 - the correction compares the error of a stored action with a running mean of the codec's error, over its last hundred
   or so updates, instead of the error of the last update;
+- with `parameter_tolerance` the correction asks whether z still decodes to the executed parameters, which are stored,
+  instead of whether the change of the state that it predicts is the one that followed. Where changes are hard to
+  predict, the two hardly agree: see `experiments/domains`;
+- with `layer_norm` the critics' layers are normalised, which bounds what they promise of latent actions far from all
+  that were tried (Ball et al. 2023, arXiv 2302.02948);
 - with `greedy_samples` the greedy policy also values variations of z and takes the best of them all;
 - with `search_samples` the actor is also drawn to the best of random latent actions, the more the better they are than
   its own by the critics, and `preactivation_penalty` keeps it from the bounds; both as in P-DQN;
@@ -198,9 +203,11 @@ class LatentActor(nn.Module):
 class LatentCritics(nn.Module):
     """`num_members` independent networks for Q(s, e, z)."""
 
-    def __init__(self, num_members: int, observation_dim: int, action_dim: int, hidden_dims: list[int]) -> None:
+    def __init__(
+        self, num_members: int, observation_dim: int, action_dim: int, hidden_dims: list[int], *, layer_norm: bool
+    ) -> None:
         super().__init__()
-        self.net = EnsembleMLP(num_members, observation_dim + action_dim, hidden_dims, 1)
+        self.net = EnsembleMLP(num_members, observation_dim + action_dim, hidden_dims, 1, layer_norm=layer_norm)
 
     def forward(self, state: Tensor, latent: Tensor, num_members: int | None = None) -> Tensor:
         """Return the values `[E, B, N]` of N latent actions in each state.
@@ -343,6 +350,7 @@ class HyAR(ReplayLearner):
         latent_dim: PositiveInt | None,
         codec_hidden_dim: PositiveInt,
         hidden_dims: list[PositiveInt],
+        layer_norm: bool,
         warmup_frames: PositiveInt,
         codec_pretrain_updates: PositiveInt,
         codec_every: PositiveInt,
@@ -351,6 +359,7 @@ class HyAR(ReplayLearner):
         dynamics_weight: NonNegativeFloat,
         latent_coverage: PositiveFraction,
         correction_factor: PositiveFloat,
+        parameter_tolerance: NonNegativeFloat | None,
         relabelling: Literal["mean", "sample"],
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
@@ -392,6 +401,7 @@ class HyAR(ReplayLearner):
         self.reward_scale = reward_scale
         self.latent_coverage = latent_coverage
         self.correction_factor = correction_factor
+        self.parameter_tolerance = parameter_tolerance
         self.relabels_with_noise = relabelling == "sample"
         self.tau = tau
         self.lr_final = lr_final
@@ -410,7 +420,9 @@ class HyAR(ReplayLearner):
         self.codec = HybridCodec(specs, embedding_dim, latent_dim, codec_hidden_dim)
         self.actor = LatentActor(specs, embedding_dim, latent_dim, hidden_dims, is_greedy=discrete == "greedy")
         num_critics = 2 if is_td3 else 1
-        self.critics = LatentCritics(num_critics, specs.observation_dim, embedding_dim + latent_dim, hidden_dims)
+        self.critics = LatentCritics(
+            num_critics, specs.observation_dim, embedding_dim + latent_dim, hidden_dims, layer_norm=layer_norm
+        )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HyARPolicy(
@@ -484,8 +496,9 @@ class HyAR(ReplayLearner):
 
         This is the representation-shift correction: e is replaced by the discrete action's embedding where it no longer
         decodes to that action; z is encoded anew where the predicted change of the state is off by more than
-        `correction_factor` times the codec's mean error. With `relabelling="sample"` the new e carries noise, and the
-        new z is a sample of the encoder's distribution instead of its mean.
+        `correction_factor` times the codec's mean error or, if `parameter_tolerance` is given, where the decoded
+        parameters are off by more than that. With `relabelling="sample"` the new e carries noise, and the new z is a
+        sample of the encoder's distribution instead of its mean.
 
         Latents are `[B, embedding_dim + latent_dim]`.
         """
@@ -493,11 +506,7 @@ class HyAR(ReplayLearner):
         discrete = batch["discrete"]
         with torch.no_grad():
             e, z = batch[LATENT].split([self.codec.table.shape[-1], self.codec.latent_dim], -1)
-            change = self.codec.change(state, discrete, self.codec.z_from_unit(z))
-            target = (batch["next_state"] - state) / self.codec.change_scale
-            # A random action's latent is NaN; comparisons with it are false, so it is always encoded anew.
-            threshold = self.correction_factor * self.dynamics_error
-            is_same_change = (change - target).square().mean(-1) <= threshold
+            is_current = self._is_current(batch, z)
             is_same_discrete = (self.codec.nearest_discrete(e.nan_to_num()) == discrete) & ~e.isnan().any(-1)
             new_e = self.codec.embeddings[discrete]
             if self.actor.is_greedy:
@@ -509,8 +518,23 @@ class HyAR(ReplayLearner):
             new_z, log_variance = self.codec.encode(state, discrete, batch["unit"])
             if self.relabels_with_noise:
                 new_z = new_z + (0.5 * log_variance).exp() * torch.randn_like(new_z)
-            z = torch.where(is_same_change.unsqueeze(-1), z, self.codec.z_to_unit(new_z))
-        return torch.cat([e, z], -1), ~(is_same_discrete & is_same_change)
+            z = torch.where(is_current.unsqueeze(-1), z, self.codec.z_to_unit(new_z))
+        return torch.cat([e, z], -1), ~(is_same_discrete & is_current)
+
+    def _is_current(self, batch: TensorDictBase, z: Tensor) -> Tensor:
+        """Return whether stored z `[B, latent_dim]` in [-1, 1] still stand for what was executed, bool `[B]`.
+
+        A random action's z is NaN; comparisons with it are false, so it never does.
+        """
+        state, discrete = batch["state"], batch["discrete"]
+        z = self.codec.z_from_unit(z)
+        if self.parameter_tolerance is None:
+            target = (batch["next_state"] - state) / self.codec.change_scale
+            error = (self.codec.change(state, discrete, z) - target).square().mean(-1)
+            return error <= self.correction_factor * self.dynamics_error
+        unit, _ = self.codec.decode(state, discrete, z)
+        error = ((unit - batch["unit"]) * self.codec.mask[discrete]).abs().amax(-1)
+        return error <= self.parameter_tolerance
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:

@@ -18,6 +18,7 @@ Differs from the source:
   often know better parameters than those that the actor's gradient has led to. It makes no difference in training;
 - with `search_samples` the actor is also drawn to the best of uniformly random parameters of each discrete action, the
   more the better they are by the critics than its own. A gradient alone stays on the hill that it began on;
+- with `layer_norm` the critics' layers are normalised (Ball et al. 2023, arXiv 2302.02948);
 - where only the chosen action's value matters, only its pass is computed; passes share what they have in common;
 - networks start as PyTorch's, not as Kaiming et al. proposed;
 - by default, that is with `pdqn.yaml`: twin critics, whose minimum is Q everywhere (in the targets, in the actor's loss
@@ -199,6 +200,7 @@ class PDQN(ReplayLearner):
         bounding: Literal["tanh", "inverting_gradients"],
         initial_parameters: InitialParameters,
         hidden_dims: list[PositiveInt],
+        layer_norm: bool,
         warmup_frames: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
@@ -261,7 +263,7 @@ class PDQN(ReplayLearner):
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
 
         self.actor = ParameterActor(specs, hidden_dims, bounding, initial_parameters)
-        self.critics = HybridCritics(specs, 2 if twin_q else 1, hidden_dims, multipass)
+        self.critics = HybridCritics(specs, 2 if twin_q else 1, hidden_dims, multipass, layer_norm=layer_norm)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = PDQNPolicy(
