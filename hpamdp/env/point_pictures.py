@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image
 
-from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
 
 _FIELD, _RIM = "#ffffff", "#c9c5ba"
 _PATH, _BODY = "#2f6690", "#1d3f58"
@@ -47,7 +46,7 @@ class Scene:
 
 def draw(scene: Scene, size: int = 480) -> np.ndarray:
     """Return a picture of the scene, uint8 `[size, size, 3]`."""
-    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+    canvas = Canvas.for_shapes(size)
     corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
     canvas.polygon([_on_paper(corner) for corner in corners], _FIELD, _RIM, 3.0 if scene.has_walls else 1.0)
     fill, edge = _colours(scene)
@@ -60,7 +59,7 @@ def draw(scene: Scene, size: int = 480) -> np.ndarray:
         canvas.disc(_on_paper(point), 2.0, _PATH)
     canvas.disc(_on_paper(scene.path[0]), 5.0, BACKGROUND, INK, 2.0)
     _draw_agent(canvas, scene)
-    finished = Canvas(canvas.image.reduce(SMOOTH))
+    finished = canvas.smoothed()
     _write(finished, scene)
     return np.array(finished.image)
 

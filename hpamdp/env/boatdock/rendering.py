@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.task import Boats, BoatState
-from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, BAD, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
 
 _WATER = "#d6e7ec"
 _RIM = "#a5c2cb"
@@ -71,22 +71,24 @@ class Scene:
 
 def draw(scene: Scene, size: int = 480) -> np.ndarray:
     """Return a picture of the scene, uint8 `[size, size, 3]`."""
-    canvas = Canvas(_empty_harbour(size).copy())
+    harbour_shapes, harbour_smoothed = _empty_harbour(size)
+    canvas = Canvas(harbour_shapes.copy())
     _draw_places(canvas, scene)
     _draw_track(canvas, scene)
     _draw_boat(canvas, scene)
     _draw_gauge(canvas, scene.fuel)
     _draw_compass(canvas, scene)
-    finished = Canvas(canvas.image.reduce(SMOOTH))
+    finished = canvas.smoothed(harbour_smoothed)
     _write_labels(finished, scene)
     return np.array(finished.image)
 
 
 @lru_cache(maxsize=2)
-def _empty_harbour(size: int) -> Image.Image:
-    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+def _empty_harbour(size: int) -> tuple[Image.Image, Image.Image]:
+    """Return the harbour before and after smoothing; both for reading only."""
+    canvas = Canvas.for_shapes(size)
     canvas.disc(_on_paper((0.0, 0.0)), physics.HARBOUR_RADIUS * _SCALE + 1.5, _WATER, _RIM, 3.0)
-    return canvas.image
+    return canvas.image, canvas.smoothed().image
 
 
 def _on_paper(point: Point) -> Point:

@@ -7,10 +7,9 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image
 from torch import Tensor
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, Canvas, Point
 from hpamdp.env.goal import rules
 from hpamdp.env.goal.rules import GoalState
 
@@ -29,7 +28,7 @@ def draw(track: Sequence[GoalState], size: int = 480) -> np.ndarray:
         size: px from edge to edge.
     """
     last = track[-1]
-    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+    canvas = Canvas.for_shapes(size)
     _rectangle(canvas, (0.0, -rules.HALF_WIDTH), (rules.LENGTH, rules.HALF_WIDTH), _GRASS)
     goal = (rules.LENGTH + rules.GOAL_DEPTH, rules.GOAL_HALF_WIDTH)
     _rectangle(canvas, (rules.LENGTH, -rules.GOAL_HALF_WIDTH), goal, _NET)
@@ -45,7 +44,7 @@ def draw(track: Sequence[GoalState], size: int = 480) -> np.ndarray:
     _draw_body(canvas, _place(last.keeper_x, last.keeper_y), float(last.keeper_angle), rules.KEEPER_SIZE, _KEEPER)
     _draw_body(canvas, _place(last.player_x, last.player_y), float(last.player_angle), rules.PLAYER_SIZE, _PLAYER)
     canvas.disc(_on_paper(places[-1]), rules.BALL_SIZE * _SCALE, _BALL, BACKGROUND, 1.5)
-    finished = Canvas(canvas.image.reduce(SMOOTH))
+    finished = canvas.smoothed()
     steps, outcome = int(last.steps), int(last.outcome)
     finished.write((18.0, 16.0), f"{steps} {'step' if steps == 1 else 'steps'}", FAINT)
     if outcome != rules.PLAYING:

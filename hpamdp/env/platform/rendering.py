@@ -6,9 +6,8 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
-from PIL import Image
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas
+from hpamdp.env.canvas import BAD_EDGE, FAINT, GOOD_EDGE, INK, PAPER, Canvas
 from hpamdp.env.platform import rules
 from hpamdp.env.platform.rules import PlatformState
 
@@ -25,7 +24,7 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
         track: the states of one environment after each action, columns `[1]`.
         size: of the picture.
     """
-    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+    canvas = Canvas.for_shapes(size)
     for left, right in zip(rules.LEFT, rules.RIGHT, strict=True):
         corners = [(left, 0.0), (right, 0.0), (right, -_DEPTH / _SCALE), (left, -_DEPTH / _SCALE)]
         canvas.polygon([_on_paper(x, y) for x, y in corners], _GROUND)
@@ -38,7 +37,7 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
     _draw_body(canvas, float(last.enemy_x), _ENEMY, 0.0)
     has_fallen = int(last.outcome) == rules.FELL
     _draw_body(canvas, float(last.x), _AGENT, -rules.BODY_HEIGHT if has_fallen else 0.0)
-    finished = Canvas(canvas.image.reduce(SMOOTH))
+    finished = canvas.smoothed()
     steps, outcome = int(last.steps), int(last.outcome)
     finished.write((18.0, 22.0), f"{steps} {'action' if steps == 1 else 'actions'}", FAINT)
     finished.write((PAPER - 18.0, 22.0), f"{100.0 * float(last.x) / rules.END:.0f} % of the course", INK, anchor="rm")

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from PIL import Image
 
-from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, SMOOTH, Canvas, Point
+from hpamdp.env.canvas import BACKGROUND, BAD_EDGE, FAINT, GOOD, GOOD_EDGE, INK, PAPER, Canvas, Point
 from hpamdp.env.rooms import rules
 
 _WALL, _DOORWAY, _ICE, _SAND = "#8f8a7c", "#fffdf8", "#d6e7ec", "#f4e6c4"
@@ -29,7 +28,7 @@ def draw(path: Sequence[tuple[int, int]], outcome: int, size: int = 480) -> np.n
     Returns:
         uint8 `[size, size, 3]`.
     """
-    canvas = Canvas(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
+    canvas = Canvas.for_shapes(size)
     for x, y in itertools.product(range(rules.SIZE), repeat=2):
         canvas.polygon(_square((x, y)), _floor(x, y))
     canvas.polygon(_square((rules.GOAL, rules.GOAL)), GOOD, GOOD_EDGE, 2.0)
@@ -39,7 +38,7 @@ def draw(path: Sequence[tuple[int, int]], outcome: int, size: int = 480) -> np.n
         canvas.disc(_middle(cell), 3.5, _PATH)
     canvas.disc(_middle(path[0]), 6.0, BACKGROUND, INK, 2.0)
     canvas.disc(_middle(path[-1]), 9.0, _BODY, BACKGROUND, 1.6)
-    finished = Canvas(canvas.image.reduce(SMOOTH))
+    finished = canvas.smoothed()
     steps = len(path) - 1
     finished.write((18.0, 22.0), f"{steps} {'step' if steps == 1 else 'steps'}", FAINT)
     if outcome != rules.GOING_ON:
