@@ -10,7 +10,7 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.low_level.pets import MEMBER, PETS
 from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.planning import Prediction, SequenceSearch, discounted_return, elite_weights
+from hpamdp.policies.shared.planning import Found, Prediction, SequenceSearch, discounted_return, elite_weights
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")
@@ -25,7 +25,7 @@ OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
     linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0,
     warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
-    posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, gamma=0.97,
+    posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, epsilon=0.0, gamma=0.97,
     planning_precision="float32", end_values=False, end_value_lr=1e-3,
     end_value_tau=0.02, end_value_expectile=0.9, **SEARCH,
 )  # fmt: skip
@@ -541,6 +541,27 @@ def test_actions_are_random_as_long_as_all_rewards_are_the_same():
     for reward, is_trained in ((torch.zeros(64), False), (torch.arange(64.0), True)):
         learn(learner, random_batch(64, reward=reward))
         assert bool(learner.policy.is_trained) == is_trained
+
+
+@pytest.mark.parametrize(
+    ("epsilon", "is_exploring", "planned"), [(0.25, True, 0.75), (1.0, True, 0.0), (1.0, False, 1.0)]
+)
+def test_a_share_epsilon_of_exploring_actions_is_random_and_no_greedy_one(monkeypatch, epsilon, is_exploring, planned):
+    learner = make(epsilon=epsilon)
+    learner.policy.is_trained.fill_(True)
+    asked = []
+
+    def plan(state, member=None, allowed=None):
+        asked.append(len(state))
+        own = torch.zeros(len(state), learner.policy.slots.shape[-1])
+        return Found(torch.full((len(state),), 2), own, torch.zeros(len(state)))
+
+    monkeypatch.setattr(learner.policy, "plan", plan)
+    td = TensorDict({keys.OBSERVATION: torch.randn(4000, 4)}, [4000])
+    with set_exploration_type(ExplorationType.RANDOM if is_exploring else ExplorationType.DETERMINISTIC):
+        discrete = learner.policy(td)[keys.DISCRETE]
+    assert sum(asked) == pytest.approx(planned * 4000, abs=100)
+    assert (discrete == 2).float().mean().item() == pytest.approx(planned + (1 - planned) / 3, abs=0.03)
 
 
 def test_actions_lie_in_their_bounds():

@@ -22,6 +22,8 @@ Differs from the sources:
 - nor does an environment follow a single member there. Exploring plans are those of the mean of all members' returns
   plus their standard deviation (`posterior_sampling`, `optimism`): all members are sure that what has never earned
   anything never will, and agree best on actions that hardly do anything;
+- with `epsilon` a share of the exploring actions is random, for rewards that members which never met them agree not to
+  expect;
 - entries of the state whose changes depend linearly on those of others, such as a target's offset on one's own place,
   are not predicted but derived from them;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
@@ -46,7 +48,7 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.fractions import Expectile, LearningRate, PositiveFraction
+from hpamdp.policies.shared.fractions import Expectile, Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.frame import CanonicalFrame, joined
 from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.networks import EnsembleLinear
@@ -395,6 +397,7 @@ class PETSPolicy(TensorDictModuleBase):
         *,
         gamma: float,
         noise: float,
+        epsilon: float,
         samples_posterior: bool,
         optimism: float,
         caution: float,
@@ -410,6 +413,7 @@ class PETSPolicy(TensorDictModuleBase):
         self.specs = specs
         self.gamma = gamma
         self.noise = noise
+        self.epsilon = epsilon
         self.samples_posterior = samples_posterior
         self.optimism = optimism
         self.caution = caution
@@ -434,6 +438,8 @@ class PETSPolicy(TensorDictModuleBase):
         done = td.get(keys.DONE, None)
         if done is not None:
             is_planned = is_planned & ~done.flatten()
+        if self.epsilon > 0.0 and not is_greedy():
+            is_planned = is_planned & (torch.rand(num, device=device) >= self.epsilon)
         if is_planned.any():
             allowed = None if allowed is None else allowed[is_planned]
             found = self.plan(state[is_planned], member[is_planned] if self._follows_member else None, allowed)
@@ -626,6 +632,7 @@ class PETS(ReplayLearner):
         optimism: NonNegativeFloat,
         caution: NonNegativeFloat,
         parameter_noise: NonNegativeFloat,
+        epsilon: Fraction,
         gamma: PositiveFraction,
         horizon: PositiveInt,
         max_sequences: PositiveInt,
@@ -694,6 +701,7 @@ class PETS(ReplayLearner):
             self.entries,
             gamma=gamma,
             noise=parameter_noise,
+            epsilon=epsilon,
             samples_posterior=self.model.frame.turns if posterior_sampling == "auto" else posterior_sampling,
             optimism=optimism,
             caution=caution,
