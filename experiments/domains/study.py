@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullFormatter
 
 from hpamdp.analysis.study import (
     MIN_SEEDS,
@@ -52,6 +52,7 @@ DOMAINS = {
 }
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_COMPARED = 3  # of both learners, for a probability of improvement
+FIRST_STEPS = 700  # where the curves' axes begin: no learner was evaluated earlier
 CPU_LIMIT = 600.0  # seconds, of the second table
 AUGMENTED = "_augment"  # follows a learner's name where steps are mapped by symmetries that the problem declares
 KEY = ("domain", "learner", "frames", "seed")
@@ -232,26 +233,35 @@ def draw(curves: Rows, published: Rows, path: Path) -> None:
         _draw_domain(axes, name, at_published_steps([row for row in curves if row["domain"] == name]), published)
     for axes in list(figure.axes)[len(shown) :]:
         axes.set_axis_off()
+    lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
+    figure.legend(handles=list(lines.values()), loc="outside lower center", ncols=6, fontsize=10, frameon=False)
     figure.savefig(path, dpi=130)
 
 
 def _draw_domain(axes: Axes, name: str, curves: Rows, published: Rows) -> None:
     what = DOMAINS[name][1]
-    for (low,), rows in groups(curves, "learner").items():
+    for (low,), rows in groups([row for row in curves if row["at_frames"] > 0], "learner").items():
         longest = max(row["frames"] for row in rows)
         at, mean, deviation = curve([row for row in rows if row["frames"] == longest], "at_frames", what)
         colour, line = LEARNER_COLOURS[low.removesuffix(AUGMENTED)], ":" if low.endswith(AUGMENTED) else "-"
-        axes.plot(at, mean, color=colour, linestyle=line, linewidth=1.6, label=low)
+        axes.plot(at, mean, color=colour, linestyle=line, linewidth=1.6, marker=".", markersize=4, label=low)
         axes.fill_between(at, mean - deviation, mean + deviation, color=colour, alpha=0.18, lw=0)
     best = best_published(published, name)
     if best is not None:
         axes.axhline(best["score"], color="#2b2b2b", linestyle="--", linewidth=1.0, label="best published")
     axes.set_title(name, loc="left", fontweight="bold", fontsize=10)
+    # Learners differ by a factor of a thousand in the steps that they take.
+    axes.set_xscale("log")
+    axes.set_xlim(left=FIRST_STEPS)
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("steps")
-    axes.set_ylabel("mean return, greedy" if what == "score" else "share of successes, greedy")
+    if what == "score":
+        axes.set_ylabel("mean return, greedy")
+    else:
+        axes.set_ylabel("share of successes, greedy")
+        axes.set_ylim(-0.02, 1.02)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=7, frameon=False)
 
 
 def main(folders: Sequence[str]) -> None:
