@@ -190,11 +190,13 @@ def best_table(results: Rows, published: Rows) -> str:
 
 
 def cost_table(results: Rows) -> str:
-    """Return a line for each learner and domain: steps, CPU and wall time of a run."""
+    """Return a line for each learner and domain: steps, CPU and wall time of a run; and one for all runs together."""
     lines = ["| domain | learner | seeds | steps | CPU | wall |", "|---|---|---|---|---|---|"]
     for (name, low, frames), rows in groups(results, "domain", "learner", "frames").items():
         cpu_s, wall_s = (np.mean([row[column] for row in rows]) for column in ("cpu_s", "wall_s"))
         lines.append(f"| {name} | {low} | {len(rows)} | {frames:,.0f} | {cpu_s:.0f} s | {wall_s:.0f} s |")
+    cpu_h, wall_h = (sum(row[column] for row in results) / 3600.0 for column in ("cpu_s", "wall_s"))
+    lines.append(f"| all runs | | {len(results)} | | {cpu_h:.1f} h | {wall_h:.1f} h |")
     return "\n".join(lines)
 
 
