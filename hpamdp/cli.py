@@ -99,6 +99,10 @@ def main() -> None:
             place = sys.argv.index(arguments.overrides[0])
             sys.argv[place:place] = saved
             arguments = _parse()
+        sweep_dir = _sweep_dir_of_experiments(arguments, conf)
+        if sweep_dir is not None:
+            sys.argv.insert(sys.argv.index(arguments.overrides[0]), f"hydra.sweep.dir='{sweep_dir}'")
+            arguments = _parse()
         _run_hydra(conf, arguments)
     except OverrideParseException as error:
         _exit_with(f"{error.override}: {_GRAMMAR}")
@@ -232,6 +236,42 @@ def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
         for group, name in choices.items()
         if group not in given and (has_own_files or (conf / group / f"{name}.yaml").is_file())
     ]
+
+
+def _sweep_dir_of_experiments(arguments: argparse.Namespace, conf: Path) -> str | None:
+    """Return the folder that all experiments of a sweep over experiments name; None where there is nothing to add.
+
+    Hydra takes a sweep's folder from the config without swept groups, in which no experiment is chosen.
+
+    Raises:
+        ConfigError: they name different ones.
+    """
+    overrides = OverridesParser.create().parse_overrides(arguments.overrides)
+    given = {override.key_or_group: override for override in overrides}
+    experiments = given.get("experiment")
+    if not arguments.multirun or "hydra.sweep.dir" in given:
+        return None
+    if experiments is None or not experiments.is_discrete_sweep():
+        return None
+    search_path: list[str] = []
+    if "hydra.searchpath" in given:
+        search_path = [given["hydra.searchpath"].input_line or ""]
+    elif arguments.config_dir is not None:
+        search_path = [f"hydra.searchpath=['{Path(arguments.config_dir).absolute()}']"]
+    folders: list[str] = []
+    for choice in _written_out(experiments):
+        try:
+            with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+                cfg = hydra.compose("config", [choice, *search_path], return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            return None  # which Hydra will tell
+        settings: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
+        folders.append(settings["dir"])
+    folders = list(dict.fromkeys(folders))
+    if len(folders) > 1:
+        different = f"their sweeps have different folders, {' and '.join(folders)}"
+        raise ConfigError(f"{experiments.input_line}: {different}; set hydra.sweep.dir")
+    return None if "${" in folders[0] else folders[0]
 
 
 def _is_choice(value: object) -> bool:

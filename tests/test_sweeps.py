@@ -95,6 +95,37 @@ def test_a_sweep_started_again_does_what_is_left(command, jobs):
     assert command(*words[:1], "seed=0,3,4", words[2])[0] == 0 and not jobs
 
 
+def test_a_sweep_over_experiments_of_one_study_lies_in_its_folder_and_is_told_at_the_end(command, jobs, tmp_path):
+    words = ["-m", "experiment=domains/moving,domains/sliding", "low=random", "seed=0,4"]
+    code, out, err = command(*words)
+    assert (code, err) == (0, "") and [seed for seed, _ in jobs] == [0, 4, 0, 4]
+    assert "4 jobs: 4 finished\n" in out and "(multirun/domains/moving_random_4)" in out
+    assert [path.name for path in (tmp_path / "multirun").iterdir()] == ["domains"]
+    jobs.clear()
+    assert command(*words)[0] == 0 and not jobs
+
+
+def test_a_sweep_over_experiments_with_folders_of_their_own_is_refused_until_one_is_given(command, jobs, tmp_path):
+    words = ["-m", "experiment=few_steps,domains/moving", "low=random"]
+    code, _, err = command(*words)
+    assert code == 2 and not jobs and not list(tmp_path.iterdir())
+    assert err == (
+        "experiment=few_steps,domains/moving: their sweeps have different folders, multirun/few_steps and "
+        "multirun/domains; set hydra.sweep.dir\n"
+    )
+    assert command(*words, "hydra.sweep.dir=mine")[0] == 0 and len(jobs) == 2
+    assert "add --multirun" in command(*words[1:])[2]
+
+
+def test_a_sweep_over_experiments_of_ones_own_lies_in_the_folder_that_they_name(command, jobs, tmp_path):
+    for name in ("first", "second"):
+        file = tmp_path / "mine/experiment" / f"{name}.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(f"# @package _global_\nhydra: {{sweep: {{dir: 'my runs', subdir: {name}}}}}\n")
+    assert command("--config-dir", str(tmp_path / "mine"), "-m", "experiment=first,second", "low=random")[0] == 0
+    assert {path.name for path in (tmp_path / "my runs").iterdir()} == {"first", "second", "multirun.yaml"}
+
+
 def test_a_run_that_ended_early_is_finished_and_one_that_was_stopped_is_not(command, jobs):
     words = ["-m", "seed=5,3", "eval.stop_score=3", "hydra.sweep.dir=sweep"]
     command(*words)
