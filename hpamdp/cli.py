@@ -99,6 +99,10 @@ def main() -> None:
             place = sys.argv.index(arguments.overrides[0])
             sys.argv[place:place] = saved
             arguments = _parse()
+        written_out = _folder_written_out(arguments, conf)
+        if written_out is not None:
+            sys.argv[:] = written_out
+            arguments = _parse()
         sweep_dir = _sweep_dir_of_experiments(arguments, conf)
         if sweep_dir is not None:
             sys.argv.insert(sys.argv.index(arguments.overrides[0]), f"hydra.sweep.dir='{sweep_dir}'")
@@ -169,7 +173,10 @@ def help_page(conf: Path) -> str:
 
 
 def _choices(folder: Path) -> list[str]:
-    return sorted(file.stem for file in folder.glob("*.yaml"))
+    """Return the choices in a group's folder. Experiments may lie in folders there, which stand for all in them."""
+    files = folder.rglob("*.yaml") if folder.name == "experiment" else folder.glob("*.yaml")
+    names = [file.relative_to(folder).with_suffix("") for file in files]
+    return sorted({str(choice) for name in names for choice in (name, *name.parents[:-1])})
 
 
 def _parse() -> argparse.Namespace:
@@ -236,6 +243,23 @@ def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
         for group, name in choices.items()
         if group not in given and (has_own_files or (conf / group / f"{name}.yaml").is_file())
     ]
+
+
+def _folder_written_out(arguments: argparse.Namespace, conf: Path) -> list[str] | None:
+    """Return the command line with `experiment=FOLDER` written out as a sweep over all in it; None without that."""
+    for override in OverridesParser.create().parse_overrides(arguments.overrides):
+        if override.key_or_group != "experiment" or override.is_delete() or override.is_sweep_override():
+            continue
+        name = override.value()
+        folder = conf / "experiment" / str(name.text if isinstance(name, QuotedString) else name)
+        if not folder.is_dir():
+            continue
+        experiments = ",".join(f"{folder.name}/{file.stem}" for file in sorted(folder.glob("*.yaml")))
+        words = [f"experiment={experiments}" if word == override.input_line else word for word in sys.argv]
+        if not arguments.multirun:
+            words.insert(sys.argv.index(arguments.overrides[0]), "--multirun")
+        return words
+    return None
 
 
 def _sweep_dir_of_experiments(arguments: argparse.Namespace, conf: Path) -> str | None:
@@ -331,7 +355,10 @@ def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str
         group, _, name = error.missing_cfg_file.rpartition("/")
         if group in _EXTRAS:
             return _missing_plugin(group, name, error.options)
-        return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted(error.options))}"
+        if not group.startswith("hydra"):  # a folder of a group may be part of the choice
+            group, _, name = error.missing_cfg_file.partition("/")
+        options = {*error.options, *_choices(conf / group)}
+        return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted(options))}"
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
     overrides = OverridesParser.create().parse_overrides(arguments.overrides)

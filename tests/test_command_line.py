@@ -17,7 +17,8 @@ MISTAKES = [
     (["high=foo"], "high=foo: no such choice; conf/high has actor, "),
     (["high=3"], "high=3: no such choice; conf/high has actor, "),
     (["low=null"], "low=null: no such choice; conf/low has "),
-    (["experiment=foo"], "experiment=foo: no such choice; conf/experiment has few_steps, hierarchy, "),
+    (["experiment=foo"], "experiment=foo: no such choice; conf/experiment has domains, domains/catch_point, "),
+    (["experiment=domains/foo"], "experiment=domains/foo: no such choice; conf/experiment has domains, domains/catch"),
     (["hihg=ucb"], "hihg: no such group or value of the run (conf/config.yaml); did you mean high? It has "),
     (["~low"], "low: nothing chosen; set low=NAME"),
     # A key that isn't there.
@@ -158,8 +159,9 @@ def test_an_interrupted_run_exits_with_130_and_ends_a_sweep(command, monkeypatch
 def test_help_shows_groups_values_with_comments_and_examples(command):
     code, out, err = command("--help")
     assert code == 0 and not err
-    for group in (*GROUPS, "experiment", "search"):
+    for group in (*GROUPS, "search"):
         assert f"  {group:<12}{', '.join(choices(group))}\n" in out
+    assert "  experiment  domains, domains/catch_point, " in out and ", domains/sliding, few_steps, " in out
     cfg = OmegaConf.load(CONF / "config.yaml")
     lines = out.splitlines()
     for name in set(cfg) - {"defaults", "hydra", "eval", "agent", "low", "offline"}:
