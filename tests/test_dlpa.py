@@ -332,14 +332,21 @@ def test_nothing_is_planned_for_finished_episodes_or_before_the_first_update(tra
         fresh.policy(TensorDict({keys.OBSERVATION: torch.randn(50, 4)}, [50]))
 
 
-def test_the_state_change_is_scaled_by_its_standard_deviation_over_the_warm_up():
-    learner = make(updates_per_frame=1e-3, warmup_frames=12 * 4)
-    batches = counting_batches(4, 6, 3)
+def test_states_and_their_changes_are_scaled_by_standard_deviations_over_all_stored_steps_not_those_of_the_warm_up():
+    learner = make(updates_per_frame=0.1, warmup_frames=24 * 4)
+    batches = counting_batches(4, 6, 8)
+    for batch in batches[:4]:
+        # The warm-up sees nothing of what the last entry is later.
+        batch[keys.OBSERVATION][..., -1] = batch["next", keys.OBSERVATION][..., -1] = 0.0
     for batch in batches:
         learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool))
-    seen = torch.cat(batches[:4], 0)
-    change = (seen["next", keys.OBSERVATION] - seen[keys.OBSERVATION]).flatten(0, 1).std(0).clamp(min=1e-2)
-    torch.testing.assert_close(learner.model.change_scale, change)
+    seen = torch.cat(batches, 0)
+    state, next_state = (part.flatten(0, 1) for part in (seen[keys.OBSERVATION], seen["next", keys.OBSERVATION]))
+    torch.testing.assert_close(learner.model.state_mean, state.mean(0))
+    torch.testing.assert_close(learner.model.state_scale, state.std(0).clamp(min=1e-2))
+    torch.testing.assert_close(learner.model.change_scale, (next_state - state).std(0).clamp(min=1e-2))
+    scaled = (state - learner.model.state_mean) / learner.model.state_scale
+    assert scaled.abs().max() < 5.0
 
 
 def test_more_elites_than_samples_are_refused():

@@ -8,7 +8,7 @@ Source: Zhang, Fu, Miao and Konidaris, *Model-based Reinforcement Learning for P
 extends model predictive path integral control (Williams et al. 2015, arXiv 1509.01149) to parameterised actions.
 
 Differs from the source:
-- the transition predictor's target is the change of the state in units of its standard deviation over the warm-up data,
+- the transition predictor's target is the change of the state in units of its standard deviation over all stored steps,
   and it is trained only on steps that do not terminate: a plan never continues after one that does;
 - rewards are not squashed, and both reward predictors are used: a plan's return weights them by the predicted
   probability of termination, and what follows by the probability that the episode continues;
@@ -414,11 +414,6 @@ class DLPA(ReplayLearner):
             trajectory[environment] = last["trajectory"][is_followed]
         return place, trajectory
 
-    def start(self) -> None:
-        """Fit the model's scales."""
-        stored = self.buffer[:]
-        self.model.fit_scales(stored["state"], stored["next_state"])
-
     def explore(self, frames: int) -> None:
         """Let the policy plan."""
         self.policy.is_trained.fill_(True)
@@ -428,7 +423,13 @@ class DLPA(ReplayLearner):
         return super().updates_due(before if before >= self.warmup_frames else 0, frames)
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
-        """Yield `num_batches` samples of windows that start at any stored step."""
+        """Fit the model's scales; yield `num_batches` samples of windows that start at any stored step.
+
+        The scales are those of all stored steps: entries of the state that the warm-up saw hardly change, such as those
+        of places far from the start, would else be in the hundreds once the policy gets there.
+        """
+        stored = self.buffer[:]
+        self.model.fit_scales(stored["state"], stored["next_state"])
         starts = torch.randint(len(self.buffer), (num_batches, self.batch_size), device=self.frames.device)
         for start in starts:
             yield self.augmented(self.windows(start))
