@@ -135,6 +135,28 @@ def test_the_step_with_a_reset_returns_what_torchrls_own_does(name):
         assert (fast_step == slow_step).all() and (one == other).all()
 
 
+# Some kernels play sixteen or thirty-two rows side by side.
+@pytest.mark.parametrize("num", [15, 16, 33, 70])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_a_row_is_the_same_to_the_bit_in_every_batch(name, num):
+    problem = PROBLEMS[name][0]
+    many = problem(num, seed=4, first_env=3)
+    td = many.reset()
+    rows = [0, num // 2, num - 1]
+    ones = [problem(1, seed=4, first_env=3 + row) for row in rows]
+    for one in ones:
+        one.reset()
+    for _ in range(6):
+        taken = many.rand_action(td.clone()).select(keys.ACTION)
+        after, td = many.step_and_maybe_reset(td.update(taken))
+        for row, one in zip(rows, ones, strict=True):
+            alone, _ = one.step_and_maybe_reset(taken[row : row + 1].clone())
+            for entry in (keys.OBSERVATION, keys.REWARD, keys.OUTCOME, keys.DONE):
+                assert torch.equal(alone["next", entry], after["next", entry][row : row + 1])
+            for own, column in zip(one.state, many.state, strict=True):
+                assert torch.equal(own, column[row : row + 1])
+
+
 def test_a_subclass_with_rules_of_its_own_has_no_kernel():
     class Level(GoalEnv):
         def observe(self, state):

@@ -158,27 +158,6 @@ def test_an_episode_does_not_depend_on_the_batch(domain, num, seed, first):
 
 
 @BOTH
-@pytest.mark.parametrize("num", [15, 16, 17, 70])
-def test_a_row_is_the_same_to_the_bit_in_every_batch(domain, num):
-    # The kernel plays sixteen rows side by side, and others take their places.
-    many = domain(num, seed=4, first_env=3)
-    td = many.reset()
-    rows = [0, num // 2, num - 1]
-    ones = [domain(1, seed=4, first_env=3 + row) for row in rows]
-    for one in ones:
-        one.reset()
-    for _ in range(6):
-        taken = many.rand_action(td.clone()).select(keys.ACTION)
-        after, td = many.step_and_maybe_reset(td.update(taken))
-        for row, one in zip(rows, ones, strict=True):
-            alone, _ = one.step_and_maybe_reset(taken[row : row + 1].clone())
-            for name in (keys.OBSERVATION, keys.REWARD, keys.OUTCOME, keys.DONE):
-                assert torch.equal(alone["next", name], after["next", name][row : row + 1])
-            for own, column in zip(one.state, many.state, strict=True):
-                assert torch.equal(own, column[row : row + 1])
-
-
-@BOTH
 def test_a_seed_fixes_the_episodes_and_evaluation_has_its_own(domain):
     env, copy = domain(40, seed=7), domain(40, seed=1)
     copy.set_seed(7)

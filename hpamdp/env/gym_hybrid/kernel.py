@@ -1,6 +1,8 @@
-"""The rules of Moving and Sliding for one row, and the loop over all rows that Numba compiles.
+"""The rules of Moving and Sliding as loops over rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two.
+It states what `rules` says of columns, for the CPU alone; a test compares the two. Some rows at a time are copied into
+lanes, a row in each, where actions and observations are loops without branches, which become vector instructions. Every
+lane does the same, so that no row depends on its lane.
 """
 
 from __future__ import annotations
@@ -9,87 +11,181 @@ import math
 from typing import Any
 
 import numpy as np
+from numba import int32
 
 from hpamdp.env import kernels
 from hpamdp.env.gym_hybrid import rules
-from hpamdp.env.kernels import ONE, OUTCOME_ROW, STEPS_ROW, TURN, TWO, ZERO, inlined, kernel, part, sin_cos
+from hpamdp.env.kernels import (
+    ONE,
+    OUTCOME_ROW,
+    STEPS_ROW,
+    TURN,
+    TWO,
+    ZERO,
+    atan2,
+    inlined,
+    kernel,
+    part,
+    sin_cos,
+)
 
 SLIDES = kernels.OWN  # the problem's own setting
 
+# Rows of the state, and the first columns of the lanes.
 _X, _Y, _SPEED, _HEADING, _COURSE, _TARGET_X, _TARGET_Y = range(7)
+_NUM_COLUMNS = _TARGET_Y + 1
+
+_LANES = 32  # with 16, as many as fit into a vector, copying takes longer; with 64 a single row does
+# Further columns of the lanes' float32: the parameter of the action, and its reward.
+_GIVEN, _REWARD = range(_NUM_COLUMNS, _NUM_COLUMNS + 2)
+_NUM_FLOATS = _REWARD + 1
+# Columns of the lanes' int32.
+_ACTION, _MOVES, _STEPS, _OUTCOME, _WAS_OVER = range(5)
+_NUM_INTEGERS = _WAS_OVER + 1
+_OBSERVATION_DIM = len(rules.OBSERVATION_NAMES)
 
 _F = np.float32
 _PUSH, _STEP, _BRAKE, _RIGHT_ANGLE = _F(rules.LARGEST_PUSH), _F(rules.STEP), _F(rules._BRAKE), _F(rules._TURN)
 _RADIUS, _START_BOUND, _STEP_COST = _F(rules.TARGET_RADIUS), _F(rules._START_BOUND), _F(rules._STEP_COST)
 _SUCCESS_REWARD, _FAILURE_REWARD = _F(rules._SUCCESS_REWARD), _F(rules._FAILURE_REWARD)
+_TURNS = _F(0.5 / math.pi)
 
 
 @inlined
-def _distance(floats: Any, row: Any) -> Any:
-    x, y = floats[_TARGET_X, row] - floats[_X, row], floats[_TARGET_Y, row] - floats[_Y, row]
+def _length(x: Any, y: Any) -> Any:
     return math.sqrt(x * x + y * y)
 
 
-@part
-def _steer(floats: Any, row: Any, action: Any, given: Any, slides: Any) -> None:
-    """Change speed, heading and course: `rules._follow` and `rules._slide`."""
-    speed, heading, course = floats[_SPEED, row], floats[_HEADING, row], floats[_COURSE, row]
-    if action == rules.TURN:
-        heading = (heading + _RIGHT_ANGLE * given) % TURN
-    elif action == rules.BRAKE:
-        speed = ZERO if speed < _BRAKE else speed - _BRAKE
-        course = heading if speed == ZERO else course
-    elif slides:
-        push = _PUSH * given
+@inlined
+def _steer(speed: Any, heading: Any, course: Any, action: Any, given: Any, slides: Any) -> Any:
+    """Return speed, heading and course after an action: `rules._follow` and `rules._slide`."""
+    is_turn, is_brake = action == rules.TURN, action == rules.BRAKE
+    turned = heading + _RIGHT_ANGLE * given
+    turned -= TURN * _F(np.floor(_TURNS * turned))
+    turned = turned + TURN if turned < ZERO else turned  # rounding can make it negative
+    slowed = ZERO if speed < _BRAKE else speed - _BRAKE
+    push = _PUSH * given
+    if not slides:
+        pushed = speed + push
+        heading_after = turned if is_turn else heading
+        course_after = heading_after
+    else:
         sin, cos = sin_cos(course - heading)
         squared = push * push + speed * speed + TWO * push * speed * cos
-        course = heading + math.atan2(speed * sin, push + speed * cos)
-        speed = math.sqrt(max(squared, ZERO))  # rounding can make it negative
-    else:
-        speed += _PUSH * given
-    floats[_SPEED, row], floats[_HEADING, row] = speed, heading
-    floats[_COURSE, row] = course if slides else heading
+        pushed = math.sqrt(max(squared, ZERO))  # rounding can make it negative
+        course_pushed = heading + atan2(speed * sin, push + speed * cos)
+        course_slowed = heading if slowed == ZERO else course
+        heading_after = turned if is_turn else heading
+        course_after = course_slowed if is_brake else (course if is_turn else course_pushed)
+    return slowed if is_brake else (speed if is_turn else pushed), heading_after, course_after
 
 
 @part
-def _act(floats: Any, row: Any, action: Any, given: Any, is_late: Any, slides: Any) -> Any:
-    """Take an action in a row and return its outcome and reward: `rules.act`."""
-    before = _distance(floats, row)
-    _steer(floats, row, action, given, slides)
-    speed = floats[_SPEED, row]
-    sin, cos = sin_cos(floats[_COURSE, row])
-    x, y = floats[_X, row] + _STEP * speed * cos, floats[_Y, row] + _STEP * speed * sin
-    floats[_X, row], floats[_Y, row] = x, y
-    left = _distance(floats, row)
-    if left < _RADIUS and speed == ZERO:
-        return rules.STOPPED, before - left - _STEP_COST + _SUCCESS_REWARD
-    if abs(x) > ONE or abs(y) > ONE:
-        return rules.LEFT_FIELD, _FAILURE_REWARD
-    if is_late:
-        return rules.TIME_LIMIT, _FAILURE_REWARD
-    return rules.GOING_ON, before - left - _STEP_COST
+def _act(lanes: Any, numbers: Any, max_steps: Any, slides: Any) -> None:
+    """Take the actions of all lanes that move: `rules.act`."""
+    for j in range(_LANES):
+        moves, action = numbers[_MOVES * _LANES + j] != 0, numbers[_ACTION * _LANES + j]
+        x, y, speed = lanes[_X * _LANES + j], lanes[_Y * _LANES + j], lanes[_SPEED * _LANES + j]
+        heading, course = lanes[_HEADING * _LANES + j], lanes[_COURSE * _LANES + j]
+        target_x, target_y = lanes[_TARGET_X * _LANES + j], lanes[_TARGET_Y * _LANES + j]
+        before = _length(target_x - x, target_y - y)
+        given = lanes[_GIVEN * _LANES + j]
+        speed_after, heading_after, course_after = _steer(speed, heading, course, action, given, slides)
+        sin, cos = sin_cos(course_after)
+        x_after, y_after = x + _STEP * speed_after * cos, y + _STEP * speed_after * sin
+        left = _length(target_x - x_after, target_y - y_after)
+        way = before - left - _STEP_COST
+        steps = numbers[_STEPS * _LANES + j] + int32(moves)
+        has_stopped = (left < _RADIUS) & (speed_after == ZERO)
+        has_left = (abs(x_after) > ONE) | (abs(y_after) > ONE)
+        is_late = steps >= max_steps
+        outcome = int32(rules.TIME_LIMIT) if is_late else int32(rules.GOING_ON)
+        outcome = int32(rules.LEFT_FIELD) if has_left else outcome
+        outcome = int32(rules.STOPPED) if has_stopped else outcome
+        reward = _FAILURE_REWARD if has_left | is_late else way
+        reward = way + _SUCCESS_REWARD if has_stopped else reward
+
+        lanes[_X * _LANES + j], lanes[_Y * _LANES + j] = x_after if moves else x, y_after if moves else y
+        lanes[_SPEED * _LANES + j] = speed_after if moves else speed
+        lanes[_HEADING * _LANES + j] = heading_after if moves else heading
+        lanes[_COURSE * _LANES + j] = course_after if moves else course
+        lanes[_REWARD * _LANES + j] = reward if moves else ZERO
+        numbers[_OUTCOME * _LANES + j] = outcome if moves else numbers[_OUTCOME * _LANES + j]
+        numbers[_STEPS * _LANES + j] = steps
 
 
 @part
-def _start(floats: Any, row: Any, bits: Any, step: Any) -> None:
-    """Put vehicle and target anywhere in the field: `rules.start`."""
-    floats[_TARGET_X, row] = _START_BOUND * (TWO * kernels.uniform(bits, step, 0) - ONE)
-    floats[_TARGET_Y, row] = _START_BOUND * (TWO * kernels.uniform(bits, step, 1) - ONE)
-    floats[_X, row] = TWO * kernels.uniform(bits, step, 2) - ONE
-    floats[_Y, row] = TWO * kernels.uniform(bits, step, 3) - ONE
+def _observe(lanes: Any, numbers: Any, latest: Any, seen: Any) -> None:
+    """Write what is observed of all lanes, columns as those of the lanes: `rules.observe`."""
+    for j in range(_LANES):
+        x, y = lanes[_X * _LANES + j], lanes[_Y * _LANES + j]
+        target_x, target_y = lanes[_TARGET_X * _LANES + j], lanes[_TARGET_Y * _LANES + j]
+        left = _length(target_x - x, target_y - y)
+        sin, cos = sin_cos(lanes[_HEADING * _LANES + j])
+        seen[j], seen[_LANES + j], seen[2 * _LANES + j] = x, y, lanes[_SPEED * _LANES + j]
+        seen[3 * _LANES + j], seen[4 * _LANES + j] = cos, sin
+        seen[5 * _LANES + j], seen[6 * _LANES + j] = target_x, target_y
+        seen[7 * _LANES + j], seen[8 * _LANES + j] = left, ONE if left <= _RADIUS else ZERO
+        seen[9 * _LANES + j] = _F(numbers[_STEPS * _LANES + j]) / latest
+
+
+@part
+def _start(lanes: Any, numbers: Any, j: Any, bits: Any, step: Any) -> None:
+    """Put vehicle and target of a lane anywhere in the field: `rules.start`."""
+    lanes[_TARGET_X * _LANES + j] = _START_BOUND * (TWO * kernels.uniform(bits, step, 0) - ONE)
+    lanes[_TARGET_Y * _LANES + j] = _START_BOUND * (TWO * kernels.uniform(bits, step, 1) - ONE)
+    lanes[_X * _LANES + j] = TWO * kernels.uniform(bits, step, 2) - ONE
+    lanes[_Y * _LANES + j] = TWO * kernels.uniform(bits, step, 3) - ONE
     heading = TURN * kernels.uniform(bits, step, 4)
-    floats[_SPEED, row], floats[_HEADING, row], floats[_COURSE, row] = ZERO, heading, heading
+    lanes[_HEADING * _LANES + j], lanes[_COURSE * _LANES + j] = heading, heading
+    lanes[_SPEED * _LANES + j] = ZERO
+    numbers[_STEPS * _LANES + j], numbers[_OUTCOME * _LANES + j] = 0, rules.GOING_ON
 
 
 @part
-def _observe(floats: Any, row: Any, time: Any, observation: Any) -> None:
-    """Write what is observed of a row: `rules.observe`."""
-    left = _distance(floats, row)
-    sin, cos = sin_cos(floats[_HEADING, row])
-    observation[0], observation[1], observation[2] = floats[_X, row], floats[_Y, row], floats[_SPEED, row]
-    observation[3], observation[4] = cos, sin
-    observation[5], observation[6] = floats[_TARGET_X, row], floats[_TARGET_Y, row]
-    observation[7], observation[8], observation[9] = left, ONE if left <= _RADIUS else ZERO, time
+def _load(
+    lanes: Any,
+    numbers: Any,
+    first: Any,
+    width: Any,
+    floats: Any,
+    integers: Any,
+    discrete: Any,
+    parameters: Any,
+    bounds: Any,
+    mask: Any,
+    mode: Any,
+) -> None:
+    """Copy rows into the lanes, with their actions; the other lanes stay as they are."""
+    for column in range(_NUM_COLUMNS):
+        for j in range(width):
+            lanes[column * _LANES + j] = floats[column, first + j]
+    for j in range(width):
+        numbers[_STEPS * _LANES + j] = integers[STEPS_ROW, first + j]
+    for j in range(width):
+        numbers[_OUTCOME * _LANES + j] = integers[OUTCOME_ROW, first + j]
+    for j in range(width):
+        row = first + j
+        was_over = numbers[_OUTCOME * _LANES + j] != rules.GOING_ON
+        numbers[_WAS_OVER * _LANES + j] = was_over
+        numbers[_MOVES * _LANES + j] = (mode != kernels.RESTART) & mask[row] & (not was_over)
+        action = int32(discrete[row])
+        push = min(max(parameters[row, 0], bounds[0, 0]), bounds[1, 0])
+        turn = min(max(parameters[row, 1], bounds[0, 1]), bounds[1, 1])
+        numbers[_ACTION * _LANES + j] = action
+        lanes[_GIVEN * _LANES + j] = turn if action == rules.TURN else push
+
+
+@part
+def _store(lanes: Any, numbers: Any, first: Any, width: Any, floats: Any, integers: Any) -> None:
+    """Copy the lanes back into their rows."""
+    for column in range(_NUM_COLUMNS):
+        for j in range(width):
+            floats[column, first + j] = lanes[column * _LANES + j]
+    for j in range(width):
+        integers[STEPS_ROW, first + j] = numbers[_STEPS * _LANES + j]
+    for j in range(width):
+        integers[OUTCOME_ROW, first + j] = numbers[_OUTCOME * _LANES + j]
 
 
 @kernel
@@ -112,19 +208,28 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    max_steps, slides = settings[kernels.MAX_STEPS], settings[SLIDES] != 0.0
-    latest = _F(max(max_steps - 1.0, 1.0))
-    for row in range(len(mask)):
-        was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
-        if mode != kernels.RESTART and mask[row] and not was_over:
-            action, steps = discrete[row], integers[STEPS_ROW, row] + 1
-            given = kernels.parameter(parameters, row, 0, action, places, bounds)
-            outcome, rewards[row] = _act(floats, row, action, given, steps >= max_steps, slides)
-            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, outcome
+    max_steps, slides = int32(settings[kernels.MAX_STEPS]), settings[SLIDES] != 0.0
+    latest = _F(max(settings[kernels.MAX_STEPS] - 1.0, 1.0))
+    lanes, numbers = np.zeros(_NUM_FLOATS * _LANES, np.float32), np.zeros(_NUM_INTEGERS * _LANES, np.int32)
+    seen = np.empty(_OBSERVATION_DIM * _LANES, np.float32)
+    for first in range(0, len(mask), _LANES):
+        width = min(_LANES, len(mask) - first)
+        _load(lanes, numbers, first, width, floats, integers, discrete, parameters, bounds, mask, mode)
+        _act(lanes, numbers, max_steps, slides)
+        for j in range(width):
+            rewards[first + j] = lanes[_REWARD * _LANES + j]
         for reading in range(len(observations)):
-            if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
-                bits, step = kernels.new_episode(integers, row, settings)
-                _start(floats, row, bits, step)
-            _observe(floats, row, _F(integers[STEPS_ROW, row]) / latest, observations[reading, row])
-            kernels.report(integers[OUTCOME_ROW, row], len(rules.OUTCOMES), row, outcomes[reading], flags[reading])
+            for j in range(width):
+                was_over, outcome = numbers[_WAS_OVER * _LANES + j] != 0, numbers[_OUTCOME * _LANES + j]
+                if kernels.must_restart(mode, reading, was_over, outcome, mask[first + j]):
+                    bits, step = kernels.new_episode(integers, first + j, settings)
+                    _start(lanes, numbers, j, bits, step)
+            _observe(lanes, numbers, latest, seen)
+            for j in range(width):
+                for entry in range(_OBSERVATION_DIM):
+                    observations[reading, first + j, entry] = seen[entry * _LANES + j]
+            for j in range(width):
+                outcome = numbers[_OUTCOME * _LANES + j]
+                kernels.report(outcome, len(rules.OUTCOMES), first + j, outcomes[reading], flags[reading])
+        _store(lanes, numbers, first, width, floats, integers)
     return -1
