@@ -83,7 +83,7 @@ def domain(run: Run) -> str:
 
 
 def learner(run: Run) -> str:
-    """Return the learner's name; the forms of P-DQN and PADDPG that have names of their own go by those.
+    """Return the learner's name; the forms of P-DQN, PADDPG and HyAR that have names of their own go by those.
 
     `AUGMENTED` may follow.
     """
@@ -93,6 +93,8 @@ def learner(run: Run) -> str:
         return "patd3"
     if name == "pdqn_published" and low.multipass:
         return "mpdqn_published"
+    if name == "hyar" and low.rl == "ddpg":
+        return "hyar_ddpg"
     return f"{name}{AUGMENTED}" if low.get("augment", False) is True else name
 
 
@@ -130,8 +132,11 @@ def _longest(results: Rows, is_allowed: Callable[[Rows], bool]) -> Rows:
     return chosen
 
 
-def table(results: Rows, published: Rows) -> str:
-    """Return a line for each learner, a column for each domain: its scores over seeds; then the published scores."""
+def table(results: Rows, published: Rows, references: Rows) -> str:
+    """Return a line for each learner, a column for each domain: its scores over seeds.
+
+    Lines with the published scores, the players that learn nothing and the ceilings follow.
+    """
     names = [f"{name}{form}" for form in ("", AUGMENTED) for name in LEARNER_COLOURS]
     learners = [name for name in names if any(row["learner"] == name for row in results)]
     lines = [
@@ -142,10 +147,16 @@ def table(results: Rows, published: Rows) -> str:
     for name in learners:
         values = [_cell(_values(cells.get((column, name), []))) for column in DOMAINS]
         lines.append(f"| **{name}** | " + " | ".join(values) + " |")
-    for method, rows in groups(published, "method", "source").items():
-        scores = {row["domain"]: f"{row['score']:g}" for row in rows}
-        lines.append(f"| {method[0]} ({method[1]}) | " + " | ".join(scores.get(name, "") for name in DOMAINS) + " |")
+    for (method, source), rows in groups(published, "method", "source").items():
+        lines.append(_line(f"{method} ({source})", rows))
+    lines += [_line(str(player), rows) for (player,), rows in groups(references, "player").items()]
     return "\n".join(lines)
+
+
+def _line(name: str, rows: Rows) -> str:
+    """Return a line of the table with one score for each domain that has one."""
+    scores = {row["domain"]: f"{row['score']:g}" for row in rows}
+    return f"| {name} | " + " | ".join(scores.get(domain, "") for domain in DOMAINS) + " |"
 
 
 def _values(rows: Rows) -> list[float]:
@@ -276,11 +287,12 @@ def main(folders: Sequence[str]) -> None:
     results = read_csv(HERE / "results.csv")
     curves = read_csv(HERE / "curves.csv")
     published = read_csv(HERE / "published.csv")
+    references = read_csv(HERE / "references.csv")
     draw(curves, published, HERE / "curves.png")
     print(
         best_table(at_published_steps(results), published),
-        table(at_published_steps(results), published),
-        table(within_cpu_limit(results), []),
+        table(at_published_steps(results), published, references),
+        table(within_cpu_limit(results), published, references),
         steps_table(curves, published),
         cost_table(results),
         sep="\n\n",

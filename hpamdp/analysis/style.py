@@ -15,6 +15,7 @@ LEARNER_COLOURS = {
     "hsac": "#D55E00",
     "pdqn": "#009E73",
     "hyar": "#CC79A7",
+    "hyar_ddpg": "#DDCC77",
     "qpamdp": "#E69F00",
     "dlpa": "#56B4E9",
     "paddpg": "#6b6b00",
