@@ -252,14 +252,14 @@ def runs_table(words: str) -> str:
     place = names.index("seed")
     measured = [name for name in names[place + 1 :] if name in MEASURED]
     wanted = [value.strip() for value in values.split(",")]
-    told = [name for name in names[:place] if name != column or len(wanted) > 1]
+    setting_columns = [name for name in names[:place] if name != column or len(wanted) > 1]
     settings: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for row in rows:
         if row[column] in wanted:
-            settings.setdefault(tuple(row[name] for name in told), []).append(row)
+            settings.setdefault(tuple(row[name] for name in setting_columns), []).append(row)
     if not settings:
         return "No run of it has been finished yet."
-    head = [*(MEASURED.get(name, name) for name in told), "seeds", *(MEASURED[name] for name in measured)]
+    head = [*(MEASURED.get(name, name) for name in setting_columns), "seeds", *(MEASURED[name] for name in measured)]
     table = [head, ["---"] * len(head)]
     for setting, same in settings.items():
         numbers = [f"{int(value):,}" if value.isdecimal() else cell(value) for value in setting]

@@ -78,7 +78,7 @@ def test_a_look_ahead_of_two_actions_scores_as_often_as_by_another_implementatio
     assert (last[keys.OUTCOME] == rules.GOAL).float().mean().item() == pytest.approx(0.69, abs=2 * 0.078)
 
 
-def test_initial_parameters_kick_the_ball_on_and_shoot_beside_the_posts():
+def test_initial_parameters_kick_the_ball_on_and_shoot_a_metre_inside_the_posts():
     env = GoalEnv(50, seed=3)
     raw_env = GoalEnv(50, seed=3, observation="raw")
     scaled, raw = env.reset()[keys.OBSERVATION], raw_env.reset()[keys.OBSERVATION]

@@ -13,6 +13,7 @@ import pytest
 import torch
 from counter_players import action, play, random_player
 from tensordict import TensorDict
+from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.catch_point import rules as catch_point
@@ -45,53 +46,55 @@ def scripted(env: CounterEnv) -> TensorDict:
     return action(discrete, parameter.unsqueeze(-1).expand(-1, sum(env.parameter_dims)))
 
 
-def success(env: CounterEnv, player) -> tuple[float, float]:
-    """Return the share of episodes that succeed and the mean return."""
+def success(env: CounterEnv, player) -> tuple[Tensor, Tensor]:
+    """Return which episodes succeed, as 0 or 1, and their returns, `[N]` each."""
     last, total = play(env, player)
-    return env.results(last)["success"].float().mean().item(), total.mean().item()
+    return env.results(last)["success"].float(), total
 
 
-# Published figures; two standard errors, of theirs (.005) and of ours, are allowed.
+def agrees(values: Tensor, known: float, error: float) -> bool:
+    """Return whether a mean is within two standard errors, the known figure's and ours, of the known one."""
+    return abs(values.mean().item() - known) <= 2.0 * (error + values.std().item() / math.sqrt(len(values)))
+
+
+# Figures of another implementation. Shares have standard errors below .005 there; those of the returns are 0.2, or 0.01
+# in Moving and Sliding.
 @pytest.mark.parametrize(
-    ("make", "share", "mean", "spread"),
+    ("make", "share", "mean", "error"),
     [
-        (lambda: CatchPointEnv(4000), 0.961, 8.5, 1.0),
+        (lambda: CatchPointEnv(4000), 0.961, 8.5, 0.2),
         (lambda: CatchPointEnv(4000, max_steps=30), 0.997, None, None),
-        (lambda: HardMoveEnv(4000, n=4), 0.962, 7.0, 1.0),
+        (lambda: HardMoveEnv(4000, n=4), 0.962, 7.0, 0.2),
         (lambda: HardMoveEnv(4000, n=6), 0.990, None, None),
         (lambda: HardMoveEnv(4000, n=8), 0.993, None, None),
-        (lambda: HardMoveEnv(2000, n=10), 0.995, 9.0, 1.0),
+        (lambda: HardMoveEnv(2000, n=10), 0.995, 9.0, 0.2),
         (lambda: HardMoveEnv(4000, n=4, max_steps=25), 0.852, None, None),
-        (lambda: MovingEnv(1000), 0.9995, 1.867, 0.03),
-        (lambda: SlidingEnv(1000), 0.9985, 1.856, 0.03),
+        (lambda: MovingEnv(1000), 0.9995, 1.867, 0.01),
+        (lambda: SlidingEnv(1000), 0.9985, 1.856, 0.01),
     ],
     ids=["catch", "catch in 30", "hard 4", "hard 6", "hard 8", "hard 10", "hard 4 in 25", "moving", "sliding"],
 )
-def test_the_scripted_player_reaches_the_known_figures(make, share, mean, spread):
-    env = make()
-    got, total = success(env, scripted)
-    error = math.sqrt(share * (1.0 - share) / env.num_envs)
-    assert got == pytest.approx(share, abs=2.0 * (error + 0.005))
-    if mean is not None:
-        assert total == pytest.approx(mean, abs=spread)
+def test_the_scripted_player_reaches_the_known_figures(make, share, mean, error):
+    succeeds, returns = success(make(), scripted)
+    assert agrees(succeeds, share, 0.005)
+    assert mean is None or agrees(returns, mean, error)
 
 
 @pytest.mark.parametrize(
-    ("make", "share", "mean"),
+    ("make", "share", "mean", "error"),
     [
-        (lambda: CatchPointEnv(4000), 0.049, -27.7),
-        (lambda: HardMoveEnv(4000, n=4), 0.049, -39.5),
-        (lambda: HardMoveEnv(2000, n=8), 0.037, -39.5),
-        (lambda: MovingEnv(400), 0.004, -1.30),
-        (lambda: SlidingEnv(400), 0.011, -1.24),
+        (lambda: CatchPointEnv(4000), 0.049, -27.7, 0.2),
+        (lambda: HardMoveEnv(4000, n=4), 0.049, -39.5, 0.3),
+        (lambda: HardMoveEnv(2000, n=8), 0.037, -39.5, 0.3),
+        (lambda: MovingEnv(4000), 0.004, -1.30, 0.005),
+        (lambda: SlidingEnv(4000), 0.011, -1.24, 0.005),
     ],
     ids=["catch", "hard 4", "hard 8", "moving", "sliding"],
 )
-def test_random_play_reaches_the_known_figures(make, share, mean):
-    env = make()
-    got, total = success(env, random_player(3))
-    assert got == pytest.approx(share, abs=0.02)
-    assert total == pytest.approx(mean, rel=0.08)
+def test_random_play_reaches_the_known_figures(make, share, mean, error):
+    succeeds, returns = success(make(), random_player(3))
+    assert succeeds.any() and agrees(succeeds, share, 0.002)
+    assert agrees(returns, mean, error)
 
 
 def test_an_episode_of_catch_point_has_eleven_catches_and_ends_a_step_after_the_last():

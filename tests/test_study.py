@@ -225,8 +225,25 @@ def test_domains_scores_each_learner_by_its_longest_runs_and_finds_the_steps_to_
 
     curves = run(2000, 0, 0.1, 0.95, 0.5) + run(2000, 1, 0.1, 0.2, 0.9) + run(1000, 0, 0.1, 0.3)
     published = [{"domain": "catch_point", "score": score} for score in (0.9, 0.94)]
-    assert domains.steps_table(curves, published).splitlines()[-1] == (
-        "| catch_point | hyar | 0.94 | 1,000, never, never | 100,000 |"
-    )
+    assert domains.steps_table(curves + run(3000, 0, 0.1, 0.1, 0.95), published).splitlines()[2:] == [
+        "| catch_point | hyar | 2,000 | 0.94 | 1,000, never | 100,000 |",
+        "| catch_point | hyar | 3,000 | 0.94 | 2,000 | 100,000 |",
+    ]
     too_many = run(2_000_000, 0, 1.0)
     assert domains.at_published_steps(curves + too_many) == curves[:6]
+
+
+def test_domains_ranks_learners_by_the_mean_that_it_shows_and_counts_runs_within_the_cpu_limit():
+    domains = study("domains")
+
+    def runs(learner, frames, cpu_s, *scores):
+        name = {"domain": "goal", "learner": learner, "frames": frames, "cpu_s": cpu_s}
+        return [name | {"seed": seed, "success": score} for seed, score in enumerate(scores)]
+
+    # One bad seed of five does not move the interquartile mean, but the mean.
+    bad_seed, steady = runs("hyar", 1000, 500.0, 0.9, 0.9, 0.9, 0.9, 0.0), runs("pdqn", 1000, 700.0, *[0.8] * 5)
+    line = domains.best_table(bad_seed + steady, [{"domain": "goal", "method": "chdp", "score": 0.81}]).splitlines()[-1]
+    assert line.startswith("| goal | hyar | 0.900 [") and "| pdqn | 0.80 | 0.81 (chdp) | 500 s |" in line
+    assert domains.within_cpu_limit(bad_seed + steady + runs("hyar", 3000, 601.0, 1.0)) == bad_seed
+    table = domains.table(steady, [], [{"domain": "goal", "player": "random", "score": 0.0004}])
+    assert table.splitlines()[-1].startswith("| random |  | 0.0004 |")

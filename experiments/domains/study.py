@@ -36,8 +36,7 @@ from hpamdp.analysis.style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
 # The domains, with the largest published number of steps and what is scored: the mean return or the share of successes.
-# No scores were published on Moving and Sliding, for which DI-engine's settings allow ten million steps; a hand-written
-# player scores 1.867 and 1.856.
+# No scores were published on Moving and Sliding, for which DI-engine's settings allow ten million steps.
 DOMAINS = {
     "platform": (200_000, "score"),
     "goal": (300_000, "success"),
@@ -90,11 +89,11 @@ def learner(run: Run) -> str:
     name = str(run.summary["low"])
     low = run.config.low
     if name == "paddpg" and low.twin:
-        return "patd3"
-    if name == "pdqn_published" and low.multipass:
-        return "mpdqn_published"
-    if name == "hyar" and low.rl == "ddpg":
-        return "hyar_ddpg"
+        name = "patd3"
+    elif name == "pdqn_published" and low.multipass:
+        name = "mpdqn_published"
+    elif name == "hyar" and low.rl == "ddpg":
+        name = "hyar_ddpg"
     return f"{name}{AUGMENTED}" if low.get("augment", False) is True else name
 
 
@@ -173,6 +172,11 @@ def _cell(values: list[float]) -> str:
     return f"{middle:.3f} [{low:.3f}, {high:.3f}] ({len(values)})"
 
 
+def _middle(values: list[float]) -> float:
+    """Return the mean that a cell shows."""
+    return float(np.mean(values)) if len(values) < MIN_SEEDS else interquartile_mean(values)[0]
+
+
 def best_table(results: Rows, published: Rows) -> str:
     """Return a line for each domain: our best learner, how sure it is above our next best, the best published score."""
     lines = [
@@ -181,7 +185,7 @@ def best_table(results: Rows, published: Rows) -> str:
     ]
     for name, (_, what) in DOMAINS.items():
         cells = groups([row for row in results if row["domain"] == name], "learner")
-        ranked = sorted(cells.items(), key=lambda cell: -np.mean(_values(cell[1])))
+        ranked = sorted(cells.items(), key=lambda cell: -_middle(_values(cell[1])))
         if not ranked:
             continue
         (best,), rows = ranked[0]
@@ -212,21 +216,25 @@ def cost_table(results: Rows) -> str:
 
 
 def steps_table(curves: Rows, published: Rows) -> str:
-    """Return a line for each learner and domain: steps to the first evaluation at the best published score."""
+    """Return a line for each learner, domain and length of the runs: steps to the first evaluation at the best
+    published score.
+    """
     lines = [
-        "| domain | learner | best published | steps to it, each seed | a tenth of the published steps |",
-        "|---|---|---|---|---|",
+        "| domain | learner | steps | best published | steps to it, each seed | a tenth of the published steps |",
+        "|---|---|---|---|---|---|",
     ]
-    for (name, low), rows in groups(curves, "domain", "learner").items():
+    for (name, low, frames), rows in groups(curves, "domain", "learner", "frames").items():
         published_steps, what = DOMAINS[name]
         best = best_published(published, name)
         if best is None:
             continue
-        reached = [first_at(run, what, best["score"]) for run in groups(rows, "frames", "seed").values()]
+        reached = [first_at(run, what, best["score"]) for run in groups(rows, "seed").values()]
         steps = sorted(row["at_frames"] for row in reached if row is not None)
         if steps:
             words = ", ".join([f"{each:,.0f}" for each in steps] + ["never"] * (len(reached) - len(steps)))
-            lines.append(f"| {name} | {low} | {best['score']:g} | {words} | {published_steps / 10:,.0f} |")
+            lines.append(
+                f"| {name} | {low} | {frames:,.0f} | {best['score']:g} | {words} | {published_steps / 10:,.0f} |"
+            )
     return "\n".join(lines)
 
 

@@ -142,7 +142,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         """Return the figures of the hand-written player, and the share of starts from which the target is in reach."""
         ceiling = {"ceiling": {"success": _CEILING[self.max_steps]}} if self.max_steps in _CEILING else {}
         is_published = (self.max_steps, self.catches, self.late_end) == (25, rules.PUBLISHED_CATCHES, True)
-        return ({"scripted": {"score": 8.5, "success": 0.961}} if is_published else {}) | ceiling
+        return ({"scripted": {"score": 8.73, "success": 0.964}} if is_published else {}) | ceiling
 
     def picture_note(self, state: CatchPointState) -> str:
         """Return how many catches have missed."""
