@@ -16,7 +16,7 @@ from hpamdp.env.counter_rng import Key
 OBSERVATION_NAMES = ("vx", "vy", "target_dx", "target_dy")
 VECTORS = ((0, 1), (2, 3))  # of the observation
 HIT_RADIUS = 0.2
-CATCH_REWARD = 20.0
+HIT_REWARD = 20.0
 TOP_SPEED = 0.8  # full force against the drag, in lengths a unit of time
 _DRAG, _GAIN, _TICK = 0.75, 0.1, 0.1
 # An agent that is let go covers this many times its speed.

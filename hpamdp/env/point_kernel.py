@@ -14,7 +14,7 @@ X, Y, VX, VY, TARGET_X, TARGET_Y = range(6)
 _F = np.float32
 _DRAG, _GAIN, _TICK = _F(point_agent._DRAG), _F(point_agent._GAIN), _F(point_agent._TICK)
 HIT = _F(point_agent.HIT_RADIUS * point_agent.HIT_RADIUS)
-CATCH_REWARD = _F(point_agent.CATCH_REWARD)
+HIT_REWARD = _F(point_agent.HIT_REWARD)
 
 
 @inlined

@@ -35,7 +35,7 @@ def _act(floats: Any, integers: Any, row: Any, action: Any, given: Any, settings
     if is_catch and has_catches and not is_hit:
         misses += 1
     integers[_MISSES, row] = misses
-    reward = (point_kernel.CATCH_REWARD if is_hit else ZERO) - squared if has_catches else ZERO
+    reward = (point_kernel.HIT_REWARD if is_hit else ZERO) - squared if has_catches else ZERO
     is_lost = not has_catches if settings[LATE_END] != 0.0 else misses >= settings[CATCHES]
     return rules.CAUGHT if is_hit else (rules.NO_CATCHES_LEFT if is_lost else rules.GOING_ON), reward
 

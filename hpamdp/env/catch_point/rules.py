@@ -67,7 +67,7 @@ def act(
     has_catches = state.misses < catches
     is_hit = is_catch & has_catches & (squared <= point_agent.HIT_RADIUS * point_agent.HIT_RADIUS)
     misses = state.misses + (is_catch & has_catches & ~is_hit).int()
-    reward = torch.where(has_catches, torch.where(is_hit, point_agent.CATCH_REWARD, 0.0) - squared, 0.0)
+    reward = torch.where(has_catches, torch.where(is_hit, point_agent.HIT_REWARD, 0.0) - squared, 0.0)
     is_lost = ~has_catches if late_end else misses >= catches
     outcome = torch.where(is_lost, NO_CATCHES_LEFT, GOING_ON)
     outcome = torch.where(is_hit, CAUGHT, outcome).int()

@@ -48,7 +48,7 @@ def advance(
             motion_x, motion_y = _F(settings[MOTIONS + 2 * action]), _F(settings[MOTIONS + 2 * action + 1])
             squared = point_kernel.move(floats, row, push * motion_x, push * motion_y)
             is_hit = squared <= point_kernel.HIT
-            rewards[row] = (point_kernel.CATCH_REWARD if is_hit else ZERO) - squared
+            rewards[row] = (point_kernel.HIT_REWARD if is_hit else ZERO) - squared
             outcome = rules.REACHED if is_hit else rules.GOING_ON
             if outcome == rules.GOING_ON and steps >= settings[kernels.MAX_STEPS]:
                 outcome = rules.TIME_LIMIT

@@ -74,7 +74,7 @@ def act(state: HardMoveState, discrete: Tensor, parameter: Tensor, motions: Tens
     x, y, vx, vy = point_agent.move(state, force_x, force_y)
     squared = point_agent.squared_distance(state, x, y)
     is_hit = squared <= point_agent.HIT_RADIUS * point_agent.HIT_RADIUS
-    reward = torch.where(is_hit, point_agent.CATCH_REWARD, 0.0) - squared
+    reward = torch.where(is_hit, point_agent.HIT_REWARD, 0.0) - squared
     outcome = torch.where(is_hit, REACHED, GOING_ON).int()
     return state._replace(x=x, y=y, vx=vx, vy=vy, steps=state.steps + 1, outcome=outcome), reward
 
