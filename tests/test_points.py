@@ -255,6 +255,14 @@ def test_our_rules_play_as_the_reference_code(tool, name):
         assert report.worst <= tolerance
 
 
+def test_the_replay_counts_the_ticks_of_an_action(tool):
+    document = json.loads(recording("goal").read_text())
+    document["episodes"] = document["episodes"][:1]
+    assert tool.replay(document).largest["ticks"] == 0.0
+    document["episodes"][0]["steps"][0]["ticks"] += 1
+    assert tool.replay(document).largest["ticks"] == 1.0
+
+
 @pytest.mark.parametrize("change", ["reward", "state", "observation", "outcome", "truncated"])
 def test_the_replay_finds_a_difference(tool, change, tmp_path, capsys):
     document = json.loads(recording("catch_point").read_text())
@@ -277,11 +285,16 @@ def test_the_replay_finds_a_difference(tool, change, tmp_path, capsys):
 
 def test_a_file_that_is_no_recording_is_refused(tool, tmp_path, capsys):
     for text, message in (
-        ("[]", "not a recording"),
+        ("[]", "not a recording: it has no domain and episodes"),
+        ('{"domain": "platform", "episodes": []}', "not a recording: it lacks 'state_names'"),
+        ('{"domain": "platform", "schema": 2, "episodes": []}', "schema 2, but must be 1"),
+        ('{"domain": "platform", "state_names": [], "episodes": [{"initial": {"state": ["a"]}}]}', "not a recording: "),
+        ('{"domain": "catch_point", "state_names": [], "episodes": [7]}', "not a recording: "),
         ('{"domain": "chess", "episodes": []}', "domain 'chess', but must be one of"),
         ("{", "Expecting"),
     ):
         path = tmp_path / "bad.json"
         path.write_text(text)
         assert tool.main([str(path)]) == 2
-        assert message in capsys.readouterr().err
+        printed = capsys.readouterr().err
+        assert message in printed and printed.count("\n") == 1

@@ -35,7 +35,8 @@ class Report:
 
     Attributes:
         steps: how many were compared.
-        largest: the largest difference by what differs: the columns of the state, `observation` and `reward`.
+        largest: the largest difference by what differs: the columns of the state, `observation`, `reward` and, where an
+            action has them, `ticks`.
         mismatches: steps whose outcome or flags differ, in words.
     """
 
@@ -63,7 +64,8 @@ def replay(recording: dict[str, Any], dtype: torch.dtype = torch.float64, *, ste
     """Compare a recording with our rules.
 
     Raises:
-        ValueError: there is no adapter for its domain.
+        ValueError: there is no adapter for its domain, or it is no recording of it; so do the next three.
+        IndexError, KeyError, TypeError:
     """
     adapter = load(recording)
     episodes = recording["episodes"]
@@ -97,13 +99,14 @@ def _steps(number: int, episode: dict[str, Any]) -> list[_Step]:
 def _compare(report: Report, adapter: Adapter, state: Any, steps: list[_Step]) -> Any:
     """Take the steps `[N]` from the states, note what differs, and return the states after them."""
     recorded = [step.recorded for step in steps]
-    after, reward = adapter.act(state, recorded)
+    after, results = adapter.act(state, recorded)
     report.steps += len(steps)
     columns = adapter.columns([step["state"] for step in recorded])
     for name, values in adapter.named(after).items():
         _note(report, name, values, columns[name], is_angle=name in adapter.angles)
     _note(report, "observation", adapter.observe(after), [step["observation"] for step in recorded])
-    _note(report, "reward", reward, [step["reward"] for step in recorded])
+    for name, values in results.items():
+        _note(report, name, values, [step[name] for step in recorded])
     for step, code in zip(steps, after.outcome.tolist(), strict=True):
         outcome = adapter.outcomes[code]
         ours = (outcome, outcome not in ("", "limit"), outcome == "limit")
@@ -133,16 +136,24 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tolerance", type=float, help="largest difference allowed; the default depends on the dtype")
     options = parser.parse_args(arguments)
     step_by_step = options.step_by_step or options.dtype == "float32"
+    if options.tolerance is not None and not options.tolerance >= 0.0:
+        parser.error(f"--tolerance {options.tolerance}: must be at least 0")
     try:
         recording = json.loads(options.file.read_text())
         adapter = load(recording)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        report = replay(recording, getattr(torch, options.dtype), step_by_step=step_by_step)
+    except (OSError, json.JSONDecodeError) as error:
         print(f"{options.file}: {error}", file=sys.stderr)
+        return 2
+    except KeyError as error:
+        print(f"{options.file}: not a recording: it lacks {error}", file=sys.stderr)
+        return 2
+    except (IndexError, RuntimeError, TypeError, ValueError) as error:
+        print(f"{options.file}: not a recording: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
     tolerance = options.tolerance
     if tolerance is None:
         tolerance = FLOAT64_TOLERANCE if options.dtype == "float64" else adapter.float32_tolerance
-    report = replay(recording, getattr(torch, options.dtype), step_by_step=step_by_step)
     how = "step by step" if step_by_step else "run through"
     print(
         f"{recording['domain']}: {report.steps} steps of {len(recording['episodes'])} episodes, {options.dtype}, {how}"

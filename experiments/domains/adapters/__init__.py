@@ -10,6 +10,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+SCHEMA = 1  # of the files
+
 
 class Adapter(Protocol):
     """A domain's rules, as a replay calls them. N is the number of rows, each of another episode or step.
@@ -29,8 +31,11 @@ class Adapter(Protocol):
     def states(self, rows: Sequence[Sequence[float]], taken: Sequence[int], dtype: torch.dtype) -> Any:
         """Return our states from recorded ones, as `state_names` orders them, after so many actions each."""
 
-    def act(self, state: Any, steps: Sequence[dict[str, Any]]) -> tuple[Any, Tensor]:
-        """Return the states after the recorded steps, with the recorded random numbers, and the rewards `[N]`."""
+    def act(self, state: Any, steps: Sequence[dict[str, Any]]) -> tuple[Any, dict[str, Tensor]]:
+        """Return the states after the recorded steps, with the recorded random numbers, and what the steps tell.
+
+        The latter `[N]` each, by their names in the recording: `reward` and, where an action has ticks, `ticks`.
+        """
 
     def observe(self, state: Any) -> Tensor:
         """Return the observations `[N, observation_dim]`, as they are recorded."""
@@ -59,7 +64,7 @@ class DirectAdapter:
 
     def columns(self, rows: Sequence[Sequence[float]]) -> dict[str, Tensor]:
         """Return our columns that are recorded, float64 `[N]`."""
-        table = torch.tensor(rows, dtype=torch.float64)
+        table = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(self.state_names))
         return {ours: table[:, self.state_names.index(name)] for ours, name in self.recorded_names.items()}
 
     def states(self, rows: Sequence[Sequence[float]], taken: Sequence[int], dtype: torch.dtype) -> Any:
@@ -101,7 +106,9 @@ def load(recording: dict[str, Any]) -> Adapter:
         ValueError: it is no recording, or of a domain without an adapter.
     """
     if not isinstance(recording, dict) or "domain" not in recording or "episodes" not in recording:
-        raise ValueError("not a recording: it has no domain and episodes")
+        raise ValueError("it has no domain and episodes")
+    if recording.get("schema", SCHEMA) != SCHEMA:
+        raise ValueError(f"schema {recording['schema']!r}, but must be {SCHEMA}")
     known: dict[str, type[Any]] = {}
     for found in pkgutil.iter_modules(__path__, "adapters."):
         module = importlib.import_module(found.name)

@@ -26,12 +26,12 @@ class DomainAdapter(DirectAdapter):
 
     def act(
         self, state: rules.CatchPointState, steps: Sequence[dict[str, Any]]
-    ) -> tuple[rules.CatchPointState, Tensor]:
+    ) -> tuple[rules.CatchPointState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.x)
         after, reward = rules.act(
             state, discrete, parameters.squeeze(-1), catches=rules.PUBLISHED_CATCHES, late_end=True
         )
-        return limited(after, 25, rules.TIME_LIMIT), reward
+        return limited(after, 25, rules.TIME_LIMIT), {"reward": reward}
 
     def observe(self, state: rules.CatchPointState) -> Tensor:
         return rules.observe(state, progress=False)

@@ -28,7 +28,7 @@ class DomainAdapter(DirectAdapter):
         super().__init__(recording)
         self._aim = rules.hard_goal_aim if recording["domain"] == "hard_goal" else rules.goal_aim
 
-    def act(self, state: rules.GoalState, steps: Sequence[dict[str, Any]]) -> tuple[rules.GoalState, Tensor]:
+    def act(self, state: rules.GoalState, steps: Sequence[dict[str, Any]]) -> tuple[rules.GoalState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.ball_x, 2)
         longest = max(len(step["draws"]) for step in steps) + _SPARE_TICKS
         drawn = state.ball_x.new_zeros(longest, rules.NUMBERS_PER_TICK, len(steps))
@@ -40,8 +40,8 @@ class DomainAdapter(DirectAdapter):
             return drawn[ticks.long()][:, :, rows]
 
         moves = torch.ones(len(steps), dtype=torch.bool)
-        after, _ = rules.act(state, self._aim(discrete, parameters), moves, numbers)
-        return after, rules.reward(state, after)
+        after, ticks = rules.act(state, self._aim(discrete, parameters), moves, numbers)
+        return after, {"reward": rules.reward(state, after), "ticks": ticks}
 
     def observe(self, state: rules.GoalState) -> Tensor:
         """Return the observations as they are recorded, not scaled."""

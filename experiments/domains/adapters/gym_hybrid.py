@@ -31,12 +31,15 @@ class DomainAdapter(DirectAdapter):
             "steps": "time",
         }
 
-    def act(self, state: rules.VehicleState, steps: Sequence[dict[str, Any]]) -> tuple[rules.VehicleState, Tensor]:
+    def act(
+        self, state: rules.VehicleState, steps: Sequence[dict[str, Any]]
+    ) -> tuple[rules.VehicleState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.x)
         parameter = parameters.squeeze(-1)
         low, high = (torch.tensor([*side, 0.0]).to(parameter) for side in (rules.PARAMETER_LOW, rules.PARAMETER_HIGH))
         parameter = parameter.clamp(low[discrete], high[discrete])
-        return rules.act(state, discrete, parameter, slides=self.slides, max_steps=rules.PUBLISHED_STEPS)
+        after, reward = rules.act(state, discrete, parameter, slides=self.slides, max_steps=rules.PUBLISHED_STEPS)
+        return after, {"reward": reward}
 
     def observe(self, state: rules.VehicleState) -> Tensor:
         return rules.observe(state, rules.PUBLISHED_STEPS)

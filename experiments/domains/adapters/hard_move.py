@@ -28,13 +28,15 @@ class DomainAdapter(DirectAdapter):
         super().__init__(recording)
         self.motions = rules.motions(recording["num_actuators"], rounded=True)
         recorded = torch.tensor(recording["motions"], dtype=torch.float64)
-        if not torch.allclose(self.motions, recorded, rtol=0.0, atol=1e-12):
+        if recorded.shape != self.motions.shape or not torch.allclose(self.motions, recorded, rtol=0.0, atol=1e-12):
             raise ValueError("the recorded motions are not those of our rules")
 
-    def act(self, state: rules.HardMoveState, steps: Sequence[dict[str, Any]]) -> tuple[rules.HardMoveState, Tensor]:
+    def act(
+        self, state: rules.HardMoveState, steps: Sequence[dict[str, Any]]
+    ) -> tuple[rules.HardMoveState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.x)
         after, reward = rules.act(state, discrete, parameters.squeeze(-1), self.motions.to(state.x.dtype))
-        return limited(after, 30, rules.TIME_LIMIT), reward
+        return limited(after, 30, rules.TIME_LIMIT), {"reward": reward}
 
     def observe(self, state: rules.HardMoveState) -> Tensor:
         return rules.observe(state)

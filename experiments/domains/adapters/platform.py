@@ -16,7 +16,12 @@ _SECOND_PLATFORM = 475.0  # beyond it, the second enemy is the active one
 
 
 class DomainAdapter:
-    """Platform by its rules. Of the enemies, our state has the active one alone; the other stands still."""
+    """Platform by its rules.
+
+    Of the enemies, our state has the active one alone, since the other stands still, and it has no heights, since after
+    an action the agent stands or the episode is over. Actions have closed forms, so nothing counts ticks but the
+    recording.
+    """
 
     outcomes = ("", "arrived", "fell", "enemy", "limit")
     angles = ()
@@ -46,7 +51,9 @@ class DomainAdapter:
     def named(self, state: rules.PlatformState) -> dict[str, Tensor]:
         return {name: getattr(state, name) for name in ("x", "speed", "enemy_x", "enemy_speed")}
 
-    def act(self, state: rules.PlatformState, steps: Sequence[dict[str, Any]]) -> tuple[rules.PlatformState, Tensor]:
+    def act(
+        self, state: rules.PlatformState, steps: Sequence[dict[str, Any]]
+    ) -> tuple[rules.PlatformState, dict[str, Tensor]]:
         discrete, parameters = chosen(steps, state.x)
         parameter = (
             parameters.squeeze(-1).clamp(min=0.0).minimum(torch.tensor(rules.PARAMETER_HIGH).to(state.x)[discrete])
@@ -64,7 +71,7 @@ class DomainAdapter:
 
         first = rules.first_number(state)
         after = rules.act(state, discrete, parameter, normal, 1.0)
-        return limited(after, 200, rules.TIME_LIMIT), (after.x - state.x) / rules.END
+        return limited(after, 200, rules.TIME_LIMIT), {"reward": (after.x - state.x) / rules.END}
 
     def observe(self, state: rules.PlatformState) -> Tensor:
         """Return the observations in [0, 1], as gym-platform gives them."""
