@@ -17,12 +17,13 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
-from hpamdp.env import counter_rng
+from hpamdp.env import counter_rng, point_pictures
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.env.counter_env import GOING_ON, CounterEnv
 from hpamdp.env.counter_faces import CounterFace
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
+from hpamdp.env.platform import rendering
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.specs import PAMDPSpecs
 
@@ -392,6 +393,31 @@ def test_a_picture_shows_the_progress_of_the_episode(env_id):
     assert before.shape == after.shape == (480, 480, 3)
     assert before.dtype == np.uint8
     assert (before != after).any()
+
+
+def places_of(colour: str, picture: np.ndarray) -> np.ndarray:
+    """Return the columns of a picture that have pixels of just this colour, as they come together, in runs."""
+    rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    columns = np.flatnonzero((picture == rgb).all(-1).any(0))
+    return np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1)
+
+
+def test_a_picture_shows_a_point_however_far_it_went():
+    env = CatchPointEnv(1)
+    env.reset()
+    start = env.state
+    for far in (1.1, 2.6, -4.0):
+        track = [start, start._replace(x=torch.full((1,), far), y=torch.full((1,), -far))]
+        assert len(places_of(point_pictures._BODY, env.draw(track))[0]) > 0
+
+
+def test_a_picture_of_platform_shows_both_enemies_on_either_platform():
+    env = PlatformEnv(1)
+    env.reset()
+    start = env.state
+    beyond = start._replace(x=start.x + 500.0, enemy_x=start.enemy_x + 450.0)
+    for track in ([start], [start, beyond]):
+        assert len(places_of(rendering._ENEMY, env.draw(track))) == 2
 
 
 def test_a_problem_without_pictures_or_player_says_so():

@@ -1,4 +1,4 @@
-"""Pictures of a point's way to a target in the square [-1, 1]^2."""
+"""Pictures of a point's way to a target in the square [-1, 1]^2, and around it where the point leaves it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ _FIELD, _RIM = "#ffffff", "#c9c5ba"
 _PATH, _BODY = "#2f6690", "#1d3f58"
 _TARGET, _TARGET_EDGE = "#f4dfb0", "#c8963e"
 _MARGIN = 44.0  # units of paper around the square
+_SCALE = PAPER / 2.0 - _MARGIN  # units of paper for each unit of length, while all are near the square
+_VISIBLE = 1.15  # coordinates that the margin has room for; beyond them, the picture shows a wider field
 
 
 @dataclass(frozen=True)
@@ -47,28 +49,28 @@ class Scene:
 def draw(scene: Scene, size: int = 480) -> np.ndarray:
     """Return a picture of the scene, uint8 `[size, size, 3]`."""
     canvas = Canvas.for_shapes(size)
+    farthest = max(abs(coordinate) for point in (*scene.path, scene.target) for coordinate in point)
+    scale = _SCALE / max(1.0, farthest / _VISIBLE)  # units of paper for each unit of length
+
+    def on_paper(point: Point) -> Point:
+        return PAPER / 2.0 + point[0] * scale, PAPER / 2.0 - point[1] * scale
+
     corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
-    canvas.polygon([_on_paper(corner) for corner in corners], _FIELD, _RIM, 3.0 if scene.has_walls else 1.0)
+    canvas.polygon([on_paper(corner) for corner in corners], _FIELD, _RIM, 3.0 if scene.has_walls else 1.0)
     fill, edge = _colours(scene)
-    canvas.disc(_on_paper(scene.target), scene.radius * _SCALE, fill, edge, 1.6)
-    canvas.disc(_on_paper(scene.target), 2.5, edge)
-    for start, end in itertools.pairwise(scene.path):
-        canvas.line(_on_paper(start), _on_paper(end), _PATH, 2.0)
+    canvas.disc(on_paper(scene.target), scene.radius * scale, fill, edge, 1.6)
+    canvas.disc(on_paper(scene.target), 2.5, edge)
+    path = [on_paper(point) for point in scene.path]
+    for start, end in itertools.pairwise(path):
+        canvas.line(start, end, _PATH, 2.0)
     # Of a long way, single steps cannot be told apart.
-    for point in scene.path[1:-1] if len(scene.path) < 60 else ():
-        canvas.disc(_on_paper(point), 2.0, _PATH)
-    canvas.disc(_on_paper(scene.path[0]), 5.0, BACKGROUND, INK, 2.0)
-    _draw_agent(canvas, scene)
+    for point in path[1:-1] if len(path) < 60 else ():
+        canvas.disc(point, 2.0, _PATH)
+    canvas.disc(path[0], 5.0, BACKGROUND, INK, 2.0)
+    _draw_agent(canvas, path[-1], scene.heading)
     finished = canvas.smoothed()
     _write(finished, scene)
     return np.array(finished.image)
-
-
-_SCALE = PAPER / 2.0 - _MARGIN  # units of paper for each unit of length
-
-
-def _on_paper(point: Point) -> Point:
-    return PAPER / 2.0 + point[0] * _SCALE, PAPER / 2.0 - point[1] * _SCALE
 
 
 def _colours(scene: Scene) -> tuple[str, str]:
@@ -77,12 +79,12 @@ def _colours(scene: Scene) -> tuple[str, str]:
     return (GOOD, GOOD_EDGE) if scene.is_success else (BAD, BAD_EDGE)
 
 
-def _draw_agent(canvas: Canvas, scene: Scene) -> None:
-    x, y = _on_paper(scene.path[-1])
-    if scene.heading is None:
+def _draw_agent(canvas: Canvas, place: Point, heading: float | None) -> None:
+    x, y = place
+    if heading is None:
         canvas.disc((x, y), 7.0, _BODY, BACKGROUND, 1.6)
         return
-    forward_x, forward_y = math.cos(scene.heading), -math.sin(scene.heading)
+    forward_x, forward_y = math.cos(heading), -math.sin(heading)
     shape = [(12.0, 0.0), (-8.0, 7.0), (-4.0, 0.0), (-8.0, -7.0)]
     turned = [(x + f * forward_x - s * forward_y, y + f * forward_y + s * forward_x) for f, s in shape]
     canvas.polygon(turned, _BODY, BACKGROUND, 1.6)

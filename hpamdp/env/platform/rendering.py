@@ -1,4 +1,4 @@
-"""Pictures of the course: its platforms, the agent with the way it made, and the active enemy."""
+"""Pictures of the course: its platforms, the agent with the way it made, and both enemies."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
         canvas.line(_on_paper(start, 60.0), _on_paper(end, 60.0), _PATH, 2.0)
     for middle in middles:
         canvas.disc(_on_paper(middle, 60.0), 2.6, _PATH)
-    _draw_body(canvas, float(last.enemy_x), _ENEMY, 0.0)
+    for enemy in _enemies(track):
+        _draw_body(canvas, enemy, _ENEMY, 0.0)
     has_fallen = int(last.outcome) == rules.FELL
     _draw_body(canvas, float(last.x), _AGENT, -rules.BODY_HEIGHT if has_fallen else 0.0)
     finished = canvas.smoothed()
@@ -45,6 +46,14 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
         colour = GOOD_EDGE if outcome == rules.ARRIVED else BAD_EDGE
         finished.write((PAPER - 18.0, PAPER - 20.0), rules.OUTCOMES[outcome], colour, 16.0, anchor="rm")
     return np.array(finished.image)
+
+
+def _enemies(track: Sequence[PlatformState]) -> list[float]:
+    """Return where the enemies are, px. The state has one of them; the other stands still where it was last."""
+    on_first = [state for state in track if float(state.x) <= rules.LEFT[1]]
+    if len(on_first) == len(track):
+        return [float(track[-1].enemy_x), rules._SECOND_START]
+    return [*(float(state.enemy_x) for state in on_first[-1:]), float(track[-1].enemy_x)]
 
 
 def _on_paper(x: float, y: float) -> tuple[float, float]:
