@@ -1,7 +1,8 @@
-"""Helpers to act in any environment over columns and counters: actions, episodes, restarts."""
+"""Helpers to act in any environment over columns and counters: actions, episodes, restarts, figures."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -59,3 +60,8 @@ def snapshot(env: CounterEnv) -> dict[str, Tensor]:
 def is_unchanged(env: CounterEnv, before: dict[str, Tensor], rows: Tensor | slice = slice(None)) -> bool:
     """Return whether the state is as `snapshot` found it, in these rows."""
     return all(torch.equal(now[rows], before[name][rows]) for name, now in env.env_state().items())
+
+
+def agrees(values: Tensor, known: float, error: float) -> bool:
+    """Return whether a mean is within two standard errors, the known figure's and ours, of the known one."""
+    return abs(values.mean().item() - known) <= 2.0 * (error + values.std().item() / math.sqrt(len(values)))

@@ -58,14 +58,18 @@ def trained_player(env: GoalEnv) -> Callable[[TensorDictBase], TensorDictBase]:
     return play
 
 
-# What a look-ahead tries: points to kick to, whose y is not read, and places on the goal line to shoot at.
-KICKS = torch.linspace(0.0, 40.0, 21)
-SHOTS = torch.linspace(-7.0, 7.0, 29)
-FIRST = action(
-    torch.cat([torch.zeros(len(KICKS), dtype=torch.long), torch.ones(len(SHOTS), dtype=torch.long)]),
-    torch.cat([F.pad(KICKS[:, None], (0, 3)), F.pad(SHOTS[:, None], (2, 1))]),
-)
-SECOND = FIRST[len(KICKS) :]
+# What a look-ahead tries: points to kick to, whose y is read where that slip is repaired alone, and places on the goal
+# line to shoot at.
+KICKS = F.pad(torch.linspace(0.0, 40.0, 21)[:, None], (0, 3))
+REPAIRED_KICKS = F.pad(torch.cartesian_prod(torch.linspace(2.0, 20.0, 10), torch.linspace(-9.0, 9.0, 7)), (0, 2))
+SHOTS = F.pad(torch.linspace(-7.0, 7.0, 29)[:, None], (2, 1))
+SECOND = action(torch.ones(len(SHOTS), dtype=torch.long), SHOTS)
+
+
+def first_actions(env: GoalEnv) -> TensorDict:
+    """Return the kicks and the shots."""
+    kicks = REPAIRED_KICKS if "kick_to" in env.repaired else KICKS
+    return torch.cat([action(torch.zeros(len(kicks), dtype=torch.long), kicks), SECOND])
 
 
 def of_rows(env: GoalEnv, rows: Tensor, seed: int = 0) -> GoalEnv:
@@ -92,7 +96,7 @@ def look_ahead_player(num_samples: int = 6) -> Player:
 
     def values(env: GoalEnv) -> Tensor:
         """Return the share of goals after each first action and the best shot that follows it, `[N, A]`."""
-        outcome, model = tried(env, FIRST, next(seeds))
+        outcome, model = tried(env, first_actions(env), next(seeds))
         value = (outcome == rules.GOAL).float().flatten()
         playing = (outcome.flatten() == rules.PLAYING).nonzero().squeeze(-1)
         if len(playing):
@@ -107,7 +111,7 @@ def look_ahead_player(num_samples: int = 6) -> Player:
         best = torch.stack([values(now) for _ in range(num_samples)]).mean(0).argmax(-1)
         chosen = torch.zeros(env.num_envs, dtype=torch.long)
         chosen[playing] = best
-        return FIRST[chosen]
+        return first_actions(env)[chosen]
 
     return act
 

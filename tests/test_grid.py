@@ -114,9 +114,6 @@ ELSEWHERE_PAIRS = [
 @pytest.mark.parametrize(("low", "env"), ELSEWHERE_PAIRS)
 def test_every_learner_works_on_other_problems(low, env, tmp_path):
     given = [f"env={env}", "high=none", f"low={low}", *ELSEWHERE[env], *SHORT.get(low, []), *SMALL]
-    if low == "qpamdp":
-        # Boat x, y and goal - boat x, y: all entries would make thousands of features.
-        given.append("low.features=[9,10,15,16]" if env == "boatdock_released" else "low.features=null")
     assert run(compose_config(given), tmp_path, given) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["env"] == env and not {"human", "human_normalised"} & {*summary, *summary["references"]}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from counter_players import action, play, random_player
+from counter_players import action, agrees, play, random_player
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -50,11 +50,6 @@ def success(env: CounterEnv, player) -> tuple[Tensor, Tensor]:
     """Return which episodes succeed, as 0 or 1, and their returns, `[N]` each."""
     last, total = play(env, player)
     return env.results(last)["success"].float(), total
-
-
-def agrees(values: Tensor, known: float, error: float) -> bool:
-    """Return whether a mean is within two standard errors, the known figure's and ours, of the known one."""
-    return abs(values.mean().item() - known) <= 2.0 * (error + values.std().item() / math.sqrt(len(values)))
 
 
 # Figures of another implementation. Shares have standard errors below .005 there; those of the returns are 0.2, or 0.01
