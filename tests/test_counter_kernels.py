@@ -140,10 +140,10 @@ def test_the_step_with_a_reset_returns_what_torchrls_own_does(name):
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_a_row_is_the_same_to_the_bit_in_every_batch(name, num):
     problem = PROBLEMS[name][0]
-    many = problem(num, seed=4, first_env=3)
+    many = problem(num, seed=4, first_env=3, max_steps=3)
     td = many.reset()
     rows = [0, num // 2, num - 1]
-    ones = [problem(1, seed=4, first_env=3 + row) for row in rows]
+    ones = [problem(1, seed=4, first_env=3 + row, max_steps=3) for row in rows]
     for one in ones:
         one.reset()
     for _ in range(6):

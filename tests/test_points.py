@@ -177,6 +177,12 @@ def test_moving_lasts_201_steps_and_the_last_costs_one():
     assert reading[keys.REWARD].item() == -1.0
 
 
+def test_more_steps_than_an_int32_counts_are_no_limit():
+    env = MovingEnv(3, max_steps=2**40)
+    place(env, x=0.0, y=0.0)
+    assert not act(env, gym_hybrid.TURN, 0.5)[keys.DONE].any()
+
+
 @pytest.mark.parametrize("problem", [MovingEnv, SlidingEnv])
 def test_a_stop_at_the_target_succeeds_even_in_the_last_step(problem):
     env = problem(1)

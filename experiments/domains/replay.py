@@ -64,8 +64,8 @@ def replay(recording: dict[str, Any], dtype: torch.dtype = torch.float64, *, ste
     """Compare a recording with our rules.
 
     Raises:
-        ValueError: there is no adapter for its domain, or it is no recording of it; so do the next three.
-        IndexError, KeyError, TypeError:
+        ValueError: there is no adapter for its domain, or a value in the recording is wrong.
+        IndexError, KeyError, RuntimeError, TypeError: it is no recording of that domain.
     """
     adapter = load(recording)
     episodes = recording["episodes"]
@@ -149,7 +149,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"{options.file}: not a recording: it lacks {error}", file=sys.stderr)
         return 2
     except (IndexError, RuntimeError, TypeError, ValueError) as error:
-        print(f"{options.file}: not a recording: {str(error).splitlines()[0]}", file=sys.stderr)
+        print(f"{options.file}: not a recording: {str(error).partition(chr(10))[0]}", file=sys.stderr)
         return 2
     tolerance = options.tolerance
     if tolerance is None:

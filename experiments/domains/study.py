@@ -52,7 +52,7 @@ DOMAINS = {
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_COMPARED = 3  # of both learners, for a probability of improvement
 FIRST_STEPS = 700  # where the curves' axes begin: no learner was evaluated earlier
-CPU_LIMIT = 600.0  # seconds, of the second table
+CPU_LIMIT = 600.0  # seconds, of the table within ten minutes
 AUGMENTED = "_augment"  # follows a learner's name where steps are mapped by symmetries that the problem declares
 KEY = ("domain", "learner", "frames", "seed")
 
@@ -216,9 +216,7 @@ def cost_table(results: Rows) -> str:
 
 
 def steps_table(curves: Rows, published: Rows) -> str:
-    """Return a line for each learner, domain and length of the runs: steps to the first evaluation at the best
-    published score.
-    """
+    """Return a line for each learner, domain and length of runs: steps to the best published score."""
     lines = [
         "| domain | learner | steps | best published | steps to it, each seed | a tenth of the published steps |",
         "|---|---|---|---|---|---|",

@@ -64,7 +64,7 @@ class DirectAdapter:
 
     def columns(self, rows: Sequence[Sequence[float]]) -> dict[str, Tensor]:
         """Return our columns that are recorded, float64 `[N]`."""
-        table = torch.tensor(rows, dtype=torch.float64).reshape(-1, len(self.state_names))
+        table = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(self.state_names))
         return {ours: table[:, self.state_names.index(name)] for ours, name in self.recorded_names.items()}
 
     def states(self, rows: Sequence[Sequence[float]], taken: Sequence[int], dtype: torch.dtype) -> Any:

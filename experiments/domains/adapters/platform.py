@@ -19,8 +19,7 @@ class DomainAdapter:
     """Platform by its rules.
 
     Of the enemies, our state has the active one alone, since the other stands still, and it has no heights, since after
-    an action the agent stands or the episode is over. Actions have closed forms, so nothing counts ticks but the
-    recording.
+    an action the agent stands or the episode is over. The rules do not return how many ticks an action took.
     """
 
     outcomes = ("", "arrived", "fell", "enemy", "limit")

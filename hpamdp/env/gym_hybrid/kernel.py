@@ -1,8 +1,8 @@
 """The rules of Moving and Sliding as loops over rows that Numba compiles.
 
-It states what `rules` says of columns, for the CPU alone; a test compares the two. Some rows at a time are copied into
-lanes, a row in each, where actions and observations are loops without branches, which become vector instructions. Every
-lane does the same, so that no row depends on its lane.
+It states what `rules` says of columns, for the CPU alone; a test compares the two. Blocks of rows are copied into
+lanes, one row each; loops over the lanes have no branches and become vector instructions. Every lane does the same, so
+that no row depends on its lane.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ _PUSH, _STEP, _BRAKE, _RIGHT_ANGLE = _F(rules.LARGEST_PUSH), _F(rules.STEP), _F(
 _RADIUS, _START_BOUND, _STEP_COST = _F(rules.TARGET_RADIUS), _F(rules._START_BOUND), _F(rules._STEP_COST)
 _SUCCESS_REWARD, _FAILURE_REWARD = _F(rules._SUCCESS_REWARD), _F(rules._FAILURE_REWARD)
 _TURNS = _F(0.5 / math.pi)
+_MOST_STEPS = 2.0**31 - 1.0  # that an int32 counts
 
 
 @inlined
@@ -208,7 +209,7 @@ def advance(
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
-    max_steps, slides = int32(settings[kernels.MAX_STEPS]), settings[SLIDES] != 0.0
+    max_steps, slides = int32(min(settings[kernels.MAX_STEPS], _MOST_STEPS)), settings[SLIDES] != 0.0
     latest = _F(max(settings[kernels.MAX_STEPS] - 1.0, 1.0))
     lanes, numbers = np.zeros(_NUM_FLOATS * _LANES, np.float32), np.zeros(_NUM_INTEGERS * _LANES, np.int32)
     seen = np.empty(_OBSERVATION_DIM * _LANES, np.float32)

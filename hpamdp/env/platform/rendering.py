@@ -49,7 +49,10 @@ def draw(track: Sequence[PlatformState], size: int = 480) -> np.ndarray:
 
 
 def _enemies(track: Sequence[PlatformState]) -> list[float]:
-    """Return where the enemies are, px. The state has one of them; the other stands still where it was last."""
+    """Return where the enemies are, px.
+
+    The state has one of them. The second waits at its start; the first is shown where it was before the agent left it.
+    """
     on_first = [state for state in track if float(state.x) <= rules.LEFT[1]]
     if len(on_first) == len(track):
         return [float(track[-1].enemy_x), rules._SECOND_START]
