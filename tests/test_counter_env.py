@@ -395,7 +395,7 @@ def test_a_picture_shows_the_progress_of_the_episode(env_id):
     assert (before != after).any()
 
 
-def places_of(colour: str, picture: np.ndarray) -> np.ndarray:
+def places_of(colour: str, picture: np.ndarray) -> list[np.ndarray]:
     """Return the columns of a picture that have pixels of just this colour, as they come together, in runs."""
     rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
     columns = np.flatnonzero((picture == rgb).all(-1).any(0))
