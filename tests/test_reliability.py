@@ -237,7 +237,9 @@ def test_an_empty_folder_name_is_refused_in_one_line(word, line, command):
 
 def test_a_folder_that_is_deleted_while_the_run_goes_on_ends_it_in_one_line(tmp_path, printed):
     process = started(tmp_path / "run", output=printed)
-    subprocess.run(["rm", "-rf", str(tmp_path / "run")], check=True)
+    # Moved first: a file that the run makes while `rm` empties the folder would keep it from being removed.
+    (tmp_path / "run").rename(tmp_path / "deleted")
+    subprocess.run(["rm", "-rf", str(tmp_path / "deleted")], check=True)
     assert exit_code(process) == 1
     (line,) = [line for line in lines_of(printed) if "steps/s" not in line]
     assert str(tmp_path / "run") in line and "No such file" in line
