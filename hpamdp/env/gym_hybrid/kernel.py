@@ -2,7 +2,8 @@
 
 It states what `rules` says of columns, for the CPU alone; a test compares the two. Blocks of rows are copied into
 lanes, one row each; loops over the lanes have no branches and become vector instructions. Every lane does the same, so
-that no row depends on its lane.
+that no row depends on its lane. Numbers of rows are unsigned: negative ones would count from the end, and Numba's test
+for them keeps a loop from becoming vector instructions.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import int32
+from numba import int32, uint64
 
 from hpamdp.env import kernels
 from hpamdp.env.gym_hybrid import rules
@@ -35,7 +36,7 @@ SLIDES = kernels.OWN  # the problem's own setting
 _X, _Y, _SPEED, _HEADING, _COURSE, _TARGET_X, _TARGET_Y = range(7)
 _NUM_COLUMNS = _TARGET_Y + 1
 
-_LANES = 32  # with 16, as many as fit into a vector, copying takes longer; with 64 a single row does
+_LANES = 64  # with fewer, beginning and ending the loops takes longer; with 128 a single row does
 # Further columns of the lanes' float32: the parameter of the action, and its reward.
 _GIVEN, _REWARD = range(_NUM_COLUMNS, _NUM_COLUMNS + 2)
 _NUM_FLOATS = _REWARD + 1
@@ -160,19 +161,21 @@ def _load(
     """Copy rows into the lanes, with their actions; the other lanes stay as they are."""
     for column in range(_NUM_COLUMNS):
         for j in range(width):
-            lanes[column * _LANES + j] = floats[column, first + j]
+            lanes[column * _LANES + j] = floats[column, uint64(first + j)]
     for j in range(width):
-        numbers[_STEPS * _LANES + j] = integers[STEPS_ROW, first + j]
+        numbers[_STEPS * _LANES + j] = integers[STEPS_ROW, uint64(first + j)]
     for j in range(width):
-        numbers[_OUTCOME * _LANES + j] = integers[OUTCOME_ROW, first + j]
+        numbers[_OUTCOME * _LANES + j] = integers[OUTCOME_ROW, uint64(first + j)]
     for j in range(width):
-        row = first + j
         was_over = numbers[_OUTCOME * _LANES + j] != rules.GOING_ON
         numbers[_WAS_OVER * _LANES + j] = was_over
-        numbers[_MOVES * _LANES + j] = (mode != kernels.RESTART) & mask[row] & (not was_over)
+        numbers[_MOVES * _LANES + j] = (mode != kernels.RESTART) & mask[uint64(first + j)] & (not was_over)
+    least_push, least_turn, most_push, most_turn = bounds[0, 0], bounds[0, 1], bounds[1, 0], bounds[1, 1]
+    for j in range(width):
+        row = uint64(first + j)
         action = int32(discrete[row])
-        push = min(max(parameters[row, 0], bounds[0, 0]), bounds[1, 0])
-        turn = min(max(parameters[row, 1], bounds[0, 1]), bounds[1, 1])
+        push = min(max(parameters[row, 0], least_push), most_push)
+        turn = min(max(parameters[row, 1], least_turn), most_turn)
         numbers[_ACTION * _LANES + j] = action
         lanes[_GIVEN * _LANES + j] = turn if action == rules.TURN else push
 
@@ -182,11 +185,11 @@ def _store(lanes: Any, numbers: Any, first: Any, width: Any, floats: Any, intege
     """Copy the lanes back into their rows."""
     for column in range(_NUM_COLUMNS):
         for j in range(width):
-            floats[column, first + j] = lanes[column * _LANES + j]
+            floats[column, uint64(first + j)] = lanes[column * _LANES + j]
     for j in range(width):
-        integers[STEPS_ROW, first + j] = numbers[_STEPS * _LANES + j]
+        integers[STEPS_ROW, uint64(first + j)] = numbers[_STEPS * _LANES + j]
     for j in range(width):
-        integers[OUTCOME_ROW, first + j] = numbers[_OUTCOME * _LANES + j]
+        integers[OUTCOME_ROW, uint64(first + j)] = numbers[_OUTCOME * _LANES + j]
 
 
 @kernel
@@ -213,24 +216,35 @@ def advance(
     latest = _F(max(settings[kernels.MAX_STEPS] - 1.0, 1.0))
     lanes, numbers = np.zeros(_NUM_FLOATS * _LANES, np.float32), np.zeros(_NUM_INTEGERS * _LANES, np.int32)
     seen = np.empty(_OBSERVATION_DIM * _LANES, np.float32)
+    entries = observations.reshape(len(observations), -1)
     for first in range(0, len(mask), _LANES):
         width = min(_LANES, len(mask) - first)
         _load(lanes, numbers, first, width, floats, integers, discrete, parameters, bounds, mask, mode)
-        _act(lanes, numbers, max_steps, slides)
+        # Two versions: where sliding is a variable, its arc tangent is computed for Moving, too.
+        if slides:
+            _act(lanes, numbers, max_steps, True)
+        else:
+            _act(lanes, numbers, max_steps, False)
         for j in range(width):
-            rewards[first + j] = lanes[_REWARD * _LANES + j]
+            rewards[uint64(first + j)] = lanes[_REWARD * _LANES + j]
         for reading in range(len(observations)):
+            must_observe = reading == 0
             for j in range(width):
                 was_over, outcome = numbers[_WAS_OVER * _LANES + j] != 0, numbers[_OUTCOME * _LANES + j]
-                if kernels.must_restart(mode, reading, was_over, outcome, mask[first + j]):
+                if kernels.must_restart(mode, reading, was_over, outcome, mask[uint64(first + j)]):
                     bits, step = kernels.new_episode(integers, first + j, settings)
                     _start(lanes, numbers, j, bits, step)
-            _observe(lanes, numbers, latest, seen)
-            for j in range(width):
-                for entry in range(_OBSERVATION_DIM):
-                    observations[reading, first + j, entry] = seen[entry * _LANES + j]
+                    must_observe = True
+            if must_observe:
+                _observe(lanes, numbers, latest, seen)
+                for j in range(width):
+                    for entry in range(_OBSERVATION_DIM):
+                        observations[reading, uint64(first + j), entry] = seen[entry * _LANES + j]
+            else:  # nothing has changed
+                for place in range(first * _OBSERVATION_DIM, (first + width) * _OBSERVATION_DIM):
+                    entries[reading, uint64(place)] = entries[reading - 1, uint64(place)]
             for j in range(width):
                 outcome = numbers[_OUTCOME * _LANES + j]
-                kernels.report(outcome, len(rules.OUTCOMES), first + j, outcomes[reading], flags[reading])
+                kernels.report(outcome, len(rules.OUTCOMES), uint64(first + j), outcomes[reading], flags[reading])
         _store(lanes, numbers, first, width, floats, integers)
     return -1
