@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import int32, njit, uint32
+from numba import int32, njit, uint32, uint64
 
 from hpamdp.env.streams import STEPS
 
@@ -83,6 +83,16 @@ def part(function: Callable[..., Any]) -> Any:
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function that kernels call for one row; inlined, since a loop with a call is not vectorised."""
     return njit(function, forceinline=True, **_PART_OPTIONS)
+
+
+@inlined
+def unsigned(index: Any) -> Any:
+    """Return an index that is not negative, unsigned.
+
+    A signed sum may be negative for all that Numba knows, which then tests whether to count from the array's end. With
+    this test a loop does not become vector instructions.
+    """
+    return uint64(index)
 
 
 def folded(seed: int) -> int:

@@ -30,6 +30,7 @@ from hpamdp.env.kernels import (
     stream_key,
     stream_step,
     uniform,
+    unsigned,
 )
 
 # Rows of the state's two arrays, float32 [9, N] and int32 [5, N], in the order of BoatState.
@@ -172,6 +173,17 @@ def _attempt(bits: Any, step: Any, first: Any) -> Any:
 def _invalid_row(option: Any, key: Any, durations: Any, integers: Any, is_later: Any, settings: Any) -> Any:
     """Return the first row whose action is invalid, or -1; those that start anew instead may have any."""
     chooses = settings[SET_CONTROLLER] == task.NOT_CHOSEN
+    # All at once, without a branch on each row's key. The loop below finds the row.
+    all_valid = True
+    for row in range(len(key)):
+        all_valid &= (key[row] >= 0) & (key[row] < task.NUM_KEYS)
+        for column in range(task.NUM_KEYS):
+            all_valid &= math.isfinite(durations[row, column])
+    if chooses:
+        for row in range(len(option)):
+            all_valid &= (option[row] >= 0) & (option[row] < settings[NUM_BOATS])
+    if all_valid:
+        return -1
     for row in range(len(key)):
         is_key = (key[row] >= 0) & (key[row] < task.NUM_KEYS)
         is_option = (not chooses) | ((option[row] >= 0) & (option[row] < settings[NUM_BOATS]))
@@ -186,13 +198,13 @@ def _invalid_row(option: Any, key: Any, durations: Any, integers: Any, is_later:
 def _load(floats: Any, integers: Any, mask: Any, first: Any, count: Any, scratch: Any, numbers: Any) -> None:
     for column in range(9):
         for j in range(count):
-            scratch[column * _BLOCK + j] = floats[column, first + j]
+            scratch[column * _BLOCK + j] = floats[column, unsigned(first + j)]
     for column in range(5):
         for j in range(count):
-            numbers[column * _BLOCK + j] = integers[column, first + j]
+            numbers[column * _BLOCK + j] = integers[column, unsigned(first + j)]
     for j in range(count):
-        numbers[_MOVES * _BLOCK + j] = mask[first + j]
-        numbers[_IS_NEW * _BLOCK + j] = mask[first + j]
+        numbers[_MOVES * _BLOCK + j] = mask[unsigned(first + j)]
+        numbers[_IS_NEW * _BLOCK + j] = mask[unsigned(first + j)]
 
 
 @part
@@ -209,20 +221,20 @@ def _load_actions(
     last_boat = int32(settings[NUM_BOATS] - 1.0)
     for j in range(count):
         # An action that is ignored may have any key and option.
-        pressed = int32(min(max(key[first + j], 0), task.NUM_KEYS - 1))
+        pressed = int32(min(max(key[unsigned(first + j)], 0), task.NUM_KEYS - 1))
         numbers[_KEY * _BLOCK + j] = pressed
-        numbers[_OPTION * _BLOCK + j] = int32(min(max(option[first + j], 0), last_boat))
-        scratch[_DURATION * _BLOCK + j] = min(max(durations[first + j, pressed], ZERO), _LONGEST)
+        numbers[_OPTION * _BLOCK + j] = int32(min(max(option[unsigned(first + j)], 0), last_boat))
+        scratch[_DURATION * _BLOCK + j] = min(max(durations[unsigned(first + j), pressed], ZERO), _LONGEST)
 
 
 @part
 def _store(floats: Any, integers: Any, first: Any, count: Any, scratch: Any, numbers: Any) -> None:
     for column in range(9):
         for j in range(count):
-            floats[column, first + j] = scratch[column * _BLOCK + j]
+            floats[column, unsigned(first + j)] = scratch[column * _BLOCK + j]
     for column in range(5):
         for j in range(count):
-            integers[column, first + j] = numbers[column * _BLOCK + j]
+            integers[column, unsigned(first + j)] = numbers[column * _BLOCK + j]
 
 
 @part
@@ -322,7 +334,7 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
         numbers[PRESSES * _BLOCK + j] = int32(presses + 1) if moves else presses
         numbers[OUTCOME * _BLOCK + j] = outcome if moves else old_outcome
     for j in range(count):
-        rewards[first + j] = scratch[_REWARD * _BLOCK + j]
+        rewards[unsigned(first + j)] = scratch[_REWARD * _BLOCK + j]
 
 
 @part
@@ -437,10 +449,10 @@ def _observe(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, 
         scratch[(_SEEN + 15) * _BLOCK + j] = (goal_y - y) * length
     for j in range(count):
         for column in range(14):
-            observation[first + j, column] = scratch[(_SEEN + column) * _BLOCK + j]
+            observation[unsigned(first + j), column] = scratch[(_SEEN + column) * _BLOCK + j]
         if not is_pixels:
-            observation[first + j, 14] = scratch[(_SEEN + 14) * _BLOCK + j]
-            observation[first + j, 15] = scratch[(_SEEN + 15) * _BLOCK + j]
+            observation[unsigned(first + j), 14] = scratch[(_SEEN + 14) * _BLOCK + j]
+            observation[unsigned(first + j), 15] = scratch[(_SEEN + 15) * _BLOCK + j]
 
 
 @part
@@ -448,13 +460,13 @@ def _report(first: Any, count: Any, scratch: Any, numbers: Any, outcomes: Any, f
     """Write outcomes, fractions of fuel and whether episodes are done, terminated and truncated."""
     for j in range(count):
         outcome = numbers[OUTCOME * _BLOCK + j]
-        outcomes[first + j] = outcome
-        fuel[first + j] = scratch[FUEL * _BLOCK + j] / _TANK
+        outcomes[unsigned(first + j)] = outcome
+        fuel[unsigned(first + j)] = scratch[FUEL * _BLOCK + j] / _TANK
         is_late = outcome == task.TIME_LIMIT
         is_done = outcome != task.SAILING
-        flags[0, first + j] = is_done
-        flags[1, first + j] = is_done & (not is_late)
-        flags[2, first + j] = is_late
+        flags[0, unsigned(first + j)] = is_done
+        flags[1, unsigned(first + j)] = is_done & (not is_late)
+        flags[2, unsigned(first + j)] = is_late
 
 
 @kernel

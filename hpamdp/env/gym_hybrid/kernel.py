@@ -2,8 +2,7 @@
 
 It states what `rules` says of columns, for the CPU alone; a test compares the two. Blocks of rows are copied into
 lanes, one row each; loops over the lanes have no branches and become vector instructions. Every lane does the same, so
-that no row depends on its lane. Numbers of rows are unsigned: negative ones would count from the end, and Numba's test
-for them keeps a loop from becoming vector instructions.
+that no row depends on its lane.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import int32, uint64
+from numba import int32
 
 from hpamdp.env import kernels
 from hpamdp.env.gym_hybrid import rules
@@ -28,6 +27,7 @@ from hpamdp.env.kernels import (
     kernel,
     part,
     sin_cos,
+    unsigned,
 )
 
 SLIDES = kernels.OWN  # the problem's own setting
@@ -161,18 +161,18 @@ def _load(
     """Copy rows into the lanes, with their actions; the other lanes stay as they are."""
     for column in range(_NUM_COLUMNS):
         for j in range(width):
-            lanes[column * _LANES + j] = floats[column, uint64(first + j)]
+            lanes[column * _LANES + j] = floats[column, unsigned(first + j)]
     for j in range(width):
-        numbers[_STEPS * _LANES + j] = integers[STEPS_ROW, uint64(first + j)]
+        numbers[_STEPS * _LANES + j] = integers[STEPS_ROW, unsigned(first + j)]
     for j in range(width):
-        numbers[_OUTCOME * _LANES + j] = integers[OUTCOME_ROW, uint64(first + j)]
+        numbers[_OUTCOME * _LANES + j] = integers[OUTCOME_ROW, unsigned(first + j)]
     for j in range(width):
         was_over = numbers[_OUTCOME * _LANES + j] != rules.GOING_ON
         numbers[_WAS_OVER * _LANES + j] = was_over
-        numbers[_MOVES * _LANES + j] = (mode != kernels.RESTART) & mask[uint64(first + j)] & (not was_over)
+        numbers[_MOVES * _LANES + j] = (mode != kernels.RESTART) & mask[unsigned(first + j)] & (not was_over)
     least_push, least_turn, most_push, most_turn = bounds[0, 0], bounds[0, 1], bounds[1, 0], bounds[1, 1]
     for j in range(width):
-        row = uint64(first + j)
+        row = unsigned(first + j)
         action = int32(discrete[row])
         push = min(max(parameters[row, 0], least_push), most_push)
         turn = min(max(parameters[row, 1], least_turn), most_turn)
@@ -185,11 +185,11 @@ def _store(lanes: Any, numbers: Any, first: Any, width: Any, floats: Any, intege
     """Copy the lanes back into their rows."""
     for column in range(_NUM_COLUMNS):
         for j in range(width):
-            floats[column, uint64(first + j)] = lanes[column * _LANES + j]
+            floats[column, unsigned(first + j)] = lanes[column * _LANES + j]
     for j in range(width):
-        integers[STEPS_ROW, uint64(first + j)] = numbers[_STEPS * _LANES + j]
+        integers[STEPS_ROW, unsigned(first + j)] = numbers[_STEPS * _LANES + j]
     for j in range(width):
-        integers[OUTCOME_ROW, uint64(first + j)] = numbers[_OUTCOME * _LANES + j]
+        integers[OUTCOME_ROW, unsigned(first + j)] = numbers[_OUTCOME * _LANES + j]
 
 
 @kernel
@@ -226,12 +226,12 @@ def advance(
         else:
             _act(lanes, numbers, max_steps, False)
         for j in range(width):
-            rewards[uint64(first + j)] = lanes[_REWARD * _LANES + j]
+            rewards[unsigned(first + j)] = lanes[_REWARD * _LANES + j]
         for reading in range(len(observations)):
             must_observe = reading == 0
             for j in range(width):
                 was_over, outcome = numbers[_WAS_OVER * _LANES + j] != 0, numbers[_OUTCOME * _LANES + j]
-                if kernels.must_restart(mode, reading, was_over, outcome, mask[uint64(first + j)]):
+                if kernels.must_restart(mode, reading, was_over, outcome, mask[unsigned(first + j)]):
                     bits, step = kernels.new_episode(integers, first + j, settings)
                     _start(lanes, numbers, j, bits, step)
                     must_observe = True
@@ -239,12 +239,13 @@ def advance(
                 _observe(lanes, numbers, latest, seen)
                 for j in range(width):
                     for entry in range(_OBSERVATION_DIM):
-                        observations[reading, uint64(first + j), entry] = seen[entry * _LANES + j]
+                        observations[reading, unsigned(first + j), entry] = seen[entry * _LANES + j]
             else:  # nothing has changed
-                for place in range(first * _OBSERVATION_DIM, (first + width) * _OBSERVATION_DIM):
-                    entries[reading, uint64(place)] = entries[reading - 1, uint64(place)]
+                begin = first * _OBSERVATION_DIM
+                for place in range(width * _OBSERVATION_DIM):
+                    entries[reading, unsigned(begin + place)] = entries[reading - 1, unsigned(begin + place)]
             for j in range(width):
                 outcome = numbers[_OUTCOME * _LANES + j]
-                kernels.report(outcome, len(rules.OUTCOMES), uint64(first + j), outcomes[reading], flags[reading])
+                kernels.report(outcome, len(rules.OUTCOMES), unsigned(first + j), outcomes[reading], flags[reading])
         _store(lanes, numbers, first, width, floats, integers)
     return -1
