@@ -185,6 +185,25 @@ _FEW = 16  # parameters of a row that lie within a line of the cache
 
 
 @part
+def all_below(numbers: Any, limit: Any) -> Any:
+    """Return whether all numbers `[N]` lie in [0, limit)."""
+    are_below = True
+    for row in range(len(numbers)):
+        are_below &= (numbers[row] >= 0) & (numbers[row] < limit)
+    return are_below
+
+
+@part
+def all_finite(values: Any) -> Any:
+    """Return whether all values `[N, P]`, which lie one after another in memory, are finite."""
+    are_finite = True
+    given = values.reshape(-1)
+    for place in range(len(given)):
+        are_finite &= math.isfinite(given[place])
+    return are_finite
+
+
+@part
 def invalid_row(discrete: Any, parameters: Any, places: Any, integers: Any, mode: Any) -> Any:
     """Return the first row whose action is unknown or has a parameter that is not finite, or -1.
 
@@ -197,16 +216,9 @@ def invalid_row(discrete: Any, parameters: Any, places: Any, integers: Any, mode
     """
     if mode == RESTART:
         return -1
-    if parameters.shape[1] <= _FEW:
-        # All at once: a branch on each row's action cost a sixth of Catch Point's step. The loop below finds the row.
-        all_valid = True
-        for row in range(len(discrete)):
-            all_valid &= (discrete[row] >= 0) & (discrete[row] < len(places) - 1)
-        given = parameters.reshape(-1)
-        for place in range(len(given)):
-            all_valid &= math.isfinite(given[place])
-        if all_valid:
-            return -1
+    # All at once: a branch on each row's action cost a sixth of Catch Point's step. The loop below finds the row.
+    if parameters.shape[1] <= _FEW and all_below(discrete, len(places) - 1) and all_finite(parameters):
+        return -1
     for row in range(len(discrete)):
         is_valid = (discrete[row] >= 0) & (discrete[row] < len(places) - 1)
         if is_valid:

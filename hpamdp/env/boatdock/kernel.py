@@ -21,6 +21,8 @@ from hpamdp.env.kernels import (
     TURN,
     TWO,
     ZERO,
+    all_below,
+    all_finite,
     episode_key,
     inlined,
     kernel,
@@ -174,15 +176,8 @@ def _invalid_row(option: Any, key: Any, durations: Any, integers: Any, is_later:
     """Return the first row whose action is invalid, or -1; those that start anew instead may have any."""
     chooses = settings[SET_CONTROLLER] == task.NOT_CHOSEN
     # All at once, without a branch on each row's key. The loop below finds the row.
-    all_valid = True
-    for row in range(len(key)):
-        all_valid &= (key[row] >= 0) & (key[row] < task.NUM_KEYS)
-        for column in range(task.NUM_KEYS):
-            all_valid &= math.isfinite(durations[row, column])
-    if chooses:
-        for row in range(len(option)):
-            all_valid &= (option[row] >= 0) & (option[row] < settings[NUM_BOATS])
-    if all_valid:
+    are_known = all_below(key, task.NUM_KEYS) and (not chooses or all_below(option, settings[NUM_BOATS]))
+    if are_known and all_finite(durations):
         return -1
     for row in range(len(key)):
         is_key = (key[row] >= 0) & (key[row] < task.NUM_KEYS)
@@ -221,10 +216,11 @@ def _load_actions(
     last_boat = int32(settings[NUM_BOATS] - 1.0)
     for j in range(count):
         # An action that is ignored may have any key and option.
-        pressed = int32(min(max(key[unsigned(first + j)], 0), task.NUM_KEYS - 1))
+        row = unsigned(first + j)
+        pressed = int32(min(max(key[row], 0), task.NUM_KEYS - 1))
         numbers[_KEY * _BLOCK + j] = pressed
-        numbers[_OPTION * _BLOCK + j] = int32(min(max(option[unsigned(first + j)], 0), last_boat))
-        scratch[_DURATION * _BLOCK + j] = min(max(durations[unsigned(first + j), pressed], ZERO), _LONGEST)
+        numbers[_OPTION * _BLOCK + j] = int32(min(max(option[row], 0), last_boat))
+        scratch[_DURATION * _BLOCK + j] = min(max(durations[row, pressed], ZERO), _LONGEST)
 
 
 @part
@@ -448,25 +444,26 @@ def _observe(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, 
         scratch[(_SEEN + 14) * _BLOCK + j] = (goal_x - x) * length
         scratch[(_SEEN + 15) * _BLOCK + j] = (goal_y - y) * length
     for j in range(count):
+        row = unsigned(first + j)
         for column in range(14):
-            observation[unsigned(first + j), column] = scratch[(_SEEN + column) * _BLOCK + j]
+            observation[row, column] = scratch[(_SEEN + column) * _BLOCK + j]
         if not is_pixels:
-            observation[unsigned(first + j), 14] = scratch[(_SEEN + 14) * _BLOCK + j]
-            observation[unsigned(first + j), 15] = scratch[(_SEEN + 15) * _BLOCK + j]
+            observation[row, 14] = scratch[(_SEEN + 14) * _BLOCK + j]
+            observation[row, 15] = scratch[(_SEEN + 15) * _BLOCK + j]
 
 
 @part
 def _report(first: Any, count: Any, scratch: Any, numbers: Any, outcomes: Any, fuel: Any, flags: Any) -> None:
     """Write outcomes, fractions of fuel and whether episodes are done, terminated and truncated."""
     for j in range(count):
-        outcome = numbers[OUTCOME * _BLOCK + j]
-        outcomes[unsigned(first + j)] = outcome
-        fuel[unsigned(first + j)] = scratch[FUEL * _BLOCK + j] / _TANK
+        row, outcome = unsigned(first + j), numbers[OUTCOME * _BLOCK + j]
+        outcomes[row] = outcome
+        fuel[row] = scratch[FUEL * _BLOCK + j] / _TANK
         is_late = outcome == task.TIME_LIMIT
         is_done = outcome != task.SAILING
-        flags[0, unsigned(first + j)] = is_done
-        flags[1, unsigned(first + j)] = is_done & (not is_late)
-        flags[2, unsigned(first + j)] = is_late
+        flags[0, row] = is_done
+        flags[1, row] = is_done & (not is_late)
+        flags[2, row] = is_late
 
 
 @kernel
