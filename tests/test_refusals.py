@@ -13,6 +13,7 @@ from hpamdp import memory
 from hpamdp.config import GROUPS, ConfigError, read
 from hpamdp.run import assemble as assemble_module
 from hpamdp.run.assemble import assemble
+from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.resume import check_saved_options
 from hpamdp.run.train import run
 
@@ -214,6 +215,7 @@ def test_errors_of_a_resumed_run_name_its_own_parts(word, line, saved, command):
 def test_an_agent_is_told_when_its_options_are_others(tmp_path, capsys):
     first = "env.boats=[congruent,incongruent1]"
     assert run(config_of(f"{first} high=uniform low=random film=false"), tmp_path / "saved") == 0
+    assert progress_of(tmp_path / "saved/policy.pt")["option_names"] == ["congruent", "incongruent1"]
 
     def check(words, setting="low.checkpoint"):
         config = read(config_of(f"{words} high=uniform low=random {setting}={tmp_path / 'saved'}"))

@@ -87,10 +87,10 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
     where, source = next(((name, path) for name, path in sources.items() if path is not None), ("", None))
     if source is None:
         return
-    saved = checkpoint.progress_of(checkpoint.find(source, where))["config"]
-    if saved["env"] == config.to_dict()["env"]:
+    progress = checkpoint.progress_of(checkpoint.find(source, where))
+    if progress["config"]["env"] == config.to_dict()["env"]:
         return
-    before, now = _option_names(saved), env.option_names if env.has_choice else ()
+    before, now = _option_names(progress), env.option_names if env.has_choice else ()
     if not before or not now or before == now:
         return
     both = f"{where}={source}: its agent chooses among {', '.join(before)}, but {config.env} has {', '.join(now)}"
@@ -101,8 +101,11 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
     warn(f"{both}, which take their places")
 
 
-def _option_names(saved: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the options that a saved run's agent chose among; none where its environment is no longer to be had."""
+def _option_names(progress: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the options that a saved run's agent chose among; none if they are not known."""
+    if "option_names" in progress:
+        return tuple(progress["option_names"])
+    saved = progress["config"]  # Checkpoints of earlier versions lack the names.
     try:
         env = make_env(read(*compose_saved({**saved, "resume": None, "checkpoint": None})), 1, torch.device("cpu"), 0)
     except ConfigError:

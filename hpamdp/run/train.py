@@ -291,6 +291,7 @@ class Trainer:
     def _progress(self) -> dict[str, object]:
         return {
             "config": self.config.to_dict(),
+            "option_names": list(self.parts.agent.specs.option_names),
             "frames": self.frames,
             "wall_s": self.wall_s,
             "cpu_s": self.cpu_s,
