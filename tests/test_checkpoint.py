@@ -191,7 +191,7 @@ def test_a_kill_while_writing_leaves_the_old_checkpoint_and_its_leftover_is_remo
     file = tmp_path / "checkpoint.zip"
     states = {"collection": {}, "recorder": {}}
     checkpoint.save(file, parts.agent, states, {"config": {}, "frames": 1})
-    (tmp_path / ".checkpoint.zip.999.partial").write_bytes(b"half a checkpo")
+    (tmp_path / ".checkpoint.zip.999.partial.zip").write_bytes(b"half a checkpo")
     assert checkpoint.progress_of(file)["frames"] == 1
     checkpoint.save(file, parts.agent, states, {"config": {}, "frames": 2})
     assert checkpoint.progress_of(file)["frames"] == 2

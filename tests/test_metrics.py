@@ -74,7 +74,7 @@ def test_a_kill_while_the_header_is_rewritten_leaves_the_old_file(tmp_path, monk
     def killed(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pathlib.Path.replace", killed)
+    monkeypatch.setattr("os.replace", killed)
     with pytest.raises(KeyboardInterrupt):
         file.append({"frames": 2.0, "new": 1.0})
     assert read_rows(file.path) == [{"frames": 1.0}]

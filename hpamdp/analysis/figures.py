@@ -16,6 +16,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
 from hpamdp.analysis.style import AGENT, REFERENCES, STYLE, label_ends
 from hpamdp.env.base import Metric, PAMDPEnv
+from hpamdp.files import replacing
 from hpamdp.messages import duration, warn
 from hpamdp.run.metrics import EVALUATION, FRAMES, WALL_SECONDS, read_rows
 
@@ -38,7 +39,8 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
         figures = {} if curves is None else {"learning_curves.png": curves}
         figures |= env.draw_figures(evaluation, summary)
         for name, figure in figures.items():
-            figure.savefig(output_dir / name)
+            with replacing(output_dir / name) as partial:
+                figure.savefig(partial)
     return [output_dir / name for name in figures]
 
 

@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.files import replacing
 
 SUFFIXES = (".gif", ".mp4")
 GIF_FPS = 50  # the most pictures a second that a GIF shows
@@ -94,7 +95,8 @@ def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
     indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     # A GIF counts in hundredths of a second, and viewers show a picture for a tenth of one if it says a hundredth.
     hundredths = round(100.0 / min(fps, GIF_FPS))
-    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=10 * hundredths, loop=0)
+    with replacing(path) as partial:
+        indexed[0].save(partial, save_all=True, append_images=indexed[1:], duration=10 * hundredths, loop=0)
 
 
 def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
@@ -103,6 +105,7 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
         import imageio_ffmpeg  # noqa: F401  (the encoder, which imageio misses only when it writes)
     except ImportError as error:
         raise FilmError(f"{path}: imageio is not installed; pip install 'hpamdp[video]', or write a .gif") from error
-    with imageio.get_writer(path, fps=fps, macro_block_size=2, codec="libx264", quality=8) as writer:
+    encoding = {"fps": fps, "macro_block_size": 2, "codec": "libx264", "quality": 8}
+    with replacing(path) as partial, imageio.get_writer(partial, **encoding) as writer:
         for frame in frames:
             writer.append_data(frame)

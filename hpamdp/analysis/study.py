@@ -15,6 +15,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from scipy import stats
 
+from hpamdp.files import replacing
 from hpamdp.run.metrics import read_rows
 
 Rows = list[dict[str, Any]]
@@ -65,7 +66,7 @@ def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
         files = ", ".join(f"{name}.csv" for name in empty)
         raise SystemExit(f"in the folders given are no finished runs for {files}; nothing was written")
     for name, rows in tables.items():
-        with (folder / f"{name}.csv").open("w", newline="") as file:
+        with replacing(folder / f"{name}.csv") as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, rows[0])
             writer.writeheader()
             writer.writerows(rows)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import pickle
 import zipfile
 import zlib
@@ -27,6 +26,7 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 
 from hpamdp.config import ConfigError
+from hpamdp.files import replacing
 from hpamdp.messages import first_line, one_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
@@ -105,9 +105,6 @@ def save(
 ) -> None:
     """Write the agent, its optimizers and replay, the states of other parts and the random generators.
 
-    The file is complete or not there: it is written beside the old one, flushed to the disk, and put in its place in
-    one step.
-
     Args:
         path: the file.
         agent: the agent.
@@ -125,33 +122,14 @@ def save(
                 members[name] = _replay_state(part)
         else:
             members[name] = part.state_dict()
-    for leftover in path.parent.glob(f".{path.name}.*.partial"):
-        leftover.unlink(missing_ok=True)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        checksums = {}
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive:
-            for name, state in members.items():
-                data = _packed(state)
-                checksums[name] = hashlib.sha256(data).hexdigest()
-                archive.writestr(f"{name}.pt", data)
-            manifest = {"format": _FORMAT, "members": checksums, "progress": dict(progress)}
-            archive.writestr(_MANIFEST, json.dumps(manifest))
-        put_in_place(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def put_in_place(partial: Path, path: Path) -> None:
-    """Flush a complete file to the disk and give it its name, in place of an older one."""
-    with partial.open("rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(partial, path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    checksums = {}
+    with replacing(path) as partial, zipfile.ZipFile(partial, "w", zipfile.ZIP_STORED) as archive:
+        for name, state in members.items():
+            data = _packed(state)
+            checksums[name] = hashlib.sha256(data).hexdigest()
+            archive.writestr(f"{name}.pt", data)
+        manifest = {"format": _FORMAT, "members": checksums, "progress": dict(progress)}
+        archive.writestr(_MANIFEST, json.dumps(manifest))
 
 
 def save_policy(path: Path, agent: HierarchicalAgent, progress: Mapping[str, Any]) -> None:
@@ -160,12 +138,8 @@ def save_policy(path: Path, agent: HierarchicalAgent, progress: Mapping[str, Any
     Raises:
         OSError: as `save`.
     """
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
+    with replacing(path) as partial:
         torch.save({"format": _FORMAT, "progress": json.dumps(dict(progress)), "agent": agent.state_dict()}, partial)
-        put_in_place(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def progress_of(file: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -9,11 +10,14 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from hpamdp.config import ConfigError
+from hpamdp.files import remove_link
 
 # Files of a run that others read.
 CHECKPOINT_NAME = "checkpoint.zip"
 POLICY_NAME = "policy.pt"
 SUMMARY_NAME = "summary.json"
+# Folders that a run's logger writes to.
+TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
 
 
 @contextmanager
@@ -29,6 +33,7 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / ".lock"
+    remove_link(file)
     lock = FileLock(file, timeout=patience_s)
     try:
         lock.acquire()
@@ -39,6 +44,16 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     finally:
         file.unlink(missing_ok=True)
         lock.release()
+
+
+def check_no_link(folder: Path) -> None:
+    """Refuse to write to a folder inside a run's folder if it is a link to another place.
+
+    Raises:
+        ConfigError: it is a link.
+    """
+    if folder.is_symlink():
+        raise ConfigError(f"{folder}: a link to {os.readlink(folder)}; a run writes to no linked folder, so remove it")
 
 
 def check_unused(folder: Path) -> None:

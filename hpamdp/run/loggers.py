@@ -12,6 +12,7 @@ from urllib.parse import urlsplit
 from pydantic import Field, ValidationError
 
 from hpamdp.messages import first_line, warn
+from hpamdp.run.folder import TENSORBOARD_NAME
 
 # Seconds that an online wandb run may keep the training waiting, at its start and at its end.
 _WANDB_START, _WANDB_FINISH = 20.0, 60.0
@@ -83,7 +84,7 @@ class TensorboardLogger:
     def __init__(self, output_dir: Path) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(output_dir / "tensorboard"))
+        self._writer = SummaryWriter(str(output_dir / TENSORBOARD_NAME))
         self._step = 0
 
     def log(self, row: dict[str, float], step: int) -> None:

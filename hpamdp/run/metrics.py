@@ -10,6 +10,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+from hpamdp.files import replacing
+
 FRAMES, WALL_SECONDS = "frames", "wall_s"
 EVALUATION = "eval/"
 
@@ -20,7 +22,7 @@ def read_rows(path: Path) -> list[dict[str, float]]:
     A last line without its end was cut off while it was written, and is left out; cells that hold no number too.
     A missing file has no rows.
     """
-    text = path.read_text() if path.exists() else ""
+    text = path.read_text() if path.is_file() else ""
     lines = text[: text.rfind("\n") + 1].splitlines()
     return [dict(_numbers(cells)) for cells in csv.DictReader(lines)]
 
@@ -72,18 +74,16 @@ class MetricsFile:
 
     def _keep_previous(self) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.exists():
-            shutil.copyfile(self.path, self.path.with_name(self.path.name + ".previous"))
+        if self.path.is_file():
+            with replacing(self.path.with_name(self.path.name + ".previous")) as partial:
+                shutil.copyfile(self.path, partial)
 
     def _rewrite(self, rows: list[dict[str, float]]) -> None:
         self._columns = list(dict.fromkeys(column for column in [*self._columns, *(c for row in rows for c in row)]))
-        # Written beside and put in place in one step, so that a kill leaves either the old file or the new one.
-        draft = self.path.with_name(self.path.name + ".draft")
-        with draft.open("w", newline="") as file:
+        with replacing(self.path) as partial, partial.open("w", newline="") as file:
             writer = self._writer(file)
             writer.writeheader()
             writer.writerows(rows)
-        draft.replace(self.path)
 
     def _writer(self, file: Any) -> csv.DictWriter[str]:
         return csv.DictWriter(file, self._columns, restval="", lineterminator="\n")

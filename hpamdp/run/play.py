@@ -15,6 +15,7 @@ import torch
 
 from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
 from hpamdp.env.page import EpisodeError, Page
+from hpamdp.files import replacing
 from hpamdp.messages import first_line, say, warn
 from hpamdp.run.assemble import check_classes, make_env
 from hpamdp.run.checkpoint import progress_of
@@ -143,8 +144,10 @@ def export(page: Page, data: dict[str, Any], folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in page.files:
-            shutil.copyfile(page.folder / name, folder / name)
-        (folder / DATA_NAME).write_bytes(as_script(data))
+            with replacing(folder / name) as partial:
+                shutil.copyfile(page.folder / name, partial)
+        with replacing(folder / DATA_NAME) as partial:
+            partial.write_bytes(as_script(data))
     except OSError as error:
         raise ConfigError(f"--export {folder}: {error.strerror or error}") from error
 

@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.analysis import figures, film
 from hpamdp.config import Config
+from hpamdp.files import replacing
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
 from hpamdp.run.closing_table import closing_table
@@ -92,12 +93,14 @@ class Recorder:
         """Evaluate, write the summary and the figures, close the logger; return the closing table."""
         played = self._play()
         arrays: dict[str, Any] = dict(played)
-        np.savez_compressed(self.output_dir / "evaluation.npz", **arrays)
+        with replacing(self.output_dir / "evaluation.npz") as partial:
+            np.savez_compressed(partial, **arrays)
         measured = self.parts.evaluation.measure(played)
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random, effort, is_finished=is_finished)
-        (self.output_dir / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        with replacing(self.output_dir / "summary.json") as partial:
+            partial.write_text(json.dumps(summary, indent=2) + "\n")
         logger = self.parts.logger
         logger.images(figures.draw_all(self.output_dir, type(env)))
         filmed = self._film()

@@ -23,8 +23,9 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from hpamdp.config import Config, ConfigError, job_overrides
+from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, say
-from hpamdp.run.folder import locked
+from hpamdp.run.folder import check_no_link, locked
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
@@ -41,6 +42,7 @@ class SweepDir(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """Remember the sweep's folder."""
         SweepDir.path = Path(config.hydra.sweep.dir).absolute()
+        remove_link(SweepDir.path / "multirun.yaml")  # which Hydra writes
 
 
 @dataclass
@@ -68,14 +70,14 @@ class Records:
 
     def write(self, job: Job) -> None:
         """Save the state of a job."""
+        check_no_link(self._folder.parent)
         self._folder.mkdir(parents=True, exist_ok=True)
-        draft = self._folder / f"{job.number}.draft"
-        draft.write_text(json.dumps(asdict(job)))
-        draft.replace(self._folder / f"{job.number}.json")
+        with replacing(self._folder / f"{job.number}.json") as partial:
+            partial.write_text(json.dumps(asdict(job)))
 
     def read(self) -> list[Job]:
         """Return the jobs that have been started, in order."""
-        jobs = [Job(**json.loads(file.read_text())) for file in self._folder.glob("*.json")]
+        jobs = [Job(**json.loads(file.read_text())) for file in self._folder.glob("[0-9]*.json")]
         return sorted(jobs, key=lambda job: job.number)
 
     def remove(self) -> None:
@@ -116,8 +118,8 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
             folder.rmdir()  # Hydra made it; it stays if there is something in it
     except Exception as error:
         job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
-        with suppress(OSError):
-            (folder / "error.txt").write_text(traceback.format_exc())
+        with suppress(OSError), replacing(folder / "error.txt") as partial:
+            partial.write_text(traceback.format_exc())
     records.write(job)
     if job.state != _FINISHED:
         say(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}")
@@ -225,7 +227,8 @@ def report(start: str, error: BaseException | None = None) -> int:
         print(f"{job.overrides}: {job.reason} ({_shown(told if told.exists() else told.parent)})", file=sys.stderr)
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if not is_stopped:
-            (sweep_dir / "error.txt").write_text("".join(traceback.format_exception(error)))
+            with replacing(sweep_dir / "error.txt") as partial:
+                partial.write_text("".join(traceback.format_exception(error)))
             reason = one_line("".join(traceback.format_exception_only(error)))
             print(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})", file=sys.stderr)
         print(f"To go on: the same command with hydra.sweep.dir={_shown(sweep_dir)}")

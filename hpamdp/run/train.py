@@ -17,11 +17,12 @@ from tqdm import tqdm
 from hpamdp import keys
 from hpamdp.config import Config, ConfigError
 from hpamdp.env.base import ProblemError
+from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
 from hpamdp.run.collection.base import Collection, WorkerDiedError
-from hpamdp.run.folder import POLICY_NAME, check_unused
+from hpamdp.run.folder import POLICY_NAME, TENSORBOARD_NAME, WANDB_NAME, check_no_link, check_unused
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
@@ -78,9 +79,11 @@ def _run(
     may_overwrite: bool,
     tell: Callable[[str], None],
 ) -> int:
-    is_own = source is not None and source.resolve().parent == output_dir.resolve()
+    is_own = source is not None and source.parent.resolve() == output_dir.resolve()
     if not (may_overwrite or config.run.overwrite or is_own):
         check_unused(output_dir)
+    for name in (TENSORBOARD_NAME, WANDB_NAME):
+        check_no_link(output_dir / name)
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
     parts = assemble(config, output_dir)
@@ -92,7 +95,8 @@ def _run(
             if word.startswith(("total_frames=", "offline.updates=")) and config.run.mode != "eval":
                 check_more(word, trainer.frames, config.run.num_frames)
     output_dir.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(OmegaConf.create(config.to_dict()), output_dir / "config.yaml")
+    with replacing(output_dir / "config.yaml") as partial:
+        OmegaConf.save(OmegaConf.create(config.to_dict()), partial)
     is_interrupted = False
     if config.run.mode != "eval":
         try:

@@ -1,0 +1,118 @@
+"""What a run writes is whole or not there, and lies inside its folder, wherever links in it lead."""
+
+import os
+import shutil
+
+import pytest
+from conftest import compose_config
+
+from hpamdp.config import ConfigError
+from hpamdp.files import remove_link, replacing
+from hpamdp.run import play
+from hpamdp.run.folder import locked
+from hpamdp.run.metrics import MetricsFile
+from hpamdp.run.sweep import Job, Records
+from hpamdp.run.train import run
+
+TINY = ["low=hppo", "num_envs=4", "steps_per_batch=2", "eval.layouts=2", "eval.every=0", "log_every=8"]
+
+
+def outside_copies(folder, outside):
+    """Move every file of a folder outside and leave a soft or hard link in its place; return the bytes of each."""
+    outside.mkdir()
+    contents = {}
+    for i, file in enumerate(sorted(path for path in folder.iterdir() if path.is_file())):
+        target = outside / file.name
+        contents[target] = file.read_bytes()
+        shutil.move(file, target)
+        (os.symlink if i % 2 else os.link)(target, file)
+    return contents
+
+
+def test_a_run_never_writes_through_a_link_in_its_folder(tmp_path, with_figures):
+    folder = tmp_path / "run"
+    words = [*TINY, "total_frames=16", "film=true"]
+    assert run(compose_config(words), folder, words) == 0
+    names = {path.name for path in folder.iterdir()}
+    assert {"checkpoint.zip", "policy.pt", "config.yaml", "metrics.csv", "summary.json", "evaluation.npz"} < names
+    assert {"episodes.gif", "learning_curves.png"} < names
+    contents = outside_copies(folder, tmp_path / "outside")
+    os.link(tmp_path / "outside/summary.json", folder / ".lock")
+    os.symlink(tmp_path / "outside/summary.json", folder / "metrics.csv.previous")
+    words = [f"resume={folder}", "total_frames=32", "film=true"]
+    with locked(folder):
+        assert run(compose_config(words), folder, words) == 0
+    assert all(target.read_bytes() == data for target, data in contents.items())
+    assert {path.name for path in folder.iterdir()} == {*names, "metrics.csv.previous"}
+    assert not [path for path in folder.iterdir() if path.is_symlink() or path.stat().st_nlink > 1]
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "wandb"])
+def test_a_linked_folder_inside_a_run_is_refused_and_a_linked_run_is_not(name, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / name).symlink_to(tmp_path / "elsewhere")
+    words = [*TINY, "total_frames=8"]
+    with pytest.raises(ConfigError, match=rf"{name}: a link to .*elsewhere; a run writes to no linked folder"):
+        run(compose_config(words), folder, words)
+    if name == "wandb":
+        (tmp_path / "seed").symlink_to(tmp_path / "elsewhere")
+        assert run(compose_config(words), tmp_path / "seed", words) == 0
+        assert (tmp_path / "elsewhere/summary.json").is_file()
+
+
+def test_a_sweep_keeps_no_records_behind_a_link(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / ".sweep").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ConfigError, match="a link to"):
+        Records(tmp_path, "start").write(Job(0, "", "0"))
+
+
+def test_an_exported_page_replaces_links(tmp_path):
+    page = type("Page", (), {"folder": tmp_path / "page", "files": ["index.html"]})
+    page.folder.mkdir()
+    (page.folder / "index.html").write_text("new")
+    (tmp_path / "export").mkdir()
+    for name in ("index.html", play.DATA_NAME):
+        (tmp_path / f"own-{name}").write_text("own")
+        (tmp_path / "export" / name).symlink_to(tmp_path / f"own-{name}")
+    play.export(page, {}, tmp_path / "export")
+    assert (tmp_path / "export/index.html").read_text() == "new"
+    assert all((tmp_path / f"own-{name}").read_text() == "own" for name in ("index.html", play.DATA_NAME))
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_beside_it(tmp_path):
+    file = tmp_path / "a.txt"
+    file.write_text("old")
+    (tmp_path / ".a.txt.00ff.partial.txt").write_text("left by a kill")
+    with pytest.raises(OSError, match="full"), replacing(file) as partial:
+        partial.write_text("ne")
+        raise OSError("full")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "old")]
+    with replacing(file) as partial:
+        assert partial.suffix == ".txt"
+        partial.write_text("new")
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("a.txt", "new")]
+    assert file.stat().st_mode & 0o777 == 0o666 & ~_umask()
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_only_links_are_removed(tmp_path):
+    (tmp_path / "own").write_text("own")
+    (tmp_path / "dangling").symlink_to(tmp_path / "gone")
+    for name in ("own", "dangling", "missing"):
+        remove_link(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["own"]
+
+
+def test_metrics_that_are_no_file_are_not_read(tmp_path):
+    os.mkfifo(tmp_path / "metrics.csv")
+    metrics = MetricsFile(tmp_path / "metrics.csv", tmp_path / "metrics.csv")
+    metrics.append({"frames": 1.0})
+    assert metrics.rows() == [{"frames": 1.0}]
