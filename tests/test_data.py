@@ -1,18 +1,25 @@
 """What serves any recording: demonstrations, tables and memory-mapped files, and Minari."""
 
 import csv
+import re
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from conftest import make_config
 from gymnasium import spaces
 from tensordict import TensorDict
 
 from hpamdp import keys
+from hpamdp.config import ConfigError
 from hpamdp.data import export, minari
 from hpamdp.data.demonstrations import TRAJECTORY, Demonstrations, with_option_sums
 from hpamdp.data.errors import DataError
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.run.assemble import make_data, make_env
+from hpamdp.specs import PAMDPSpecs
 
 LAYOUT = minari.MinariLayout(discrete="tool", parameters="force", infos=("heat",))
 
@@ -120,6 +127,138 @@ def test_demonstrations_name_missing_keys_and_refuse_episodes_out_of_order():
         Demonstrations(rows.exclude(keys.DISCRETE, ("next", keys.REWARD)))
     with pytest.raises(DataError, match="must be in ascending order"):
         Demonstrations(rows.set(TRAJECTORY, torch.tensor([1, 1, 0, 0])))
+
+
+SPECS = PAMDPSpecs(2, (), (1, 1, 2), (0.0,) * 4, (1.0,) * 4)
+WITH_OPTIONS = replace(SPECS, option_names=("left", "right"), option_actions=((True, True, True), (False, False, True)))
+MASKED = replace(SPECS, has_action_mask=True)
+
+
+def spoilt(name, row, value, rows=None):
+    rows = episodes(2, 3) if rows is None else rows.clone()
+    rows[name][row] = value
+    return rows
+
+
+def with_option(*options):
+    return spoilt(keys.DISCRETE, slice(None), 2).set(keys.OPTION, torch.tensor(options))
+
+
+def masked(row, name=keys.ACTION_MASK):
+    mask = torch.ones(5, 3, dtype=torch.bool)
+    mask[row] = False
+    return episodes(2, 3).set(name, mask)
+
+
+@pytest.mark.parametrize(
+    ("rows", "specs", "said"),
+    [
+        (spoilt(keys.OBSERVATION, (3, 1), np.nan), SPECS, r"row 3: observation[1] is nan, but must be finite"),
+        (spoilt(("next", keys.OBSERVATION), (0, 0), np.inf), SPECS, "row 0: next.observation[0] is inf, but must be"),
+        (spoilt(("next", keys.REWARD), 4, np.nan), SPECS, "row 4: next.reward is nan, but must be finite"),
+        (spoilt(keys.PARAMETERS, (2, 3), np.nan), SPECS, "row 2: action.parameters[3] is nan, but must be finite"),
+        (
+            spoilt(keys.PARAMETERS, (2, 0), 1e6, spoilt(keys.DISCRETE, 2, 0)),
+            SPECS,
+            "row 2: action.parameters[0] is 1e+06, but must be 0 to 1",
+        ),
+        (
+            spoilt(keys.PARAMETERS, (2, 3), -0.5, spoilt(keys.DISCRETE, 2, 0)),
+            SPECS,
+            "row 2: action.parameters[3] is -0.5, but must be 0 to 1, or 0 as it is another action's",
+        ),
+        (spoilt(keys.DISCRETE, 1, 3), SPECS, "row 1: action.discrete is 3, but must be 0 to 2"),
+        (spoilt(keys.DISCRETE, 4, -1), SPECS, "row 4: action.discrete is -1, but must be 0 to 2"),
+        (spoilt(("next", keys.DONE), 0, True), SPECS, "row 0: next.done is true, but must be true if the row is term"),
+        (
+            spoilt(("next", keys.DONE), 2, True, spoilt(("next", keys.TERMINATED), 2, True)),
+            SPECS,
+            "row 2: next.done is true, but must be true in the last row of an episode, and only there",
+        ),
+        (spoilt(keys.IS_DECISION, 2, False), SPECS, "row 2: is_decision is false, but must be true in an episode's"),
+        (spoilt(("next", keys.IS_DECISION), 0, True), SPECS, "row 0: next.is_decision is true, but must be the same"),
+        (episodes(2).set(keys.OBSERVATION, torch.zeros(2, 3)), SPECS, "observation has 3 numbers a row, but the"),
+        (episodes(2).set(keys.PARAMETERS, torch.zeros(2, 9)), SPECS, "parameters has 9 numbers a row, but the"),
+        (episodes(2).set(keys.DISCRETE, torch.zeros(2)), SPECS, "discrete is float32 [N], but must be int64 [N]"),
+        (
+            episodes(2).set(("next", keys.REWARD), torch.zeros(2)),
+            SPECS,
+            "next.reward is float32 [N], but must be float32 [N, 1]",
+        ),
+        (episodes(2).set(keys.OBSERVATION, torch.zeros(2, 2).half()), SPECS, "float16 [N, 2], but must be float32 [N,"),
+        (episodes(2)[:0], SPECS, "shape [0], but must be [N], of at least one row"),
+        (dict(episodes(2)), SPECS, "of class dict, but must be a TensorDict"),
+        (episodes(2), WITH_OPTIONS, "lack option, which the agent chooses here, of left, right"),
+        (with_option(0, 1, 1, 1, 1), WITH_OPTIONS, "row 1: option is 1, but must be the same as in the row before"),
+        (with_option(0, 0, 2, 2, 2), WITH_OPTIONS, "row 2: option is 2, but must be 0 to 1"),
+        (
+            spoilt(keys.DISCRETE, 3, 1, with_option(0, 0, 1, 1, 1)),
+            WITH_OPTIONS,
+            "row 3: action.discrete is 1, but must be an action of the row's option",
+        ),
+        (masked(2), MASKED, "allowed by the row's action_mask"),
+        (masked(3, ("next", keys.ACTION_MASK)), MASKED, "row 3: next.action_mask[0] is false, but must be true for"),
+    ],
+)  # fmt: skip
+def test_a_wrong_value_in_a_data_set_is_told_with_its_row(rows, specs, said):
+    with pytest.raises(DataError) as refused:
+        Demonstrations(rows).check(specs)
+    assert said in str(refused.value) and "\n" not in str(refused.value)
+
+
+class OwnRows(Demonstrations):
+    """A data set of somebody's own, one of whose rows has a parameter that the environment does not have."""
+
+    def __init__(self, env: PAMDPEnv) -> None:
+        wide = episodes(2, 3)
+        short = wide.set(keys.PARAMETERS, wide[keys.PARAMETERS][:, : sum(env.parameter_dims)])
+        dim = env.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
+        for name in (keys.OBSERVATION, ("next", keys.OBSERVATION)):
+            short[name] = torch.zeros(5, dim)
+        super().__init__(spoilt(keys.PARAMETERS, (3, slice(None)), 1e6, short))
+
+
+class MissingRows(Demonstrations):
+    """A data set of somebody's own without any entry."""
+
+    def __init__(self) -> None:
+        super().__init__(TensorDict(batch_size=[3]))
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("OwnRows", "the transitions, row 3: action.parameters[2] is 1e+06, but must be 0 to 430"),
+        ("MissingRows", "the transitions lack collector.traj_ids, observation, "),
+    ],
+)
+def test_a_run_names_the_data_set_whose_rows_are_wrong(name, said):
+    config = make_config(["env=platform", "low=bc", "mode=offline", f"data._target_={__name__}.{name}"])
+    env = make_env(config, 1, torch.device("cpu"), 0)
+    with pytest.raises(ConfigError) as refused:
+        make_data(config, env, 1.0)
+    assert str(refused.value).startswith(f"data=none: {said}")
+
+
+def test_right_rows_pass_the_check():
+    Demonstrations(episodes(2, 3, 1)).check(SPECS)
+    Demonstrations(spoilt(keys.PARAMETERS, slice(None), 1.0 + 1e-6)).check(SPECS)  # rounding
+    Demonstrations(with_option(0, 0, 1, 1, 1)).check(WITH_OPTIONS)
+    Demonstrations(masked([])).check(MASKED)
+
+
+def test_wrong_decisions_are_told_with_their_row():
+    rows = with_option(0, 0, 1, 1, 1)
+    given = with_option_sums(rows)[rows["next", keys.DONE].squeeze(-1)]
+    Demonstrations(rows, decisions=given).check(WITH_OPTIONS)
+    for name, value, said in (
+        (keys.OPTION, 7, "row 1: option is 7, but must be 0 to 1"),
+        (("next", keys.OPTION_RETURN), np.inf, "row 1: next.option_return is inf, but must be finite"),
+        (("next", keys.OPTION_STEPS), 0, "row 1: next.option_steps is 0, but must be at least 1"),
+        (("next", keys.DECISION_OBSERVATION), np.nan, "row 1: next.decision_observation[0] is nan"),
+    ):
+        with pytest.raises(DataError, match=rf"^the decisions, {re.escape(said)}"):
+            Demonstrations(rows, decisions=spoilt(name, 1, value, given)).check(WITH_OPTIONS)
 
 
 def test_csv_gives_back_every_value(tmp_path):

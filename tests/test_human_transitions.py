@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
+import os
+import pickle
+import struct
 from pathlib import Path
 
 import pytest
@@ -207,6 +211,79 @@ def test_replay_buffer_made_once_is_found_again(path, tmp_path):
     assert found.data_path == made.data_path and len(found) == len(made)
     with pytest.raises(DataError, match="no such file"):
         HumanExperienceReplay(4, path="nowhere", root=tmp_path, checksum=checksum, complete=False)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: pickled(folder), "not of a plain TensorDict"),
+        (lambda folder: meta(folder, _type="<class 'tensordict.tensorclass.NonTensorData'>"), "not of a plain"),
+        (lambda folder: meta(folder, note={"type": "NonTensorData"}), "note is not described as a tensor of numbers"),
+        (lambda folder: meta(folder, **{"../up": {"type": "TensorDict"}}), "'../up' is no name of an entry"),
+        (lambda folder: meta(folder, shape=[10**12]), "reward has shape|observation has shape"),
+        (lambda folder: meta(folder, fuel=leaf("complex64")), "fuel is not described as a tensor of numbers"),
+        (lambda folder: (folder / "meta.json").write_text("[" * 99_999), "meta.json: no JSON"),
+        (lambda folder: (folder / "meta.json").unlink(), "No such file"),
+        (lambda folder: (folder / "fuel.memmap").unlink(), "fuel.memmap: No such file"),
+        (lambda folder: (folder / "fuel.memmap").write_bytes(b"1234"), "fuel.memmap: 4 bytes, but must have"),
+        (lambda folder: linked(folder / "fuel.memmap"), "fuel.memmap: is a link, but must be a regular file"),
+        (lambda folder: piped(folder / "fuel.memmap"), "is a named pipe, but must be a regular file"),
+        (lambda folder: linked(folder / "next"), "next: is a link"),
+        (lambda folder: zeros(folder / "next" / "done.memmap"), "row 0: next.done is false|next.done"),
+        (lambda folder: nan(folder / "observation.memmap"), r"row 0: observation\[0\] is nan, but must be finite"),
+    ],
+)
+def test_a_folder_of_rows_from_somebody_else_runs_nothing_and_is_refused_in_a_line(path, tmp_path, spoil, said):
+    checksum = hashlib.sha256(path.read_bytes()).hexdigest()
+    arguments = dict(path=path, root=tmp_path, checksum=checksum, best_people=1, successes=True)
+    folder = HumanExperienceReplay(4, **arguments).data_path
+    spoil(folder)
+    with pytest.raises(DataError, match=said) as refused:
+        HumanExperienceReplay(4, **arguments)
+    assert "\n" not in str(refused.value) and str(refused.value).endswith("and it is made again")
+    assert not Bomb.is_lit
+
+
+class Bomb:
+    """An object that runs code when it is unpickled."""
+
+    is_lit = False
+
+    def __reduce__(self):
+        return exec, ("import test_human_transitions; test_human_transitions.Bomb.is_lit = True",)
+
+
+def pickled(folder: Path) -> None:
+    """Put a pickled object in place of the rows, as `TensorDict.load_memmap` would read it."""
+    meta(folder, _type="<class 'tensordict.tensorclass.NonTensorData'>", _non_tensordict_keys=["data"])
+    (folder / "other.pickle").write_bytes(pickle.dumps({"data": Bomb()}))
+
+
+def meta(folder: Path, **changes: object) -> None:
+    file = folder / "meta.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def leaf(dtype: str) -> dict[str, object]:
+    return {"device": "cpu", "shape": [1, 1], "dtype": f"torch.{dtype}", "is_nested": False}
+
+
+def linked(file: Path) -> None:
+    file.rename(file.with_name("elsewhere"))
+    file.symlink_to("elsewhere")
+
+
+def piped(file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
+def zeros(file: Path) -> None:
+    file.write_bytes(bytes(file.stat().st_size))
+
+
+def nan(file: Path) -> None:
+    file.write_bytes(struct.pack("<f", float("nan")) + file.read_bytes()[4:])
 
 
 def test_replay_buffer_samples_whole_episodes_and_slices(path, tmp_path, data):

@@ -2,38 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
+from hpamdp.data.checks import TRAJECTORY, check_actions, check_decisions, check_options, check_transitions
 from hpamdp.data.errors import DataError
-
-TRAJECTORY = ("collector", "traj_ids")  # the number of a row's episode, where TorchRL's collectors write it
-
-_REQUIRED = (
-    TRAJECTORY,
-    keys.OBSERVATION,
-    keys.DISCRETE,
-    keys.PARAMETERS,
-    keys.IS_DECISION,
-    ("next", keys.OBSERVATION),
-    ("next", keys.REWARD),
-    ("next", keys.DONE),
-    ("next", keys.TERMINATED),
-    ("next", keys.TRUNCATED),
-    ("next", keys.IS_DECISION),
-)
-_REQUIRED_DECISIONS = (
-    keys.OPTION,
-    ("next", keys.DECISION_OBSERVATION),
-    ("next", keys.OPTION_RETURN),
-    ("next", keys.OPTION_STEPS),
-    ("next", keys.OBSERVATION),
-    ("next", keys.DONE),
-    ("next", keys.IS_DECISION),
-)
+from hpamdp.specs import PAMDPSpecs
 
 
 class Demonstrations:
@@ -41,12 +16,14 @@ class Demonstrations:
 
     For a recording of your own, write a subclass and choose it in `conf/data`. Its constructor takes the environment
     as `env`, beside the options of its yaml, and passes its transitions to this one. Options last a whole episode.
+    Values are checked here; a run then holds them against its environment, with `check`.
 
     Args:
         transitions: `[M]`, one episode after another, with ascending episode numbers under `TRAJECTORY`. At the root
             `observation`, the action leaves, `is_decision` and, where the agent chooses options, `option`; under
             `next` `observation`, `reward`, `done`, `terminated`, `truncated` and `is_decision`; shapes and types are
-            the environment's.
+            the environment's. The last row of each episode is `done`, and no other row. Parameters of discrete actions
+            that a row does not take may be 0. `action_mask` and `option_mask` may be there, too.
         device: where the tensors are kept.
         decisions: `[K]`, for selectors, where more is known of what the options earned than the transitions show: at
             the root `option`, under `next` `decision_observation`, `option_return`, `option_steps`, `observation`,
@@ -57,7 +34,7 @@ class Demonstrations:
         decisions: `[1, K]` or None.
 
     Raises:
-        DataError: a key is missing, or the episodes are out of order.
+        DataError: a key is missing, the episodes are out of order, or a value is wrong; the message names its row.
     """
 
     batch: TensorDict
@@ -66,14 +43,22 @@ class Demonstrations:
     def __init__(
         self, transitions: TensorDict, device: torch.device | None = None, *, decisions: TensorDict | None = None
     ) -> None:
-        _check_keys("transitions", transitions, _REQUIRED)
-        if (transitions[TRAJECTORY].diff() < 0).any():
-            raise DataError(f"the transitions' episode numbers ({_dotted(TRAJECTORY)}) must be in ascending order")
+        check_transitions(transitions)
         self.batch = _batch(with_option_sums(transitions), device)
         self.decisions = None
         if decisions is not None:
-            _check_keys("decisions", decisions, _REQUIRED_DECISIONS)
+            check_decisions(decisions)
             self.decisions = _batch(decisions, device)
+
+    def check(self, specs: PAMDPSpecs) -> None:
+        """Check that every row could be of an environment with these specs.
+
+        Raises:
+            DataError: with the first row that could not.
+        """
+        check_actions(self.batch.squeeze(0), specs)
+        if self.decisions is not None and specs.num_options:
+            check_options("the decisions", self.decisions.squeeze(0), specs)
 
     def discount(self, gamma: float) -> None:
         """Discount the option returns by `gamma` a step, as a selector asks for.
@@ -88,20 +73,9 @@ class Demonstrations:
         self.batch = with_option_sums(self.batch.squeeze(0), gamma).unsqueeze(0)
 
 
-def _check_keys(what: str, rows: TensorDict, required: Sequence[str | tuple[str, str]]) -> None:
-    present = set(rows.keys(True, True))
-    missing = [name for name in required if name not in present]
-    if missing:
-        raise DataError(f"the {what} lack {', '.join(map(_dotted, missing))}")
-
-
 def _batch(rows: TensorDict, device: torch.device | None) -> TensorDict:
     batch = rows.unsqueeze(0)
     return batch if device is None else batch.to(device)
-
-
-def _dotted(name: str | tuple[str, ...]) -> str:
-    return name if isinstance(name, str) else ".".join(name)
 
 
 def with_option_sums(transitions: TensorDict, gamma: float = 1.0) -> TensorDict:

@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data.demonstrations import TRAJECTORY
+from hpamdp.data.checks import TRAJECTORY
 from hpamdp.data.errors import DataError
 
 if TYPE_CHECKING:

@@ -196,10 +196,18 @@ def _learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:
 
 
 def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | None:
-    """Build the data set, if there is one, with option returns that are discounted by the selector's `gamma`."""
-    demonstrations: Demonstrations | None = config.data.build(env=env)
-    if demonstrations is None:
-        return None
+    """Build the data set, if there is one, with option returns that are discounted by the selector's `gamma`.
+
+    Raises:
+        ConfigError: the data set cannot be read, has a wrong value, or its returns cannot be discounted.
+    """
+    try:
+        demonstrations: Demonstrations | None = config.data.build(env=env)
+        if demonstrations is None:
+            return None
+        demonstrations.check(PAMDPSpecs.from_env(env))
+    except DataError as error:
+        raise ConfigError(f"{config.data}: {first_line(error)}") from error
     try:
         demonstrations.discount(gamma)
     except DataError as error:

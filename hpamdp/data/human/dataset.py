@@ -14,13 +14,16 @@ from torchrl.data import ImmutableDatasetWriter, SliceSampler, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers import Sampler
 
-from hpamdp.data.demonstrations import TRAJECTORY
+from hpamdp.data import memmap
+from hpamdp.data.checks import TRAJECTORY, check_actions, check_transitions
 from hpamdp.data.errors import DataError
 from hpamdp.data.export import write_memmap
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.released_file import SHA256, default_path, load_bytes, read
 from hpamdp.data.human.transitions import transitions
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.episode import MAX_PRESSES, ObservationForm, RewardForm
+from hpamdp.specs import PAMDPSpecs
 
 _FORMAT = 1  # to be raised whenever the transitions of the same file change
 
@@ -57,7 +60,8 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         options: further arguments of TorchRL's TensorDictReplayBuffer.
 
     Raises:
-        DataError: the file is missing or not the right one, an argument is out of range, or no episode is left.
+        DataError: the file is missing or not the right one, an argument is out of range, no episode is left, or `root`
+            has files that are not those rows.
     """
 
     def __init__(
@@ -106,7 +110,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
                 if not self._is_downloaded():  # otherwise another process was faster
                     raise
         super().__init__(
-            storage=TensorStorage(TensorDict.load_memmap(self.data_path)),
+            storage=TensorStorage(self._checked_rows(reward, observation, has_choice)),
             sampler=sampler,
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
@@ -123,6 +127,18 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
     def data_path(self) -> Path:
         """Folder of this data set's files."""
         return self.root / self._name
+
+    def _checked_rows(self, reward: RewardForm, observation: ObservationForm, has_choice: bool) -> TensorDict:
+        """Return the rows of the files, which may be somebody else's."""
+        controller = "choose" if has_choice else "random"
+        env = BoatDockEnv(1, controller=controller, reward=reward, observation=observation)
+        try:
+            rows = memmap.load(self.data_path)
+            check_transitions(rows)
+            check_actions(rows, PAMDPSpecs.from_env(env))
+        except DataError as error:
+            raise DataError(f"{error}; remove {self.data_path}, and it is made again") from error
+        return rows
 
     def _is_downloaded(self) -> bool:
         return self.data_path.exists()

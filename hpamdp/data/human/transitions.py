@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.data.demonstrations import TRAJECTORY
+from hpamdp.data.checks import TRAJECTORY
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FRAMES_PER_SECOND, HumanData
 from hpamdp.env import counter_rng

@@ -1,0 +1,263 @@
+"""The values of a data set, checked before anything learns from them; the error names the first wrong row.
+
+`check_transitions` and `check_decisions` need no environment: form, finite numbers, and flags that fit together.
+`check_actions` and `check_options` hold the rows against the environment at hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.data.errors import DataError
+from hpamdp.specs import PAMDPSpecs
+
+TRAJECTORY = ("collector", "traj_ids")  # the number of a row's episode, where TorchRL's collectors write it
+
+_Key = str | tuple[str, ...]
+_FLOAT, _INT, _BOOL = torch.float32, torch.int64, torch.bool
+# The type of each entry, and how its shape goes on after the number of rows; None: any length.
+_TRANSITIONS: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
+    TRAJECTORY: (_INT, ()),
+    keys.OBSERVATION: (_FLOAT, (None,)),
+    keys.DISCRETE: (_INT, ()),
+    keys.PARAMETERS: (_FLOAT, (None,)),
+    keys.IS_DECISION: (_BOOL, (1,)),
+    ("next", keys.OBSERVATION): (_FLOAT, (None,)),
+    ("next", keys.REWARD): (_FLOAT, (1,)),
+    ("next", keys.DONE): (_BOOL, (1,)),
+    ("next", keys.TERMINATED): (_BOOL, (1,)),
+    ("next", keys.TRUNCATED): (_BOOL, (1,)),
+    ("next", keys.IS_DECISION): (_BOOL, (1,)),
+}
+_DECISIONS: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
+    keys.OPTION: (_INT, ()),
+    ("next", keys.DECISION_OBSERVATION): (_FLOAT, (None,)),
+    ("next", keys.OPTION_RETURN): (_FLOAT, (1,)),
+    ("next", keys.OPTION_STEPS): (_INT, (1,)),
+    ("next", keys.OBSERVATION): (_FLOAT, (None,)),
+    ("next", keys.DONE): (_BOOL, (1,)),
+    ("next", keys.IS_DECISION): (_BOOL, (1,)),
+}
+_OPTIONAL: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
+    keys.OPTION: (_INT, ()),
+    keys.ACTION_MASK: (_BOOL, (None,)),
+    ("next", keys.ACTION_MASK): (_BOOL, (None,)),
+    keys.OPTION_MASK: (_BOOL, (None,)),
+    ("next", keys.OPTION_MASK): (_BOOL, (None,)),
+}
+_OBSERVATIONS: tuple[_Key, ...] = (
+    keys.OBSERVATION,
+    ("next", keys.OBSERVATION),
+    ("next", keys.DECISION_OBSERVATION),
+)
+
+
+class _Rule(NamedTuple):
+    """What an entry of every row must be.
+
+    Attributes:
+        entry: its name.
+        holds: bool, of the entry's shape or `[N]`.
+        allowed: in words, or one text for each number of a row.
+    """
+
+    entry: _Key
+    holds: Tensor
+    allowed: str | Sequence[str]
+
+
+def check_transitions(rows: TensorDict) -> None:
+    """Check transitions `[N]` that stand for themselves; `Demonstrations` has the contract.
+
+    Raises:
+        DataError: an entry is missing or has another shape or type, or a row breaks a rule.
+    """
+    what = "the transitions"
+    _check_form(what, rows, _TRANSITIONS)
+    episode = rows[TRAJECTORY]
+    if (episode.diff() < 0).any():
+        raise DataError(f"{what}' episode numbers ({_dotted(TRAJECTORY)}) must be in ascending order")
+    _check_rules(what, rows, _transition_rules(rows))
+
+
+def check_decisions(rows: TensorDict) -> None:
+    """Check decisions `[K]` that stand for themselves; `Demonstrations` has the contract.
+
+    Raises:
+        DataError: an entry is missing or has another shape or type, or a row breaks a rule.
+    """
+    _check_form("the decisions", rows, _DECISIONS)
+    _check_rules("the decisions", rows, _decision_rules(rows))
+
+
+def check_actions(rows: TensorDictBase, specs: PAMDPSpecs) -> None:
+    """Check that transitions `[N]`, already checked by themselves, are those of an environment.
+
+    Raises:
+        DataError: the observation or the parameters have another length, or a row has an action or an option that the
+            environment does not have, or forbids.
+    """
+    what = "the transitions"
+    _check_length(what, rows, keys.PARAMETERS, specs.num_parameters)
+    _check_lengths(what, rows, specs)
+    _check_rules(what, rows, _action_rules(rows, specs))
+    if specs.num_options:
+        check_options(what, rows, specs)
+
+
+def check_options(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
+    """Check that rows `[N]` with options, already checked by themselves, are those of an environment.
+
+    Raises:
+        DataError: an observation has another length, there are no options, or a row has one that does not exist.
+    """
+    if keys.OPTION not in rows.keys():
+        names = ", ".join(specs.option_names)
+        raise DataError(f"{what} lack {keys.OPTION}, which the agent chooses here, of {names}")
+    _check_lengths(what, rows, specs)
+    _check_rules(what, rows, _option_rules(rows, specs))
+
+
+def _check_form(what: str, rows: TensorDict, required: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]]) -> None:
+    """Check the names, shapes and types of the entries."""
+    if not isinstance(rows, TensorDictBase):
+        raise DataError(f"{what} are of class {type(rows).__name__}, but must be a TensorDict")
+    if rows.ndim != 1 or not len(rows):
+        raise DataError(f"{what} have shape {list(rows.shape)}, but must be [N], of at least one row")
+    present = set(rows.keys(True, True))
+    missing = [name for name in required if name not in present]
+    if missing:
+        raise DataError(f"{what} lack {', '.join(map(_dotted, missing))}")
+    optional = {name: form for name, form in _OPTIONAL.items() if name in present}
+    for name, (dtype, rest) in {**optional, **required}.items():
+        value = rows.get(name)
+        if not isinstance(value, Tensor) or value.layout != torch.strided:
+            raise DataError(f"{what}' {_dotted(name)} is of class {type(value).__name__}, but must be a tensor")
+        shape = tuple(value.shape[1:])
+        fits = len(shape) == len(rest) and all(size in (None, own) for size, own in zip(rest, shape, strict=True))
+        if value.dtype != dtype or not fits:
+            wanted = ", ".join(["N", *("D" if size is None else str(size) for size in rest)])
+            found = ", ".join(["N", *map(str, shape)])
+            raise DataError(
+                f"{what}' {_dotted(name)} is {_named(value.dtype)} [{found}], but must be {_named(dtype)} [{wanted}]"
+            )
+
+
+def _check_length(what: str, rows: TensorDictBase, name: _Key, length: int) -> None:
+    found = rows.get(name).shape[-1]
+    if found != length:
+        raise DataError(f"{what}' {_dotted(name)} has {found} numbers a row, but the environment's has {length}")
+
+
+def _check_lengths(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
+    present = set(rows.keys(True, True))
+    for name in _OBSERVATIONS:
+        if name in present:
+            _check_length(what, rows, name, specs.observation_dim)
+    for mask, length in ((keys.ACTION_MASK, specs.num_discrete), (keys.OPTION_MASK, specs.num_options)):
+        for name in (mask, ("next", mask)):
+            if length and name in present:
+                _check_length(what, rows, name, length)
+
+
+def _check_rules(what: str, rows: TensorDictBase, rules: Iterator[_Rule]) -> None:
+    for rule in rules:
+        if not rule.holds.all():
+            row, *place = (~rule.holds).nonzero()[0].tolist()
+            value = rows.get(rule.entry)[row]
+            allowed = rule.allowed if isinstance(rule.allowed, str) else rule.allowed[place[0]]
+            index = ""
+            if value.numel() > 1:
+                value, index = value[place[0]], f"[{place[0]}]"
+            entry = f"{_dotted(rule.entry)}{index}"
+            raise DataError(f"{what}, row {row}: {entry} is {_shown(value.item())}, but must be {allowed}")
+
+
+def _shown(value: float) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value).lower()
+
+
+def _transition_rules(rows: TensorDict) -> Iterator[_Rule]:
+    yield from _finite(rows, keys.OBSERVATION, keys.PARAMETERS, ("next", keys.OBSERVATION), ("next", keys.REWARD))
+    episode = rows[TRAJECTORY]
+    changes = episode[1:] != episode[:-1]
+    edge = changes.new_ones(1)
+    is_first, is_last = torch.cat([edge, changes]).unsqueeze(-1), torch.cat([changes, edge]).unsqueeze(-1)
+    done, terminated, truncated = (rows["next", name] for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED))
+    yield _Rule(
+        ("next", keys.DONE),
+        done == (terminated | truncated),
+        f"true if the row is {keys.TERMINATED} or {keys.TRUNCATED}, and only then",
+    )
+    yield _Rule(("next", keys.DONE), done == is_last, "true in the last row of an episode, and only there")
+    yield _Rule(keys.IS_DECISION, rows[keys.IS_DECISION] == is_first, "true in an episode's first row, and only there")
+    yield _Rule(("next", keys.IS_DECISION), rows["next", keys.IS_DECISION] == done, "the same as next.done")
+    if keys.OPTION in rows.keys():
+        option = rows[keys.OPTION]
+        is_kept = torch.cat([edge, (option[1:] == option[:-1]) | changes])
+        yield _Rule(keys.OPTION, is_kept, "the same as in the row before, of the same episode")
+
+
+def _decision_rules(rows: TensorDict) -> Iterator[_Rule]:
+    yield from _finite(rows, *(("next", name) for name in (keys.DECISION_OBSERVATION, keys.OBSERVATION)))
+    yield from _finite(rows, ("next", keys.OPTION_RETURN))
+    yield _Rule(("next", keys.OPTION_STEPS), rows["next", keys.OPTION_STEPS] >= 1, "at least 1")
+    yield _Rule(("next", keys.IS_DECISION), rows["next", keys.IS_DECISION], "true")
+
+
+def _finite(rows: TensorDict, *names: _Key) -> Iterator[_Rule]:
+    for name in names:
+        yield _Rule(name, rows.get(name).isfinite(), "finite")
+
+
+def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
+    discrete = rows.get(keys.DISCRETE)
+    yield _Rule(keys.DISCRETE, _is_below(discrete, specs.num_discrete), f"0 to {specs.num_discrete - 1}")
+    parameters = rows.get(keys.PARAMETERS)
+    low, high = parameters.new_tensor(specs.parameter_low), parameters.new_tensor(specs.parameter_high)
+    is_own = specs.parameter_owner.to(discrete.device) == discrete.unsqueeze(-1)
+    slack = 1e-5 * (high - low)  # of rounding
+    is_inside = (parameters >= low - slack) & (parameters <= high + slack)
+    bounds = [f"{low:.6g} to {high:.6g}" for low, high in zip(specs.parameter_low, specs.parameter_high, strict=True)]
+    yield _Rule(keys.PARAMETERS, is_inside | ~is_own, bounds)
+    # Other actions' parameters do not count, so recordings fill them with zeros.
+    is_filled = is_inside | is_own | (parameters == 0.0)
+    yield _Rule(keys.PARAMETERS, is_filled, [f"{each}, or 0 as it is another action's" for each in bounds])
+    if specs.has_action_mask and keys.ACTION_MASK in rows.keys():
+        allowed = rows.get(keys.ACTION_MASK).gather(-1, discrete.unsqueeze(-1))
+        yield _Rule(keys.DISCRETE, allowed, f"allowed by the row's {keys.ACTION_MASK}")
+    if specs.has_action_mask and ("next", keys.ACTION_MASK) in rows.keys(True, True):
+        mask = rows.get(("next", keys.ACTION_MASK))
+        has_one = mask.any(-1, keepdim=True) | rows.get(("next", keys.TERMINATED))
+        yield _Rule(("next", keys.ACTION_MASK), has_one.expand_as(mask), "true for at least one action")
+
+
+def _option_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
+    option = rows.get(keys.OPTION)
+    yield _Rule(keys.OPTION, _is_below(option, specs.num_options), f"0 to {specs.num_options - 1}")
+    if specs.option_actions is not None and keys.DISCRETE in rows.keys(True, True):
+        of_options = torch.tensor(specs.option_actions, device=option.device)
+        allowed = of_options[option].gather(-1, rows.get(keys.DISCRETE).unsqueeze(-1))
+        yield _Rule(keys.DISCRETE, allowed, "an action of the row's option")
+    if specs.has_option_mask and keys.OPTION_MASK in rows.keys():
+        is_free = rows.get(keys.OPTION_MASK).gather(-1, option.unsqueeze(-1))
+        is_decision = rows.get(keys.IS_DECISION, torch.ones_like(is_free))
+        yield _Rule(keys.OPTION, is_free | ~is_decision, f"allowed by the row's {keys.OPTION_MASK}")
+
+
+def _is_below(numbers: Tensor, count: int) -> Tensor:
+    return (numbers >= 0) & (numbers < count)
+
+
+def _named(dtype: torch.dtype) -> str:
+    return str(dtype).removeprefix("torch.")
+
+
+def _dotted(name: str | Sequence[str]) -> str:
+    return name if isinstance(name, str) else ".".join(name)
