@@ -536,11 +536,43 @@ def test_nothing_is_planned_before_the_first_update_or_for_finished_episodes(mon
     assert asked == [5]
 
 
-def test_actions_are_random_as_long_as_all_rewards_are_the_same():
+@pytest.mark.parametrize("value", [-1.0, 0.0, 1.0])
+def test_actions_are_random_only_while_neither_rewards_nor_terminations_differ(value):
+    same = {"reward": torch.full((64,), value), "terminated": torch.zeros(64, dtype=torch.bool)}
+    for changes in ({"reward": torch.arange(64.0)}, {"terminated": torch.arange(64) == 3}):
+        learner = make(buffer_size=64)
+        for batch, is_trained in (({}, False), (changes, True), ({}, True)):
+            learn(learner, random_batch(64, **{**same, **batch}))
+            assert bool(learner.policy.is_trained) == is_trained
+
+
+def test_while_nothing_is_planned_the_value_is_that_of_the_one_known_reward():
     learner = make()
-    for reward, is_trained in ((torch.zeros(64), False), (torch.arange(64.0), True)):
-        learn(learner, random_batch(64, reward=reward))
-        assert bool(learner.policy.is_trained) == is_trained
+    learn(learner, random_batch(64, reward=-torch.ones(64), terminated=torch.zeros(64, dtype=torch.bool)))
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert learner.value(torch.randn(3, 4)).tolist() == pytest.approx([-1.97] * 3)
+    assert learner.value(torch.randn(3, 4)).tolist() == [torch.inf] * 3
+
+
+@pytest.mark.parametrize(("reward", "is_good"), [(1.0, False), (-1.0, True)])
+def test_it_plans_to_survive_or_to_reach_an_end_although_every_reward_is_the_same(reward, is_good):
+    """Action 1 ends the episode if its first parameter is above the state's first entry; nothing else does."""
+    torch.manual_seed(0)
+    learner = make(warmup_frames=64, lr=5e-3)
+
+    def play(state):
+        td = learner.policy(TensorDict({keys.OBSERVATION: state}, [len(state)]))
+        unit = SPECS.to_unit(td[keys.PARAMETERS])
+        ends = (td[keys.DISCRETE] == 1) & (unit[:, 1] > state[:, 0])
+        after = torch.rand(len(state), 4) * 2 - 1
+        return batch_of(state, td[keys.DISCRETE], unit, torch.full((len(state),), reward), after, ends), ends
+
+    for _ in range(12):
+        batch, _ = play(torch.rand(20, 4) * 2 - 1)
+        learn(learner, batch)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        _, ends = play(torch.rand(200, 4) * 2 - 1)
+    assert (ends == is_good).float().mean() > 0.95, "random actions end one episode in six"
 
 
 @pytest.mark.parametrize(

@@ -382,8 +382,8 @@ def _scale_of(rows: Tensor) -> Tensor:
 class PETSPolicy(TensorDictModuleBase):
     """The first action of a plan; exploring, of one with the member that the environment follows in this episode.
 
-    Acts uniformly at random until the model has been trained on different rewards. Nothing is planned for finished
-    episodes: their action is random, too, and is ignored.
+    Acts uniformly at random until the stored steps differ in their rewards or in whether they terminate: before, all
+    plans are alike. Nothing is planned for finished episodes: their action is random, too, and is ignored.
     """
 
     is_trained: Tensor
@@ -469,11 +469,12 @@ class PETSPolicy(TensorDictModuleBase):
 
         Greedily that is by the mean of all members, and `caution`; exploring by posterior sampling, by a random member
         for each observation, or else by the mean and `optimism`, so that what members disagree on is tried. As long as
-        nothing is planned, it is 0, and exploring infinite.
+        nothing is planned, the value is that of the one known reward at every step, and infinite if exploring.
         """
         num = len(observation)
         if not bool(self.is_trained):
-            return torch.full((num,), 0.0 if is_greedy() else torch.inf, device=observation.device)
+            known = self.model.reward_mean[0] * sum(self.gamma**h for h in range(self.search.horizon))
+            return known.expand(num) if is_greedy() else torch.full_like(observation[:, 0], torch.inf)
         member = torch.randint(self.model.num_members, (num,), device=observation.device)
         allowed = self._allowed(observation, action_mask)
         return self.plan(observation[:, self.entries], member if self._follows_member else None, allowed).value
@@ -739,12 +740,12 @@ class PETS(ReplayLearner):
         return self.end_values.of_own(observation[..., self.entries])
 
     def explore(self, frames: int) -> None:
-        """Let the policy plan, as soon as there are different rewards, or end values, to plan for."""
-        if self.end_values is None:
-            reward = self.buffer[:]["reward"]
-            self.policy.is_trained.fill_(bool((reward != reward[0]).any()))
-        else:
-            self.policy.is_trained.fill_(True)
+        """Let the policy plan, from when there are different rewards, terminations or end values to plan for."""
+        if self.policy.is_trained:  # later data may be alike because the plans are good
+            return
+        stored = self.buffer[:]
+        differ = [(stored[name] != stored[name][0]).any() for name in ("reward", "terminated")]
+        self.policy.is_trained.fill_(self.end_values is not None or bool(torch.stack(differ).any()))
 
     def updates_due(self, before: int, frames: int) -> int:
         """Return how many updates to make; the first ones make up for the warm-up."""
