@@ -237,6 +237,16 @@ def test_success_comes_from_the_infos():
     assert make(2).results(last)["success"].tolist() == [True, False]
 
 
+@pytest.mark.parametrize("value", [True, 1, np.bool_(True), np.float32(1.0), np.array(1), np.array([True])])
+def test_flags_may_be_of_any_kind_that_holds_true_and_false(value, monkeypatch):
+    env = make()
+    env.reset()
+    returned = (STEP[0], np.float16([0.5]), value, False, {"success": value})
+    monkeypatch.setattr(Toy, "step", lambda self, action: returned)
+    after = step(env)
+    assert after["success"].all() and after["terminated"].all() and after["reward"].item() == 0.5
+
+
 def test_closing_closes_every_copy():
     env = make(3)
     env.close()
@@ -316,9 +326,19 @@ STEP = (np.zeros(2), 0.5, False, False, {})
         ((STEP[0], None, *STEP[2:]), "step returned None as reward, which must be a number"),
         ((STEP[0], np.ones(2), *STEP[2:]), r"step returned array([1., 1.]) as reward, which must be a number"),
         ((STEP[0], "much", *STEP[2:]), "step returned 'much' as reward, which must be a number"),
+        ((STEP[0], 1j, *STEP[2:]), "step returned 1j as reward, which must be a number"),
+        ((STEP[0], 10**5000, *STEP[2:]), "step returned a value of type int as reward, which must be a number"),
         ((*STEP[:2], None, *STEP[3:]), "step returned None as terminated, which must be True or False"),
+        ((*STEP[:2], "False", *STEP[3:]), "step returned 'False' as terminated, which must be True or False"),
+        ((*STEP[:3], float("nan"), {}), "step returned nan as truncated, which must be True or False"),
+        ((*STEP[:3], 2, {}), "step returned 2 as truncated, which must be True or False"),
+        ((*STEP[:4], {"is_success": float("nan")}), "step returned nan as info['is_success'], which must be True or"),
+        ((*STEP[:4], {"is_success": None, "success": True}), "step returned None as info['is_success'], which must"),
+        ((*STEP[:4], {"success": "False"}), "step returned 'False' as info['success'], which must be True or False"),
+        ((*STEP[:4], {"success": np.ones(2)}), "step returned array([1., 1.]) as info['success'], which must be Tr"),
         ((*STEP[:4], None), "step returned None as info, which must be a dictionary"),
-        ((None, *STEP[1:]), "gave an observation of 1 values, but its space has 2"),
+        ((None, *STEP[1:]), "gave an observation whose value is None, not numbers that NumPy can hold"),
+        ((np.zeros((2, 1)), *STEP[1:]), "gave an observation whose value has shape (2, 1), but its space has (2,)"),
         (("here", *STEP[1:]), "gave an observation whose value is 'here', not numbers"),
     ],
 )

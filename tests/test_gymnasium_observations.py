@@ -25,7 +25,11 @@ def test_observations_of_nested_spaces_are_one_vector():
 
 @pytest.mark.parametrize(
     ("kwargs", "complaint"),
-    [({"size": 1}, "1 values, but its space has 2"), ({"value": float("nan")}, "that is not finite")],
+    [
+        ({"size": 1}, r"has shape \(1,\), but its space has \(2,\)"),
+        ({"value": float("nan")}, "value is nan at index 0, which is not finite"),
+        ({"value": -1.0}, r"value is -1 at index 1, outside its bounds 0 to inf; env.out_of_bounds=clip moves"),
+    ],
 )
 def test_an_observation_that_does_not_fit_its_space_is_refused(kwargs, complaint):
     env = GymnasiumEnv(entry_point="toy_environments:Wrong", kwargs=kwargs, max_steps=5)

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
-import numpy as np
 
 from hpamdp.env.base import ProblemError
+from hpamdp.env.gymnasium.values import flag, number, shown
 from hpamdp.messages import one_line
 
 
@@ -47,30 +47,22 @@ class ContractCheck(gymnasium.Wrapper):
             raise ProblemError(f"step returned {given}, not observation, reward, terminated, truncated and info")
         observation, reward, terminated, truncated, info = values
         if not isinstance(info, Mapping):
-            raise ProblemError(f"step returned {info!r} as info, which must be a dictionary")
-        return observation, _number(reward), _flag("terminated", terminated), _flag("truncated", truncated), dict(info)
+            raise ProblemError(f"step returned {shown(info)} as info, which must be a dictionary")
+        return (
+            observation,
+            number("reward", reward),
+            flag("terminated", terminated),
+            flag("truncated", truncated),
+            dict(info),
+        )
 
 
 def checked(env: gymnasium.Env) -> gymnasium.Env:
-    """Put a ContractCheck around the environment, inside Gymnasium's wrappers, which unpack what it returns."""
+    """Put a ContractCheck around the environment and, inside its wrappers, around what they unpack the values of."""
     outer = env
     while isinstance(outer, gymnasium.Wrapper):
         if not isinstance(outer.env, gymnasium.Wrapper):
             outer.env = ContractCheck(outer.env)
-            return env
+            break
         outer = outer.env
     return ContractCheck(env)
-
-
-def _number(reward: Any) -> float:
-    number = np.asarray(reward)
-    if number.size != 1 or number.dtype.kind not in "fiub":
-        raise ProblemError(f"step returned {reward!r} as reward, which must be a number")
-    return float(number.item())
-
-
-def _flag(name: str, value: Any) -> bool:
-    flag = np.asarray(value)
-    if flag.size != 1 or flag.dtype.kind not in "biu":
-        raise ProblemError(f"step returned {value!r} as {name}, which must be True or False")
-    return bool(flag.item())

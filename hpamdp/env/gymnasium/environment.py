@@ -22,10 +22,14 @@ from hpamdp.env.base import PAMDPEnv, ProblemError
 from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import checked
 from hpamdp.env.gymnasium.four_value import FourValueEnv
+from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
+from hpamdp.env.gymnasium.values import as_numbers, flag, shown
 from hpamdp.messages import one_line
 
 _SUCCESS = "success"
+# Of an info, the first one counts.
+_SUCCESS_ENTRIES = ("is_success", "success")
 _SEED = "seed"
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
@@ -60,6 +64,8 @@ class GymnasiumEnv(PAMDPEnv):
         observation_keys: of a `Tuple` (numbers from 0) or `Dict` (names) of observations, the entries to keep, in this
             order; None: all but masks.
         observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
+        out_of_bounds: what becomes of observed numbers outside the bounds of their `Box`: `refuse` ends the run,
+            `clip` moves them to the bound, `allow` keeps them.
         device: of the tensors.
         seed: of the episodes, see above.
         first_env: number of the first copy, where other processes have the copies before it.
@@ -84,6 +90,7 @@ class GymnasiumEnv(PAMDPEnv):
         action_mask: Literal["info", "ignore"] | None = None,
         observation_keys: list[int | str] | None = None,
         observation_scaling: Scaling = "bounds",
+        out_of_bounds: OutOfBounds = "refuse",
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
@@ -107,7 +114,9 @@ class GymnasiumEnv(PAMDPEnv):
             if self._mask_source == "observation" and observation_keys is None:
                 space = self.envs[0].observation_space
                 observation_keys = [name for name in getattr(space, "spaces", {}) if name not in self._masks]
-            self.observations = ObservationSpace(self.envs[0].observation_space, observation_scaling, observation_keys)
+            self.observations = ObservationSpace(
+                self.envs[0].observation_space, observation_scaling, observation_keys, out_of_bounds
+            )
         except ValueError as error:
             raise ValueError(f"{self._name}: {error}") from error
         self.parameter_dims = self._actions.parameter_dims
@@ -252,10 +261,9 @@ class GymnasiumEnv(PAMDPEnv):
             if given is None and name == keys.OPTION_MASK:
                 masks[row] = True
                 continue
-            mask = np.asarray(given)
-            is_numbers = mask.shape == masks[row].shape and mask.dtype.kind in "iubf"
-            if not is_numbers or ((mask != 0) & (mask != 1)).any():
-                raise ProblemError(f"gave {given!r} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
+            mask = as_numbers(given)
+            if mask is None or mask.shape != masks[row].shape or ((mask != 0) & (mask != 1)).any():
+                raise ProblemError(f"gave {shown(given)} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
             masks[row] = mask != 0
 
     def _make_specs(self) -> None:
@@ -314,7 +322,7 @@ class GymnasiumEnv(PAMDPEnv):
             is_running &= np.isin(np.arange(self.num_envs), _rows(tensordict.get("_step")))
         rows = is_running.nonzero()[0].tolist()
         observations = []
-        rewards = np.zeros((self.num_envs, 1), np.float32)
+        rewards = np.zeros((self.num_envs, 1))
         for row in rows:
             action = self._actions.to_native(discrete[row], parameters[row])
             if options is not None:
@@ -323,14 +331,21 @@ class GymnasiumEnv(PAMDPEnv):
                 observation, reward, terminated, truncated, info = self.envs[row].step(action)
                 observations.append(self.observations.flat(observation))
                 self._keep_masks(row, observation, info)
+                succeeded = self._read_success(info)
             rewards[row] = reward
             self._terminated[row] = terminated
             self._truncated[row] = truncated and not terminated
-            success = info.get("is_success", info.get(_SUCCESS))
-            self._reports_success |= success is not None
-            self._success[row] = bool(success)
+            self._success[row] = succeeded
         self._keep(rows, observations)
-        return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device))
+        return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device, torch.float32))
+
+    def _read_success(self, info: Mapping[str, Any]) -> bool:
+        """Return what the info of a step says of success; False if it says nothing."""
+        for name in _SUCCESS_ENTRIES:
+            if name in info:
+                self._reports_success = True
+                return flag(f"info[{name!r}]", info[name])
+        return False
 
     def _read_options(self, tensordict: TensorDictBase) -> list[int] | None:
         """Return the options, checked; None where the environment itself has none."""

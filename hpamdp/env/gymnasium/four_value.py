@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.base import ProblemError
+from hpamdp.env.gymnasium.values import flag, shown
 
 _ADVICE = "an environment with Gymnasium's interface must inherit from gymnasium.Env"
 
@@ -61,14 +62,16 @@ class FourValueEnv(gymnasium.Env):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Take a step and split `done` into `terminated` and `truncated`."""
         values = self.env.step(action)
-        if len(values) != 4:
-            raise ProblemError(
-                f"FourValueEnv: step of {_kind(self.env)} returned {len(values)} values, not 4; {_ADVICE}"
-            )
+        if not isinstance(values, tuple | list) or len(values) != 4:
+            given = f"{len(values)} values" if isinstance(values, tuple | list) else type(values).__name__
+            raise ProblemError(f"FourValueEnv: step of {_kind(self.env)} returned {given}, not 4; {_ADVICE}")
         observation, reward, done, info = values
-        info = info or {}
-        is_truncated = bool(done) and bool(info.get("TimeLimit.truncated", False))
-        return observation, reward, bool(done) and not is_truncated, is_truncated, info
+        if not isinstance(info, Mapping | None):
+            raise ProblemError(f"step returned {shown(info)} as info, which must be a dictionary")
+        info = dict(info or {})
+        is_over = flag("done", done)
+        is_truncated = is_over and flag("info['TimeLimit.truncated']", info.get("TimeLimit.truncated", False))
+        return observation, reward, is_over and not is_truncated, is_truncated, info
 
     def render(self) -> Any:
         """Return what the environment's own `render` returns."""

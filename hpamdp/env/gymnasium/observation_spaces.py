@@ -6,18 +6,18 @@ Accepted are `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary` and `Tuple` and `
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatdim, flatten, flatten_space
+from gymnasium.spaces.utils import flatdim, flatten_space
 from gymnasium.wrappers.utils import RunningMeanStd
 from torch import Tensor
 
-from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.action_spaces import written
+from hpamdp.env.gymnasium.leaves import Leaf, OutOfBounds, children, leaves
 
 Scaling = Literal["bounds", "running", "none"]
 
@@ -35,27 +35,35 @@ class ObservationSpace:
             they are; `running` normalises to mean 0 and standard deviation 1 over all observations so far and clips to
             [-10, 10]; `none` changes nothing.
         entries: of a `Tuple` (numbers from 0) or `Dict` (names), the ones to keep, in this order; None: all.
+        out_of_bounds: what becomes of numbers of a `Box` outside its bounds: `refuse`, `clip` or `allow`; see `Leaf`.
 
     Attributes:
         dim: length of the vectors.
         statistics: of all observations so far, with `running`; else None.
 
     Raises:
-        ValueError: the space or the scaling is not accepted, or the space has no such entry.
+        ValueError: the space, the scaling or `out_of_bounds` is not accepted, or the space has no such entry.
     """
 
-    def __init__(self, space: spaces.Space, scaling: Scaling, entries: Sequence[int | str] | None = None) -> None:
+    def __init__(
+        self,
+        space: spaces.Space,
+        scaling: Scaling,
+        entries: Sequence[int | str] | None = None,
+        out_of_bounds: OutOfBounds = "refuse",
+    ) -> None:
         if scaling not in get_args(Scaling):
             raise ValueError(f"observation_scaling={scaling!r}, but must be one of {', '.join(get_args(Scaling))}")
         if not _is_flat(space):
             accepted = "Box, Discrete, MultiDiscrete, MultiBinary and Tuple and Dict of these"
             raise ValueError(f"observation space {written(space)}; accepted are {accepted}")
-        self._names = list(_children(space))
-        self._leaves = list(_leaves(space))
+        self._names = list(children(space))
+        self._leaves = list(leaves(space, out_of_bounds))
         if entries is not None:
             _check_entries(space, entries)
-            self._leaves = [(path, leaf) for entry in entries for path, leaf in self._leaves if path[0] == entry]
-        self._space = spaces.Tuple([leaf for _, leaf in self._leaves])
+            self._leaves = [leaf for entry in entries for leaf in self._leaves if leaf.path[0] == entry]
+        self._cures = [self._cure(leaf) for leaf in self._leaves]
+        self._space = spaces.Tuple([leaf.space for leaf in self._leaves])
         self.dim = flatdim(self._space)
         self.statistics = RunningStatistics(self.dim) if scaling == "running" else None
         self._is_frozen = False
@@ -69,40 +77,26 @@ class ObservationSpace:
         assert isinstance(box, spaces.Box)  # as are all spaces that `_is_flat` lets pass
         low = box.low.astype(np.float64)
         high = box.high.astype(np.float64)
-        with np.errstate(over="ignore"):
-            is_bounded = (high - low > 0.0) & (high - low <= _WIDEST)
-            self._centre = np.where(is_bounded, 0.5 * low + 0.5 * high, 0.0)
-            self._half_width = np.where(is_bounded, 0.5 * (high - low), 1.0)
+        has_both = np.isfinite(low) & np.isfinite(high)
+        half_width = 0.5 * np.where(has_both, high, 0.0) - 0.5 * np.where(has_both, low, 0.0)
+        is_bounded = (half_width > 0.0) & (half_width <= 0.5 * _WIDEST)
+        self._centre = np.where(is_bounded, 0.5 * low + 0.5 * np.where(is_bounded, high, 0.0), 0.0)
+        self._half_width = np.where(is_bounded, half_width, 1.0)
 
     def flat(self, observation: Any) -> np.ndarray:
         """Return an observation as a vector, float64 `[dim]`.
 
         Raises:
-            ProblemError: an entry is missing or outside its space, the observation has another length, or a value is
-                not finite.
+            ProblemError: an entry is missing or not in its space: see `Leaf`.
         """
-        vector = np.concatenate([self._flat_leaf(path, leaf, observation) for path, leaf in self._leaves])
-        if vector.shape != (self.dim,):
-            raise ProblemError(f"gave an observation of {vector.size} values, but its space has {self.dim}")
-        if not np.isfinite(vector).all():
-            raise ProblemError("gave an observation that is not finite")
-        return vector
+        return np.concatenate(
+            [leaf.flat(observation, cure) for leaf, cure in zip(self._leaves, self._cures, strict=True)]
+        )
 
-    def _flat_leaf(self, path: tuple[int | str, ...], leaf: spaces.Space, observation: Any) -> np.ndarray:
-        value = observation
-        try:
-            for entry in path:
-                value = value[entry]
-        except (LookupError, TypeError) as error:
-            raise ProblemError(f"gave an observation without its {_written_path(path)}") from error
-        if not _is_inside(leaf, value):
-            others = [name for name in self._names if name != path[0]] if path else []
-            cure = f"; env.observation_keys={others} leaves the entry out" if others else ""
-            raise ProblemError(f"gave an observation whose {_written_path(path)} is {value}, outside {leaf}{cure}")
-        try:
-            return np.asarray(flatten(leaf, value), np.float64)
-        except (TypeError, ValueError) as error:
-            raise ProblemError(f"gave an observation whose {_written_path(path)} is {value!r}, not numbers") from error
+    def _cure(self, leaf: Leaf) -> str:
+        """Return the setting that leaves out the leaf's entry, in words; nothing if there is no other entry."""
+        others = [name for name in self._names if leaf.path and name != leaf.path[0]]
+        return f"; env.observation_keys={others} leaves the entry out" if others else ""
 
     def scaled(self, vectors: np.ndarray) -> np.ndarray:
         """Return new observations `[M, dim]` scaled, float32; with `running`, they update the statistics first."""
@@ -165,48 +159,13 @@ class RunningStatistics(RunningMeanStd):
         self.var = columns["observation_variance"].to("cpu", torch.float64, copy=True).numpy()
 
 
-def _children(space: spaces.Space) -> dict[int | str, spaces.Space]:
-    """Return the entries of a Tuple or Dict; none of another space."""
-    children: dict[int | str, spaces.Space] = {}
-    if isinstance(space, spaces.Tuple):
-        children.update(enumerate(space.spaces))
-    elif isinstance(space, spaces.Dict):
-        children.update(space.spaces.items())
-    return children
-
-
-def _leaves(space: spaces.Space) -> Iterator[tuple[tuple[int | str, ...], spaces.Space]]:
-    """Yield the spaces inside a space, in the order of its flattened vector, each with the entries that lead to it."""
-    if not isinstance(space, spaces.Tuple | spaces.Dict):
-        yield (), space
-    for entry, child in _children(space).items():
-        for path, leaf in _leaves(child):
-            yield (entry, *path), leaf
-
-
 def _check_entries(space: spaces.Space, entries: Sequence[int | str]) -> None:
-    names = list(_children(space))
+    names = list(children(space))
     if not names:
         raise ValueError(f"observation_keys={entries}: the observation {written(space)} has no entries; use null")
     wrong = [entry for entry in entries if entry not in names]
     if wrong or not entries or len(set(entries)) < len(entries):
         raise ValueError(f"observation_keys={entries}: must name different entries of {names}; null: all")
-
-
-def _is_inside(leaf: spaces.Space, value: Any) -> bool:
-    """Return whether a discrete value is one that can be made one-hot. A Box may be left: its bounds only scale."""
-    if isinstance(leaf, spaces.Box):
-        return True
-    number = np.asarray(value)
-    if number.dtype.kind not in "iub":
-        return False
-    if isinstance(leaf, spaces.Discrete):
-        return number.size == 1 and bool(0 <= number.item() - leaf.start < leaf.n)
-    return leaf.contains(number.astype(leaf.dtype))
-
-
-def _written_path(path: tuple[int | str, ...]) -> str:
-    return f"entry {'.'.join(map(str, path))}" if path else "value"
 
 
 def _is_flat(space: spaces.Space) -> bool:

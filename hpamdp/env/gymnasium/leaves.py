@@ -1,0 +1,207 @@
+"""The spaces inside an observation space: each one's values are checked against it, then flattened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, get_args
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.spaces.utils import flatten
+
+from hpamdp.env.base import ProblemError
+from hpamdp.env.gymnasium.values import as_numbers, shown
+
+OutOfBounds = Literal["refuse", "clip", "allow"]
+
+# Units in the last place beyond a bound that count as rounding.
+_ROUNDING = 4.0
+# Of the agent's observations.
+_OBSERVED = np.dtype(np.float32)
+
+
+class Leaf:
+    """A `Box`, `Discrete`, `MultiDiscrete` or `MultiBinary` inside an observation space.
+
+    A value must have the space's shape; a `Discrete` also takes an array of one number. Integers and booleans must be
+    whole numbers within the space. Floats are rounded to the space's dtype. They are compared with the bounds in the
+    space's dtype or, if it is less precise, in the value's own; a few units in the last place count as rounding.
+
+    Args:
+        space: of the leaf.
+        path: the entries of `Tuple` and `Dict` spaces that lead to it, from the outermost on.
+        lengths: for each entry of the path, the number of entries beside it if it is one of a `Tuple`, else None.
+        out_of_bounds: what becomes of finite numbers of a `Box` outside its bounds: they are refused, moved to the
+            bound, or kept as they are.
+    """
+
+    def __init__(
+        self,
+        space: spaces.Space,
+        path: tuple[int | str, ...] = (),
+        lengths: tuple[int | None, ...] = (),
+        out_of_bounds: OutOfBounds = "refuse",
+    ) -> None:
+        self.space = space
+        self.path = path
+        self._lengths = lengths
+        self._out_of_bounds = out_of_bounds
+        self._what = f"entry {'.'.join(map(str, path))}" if path else "value"
+        if isinstance(space, spaces.Box):
+            self._read_bounds(space)
+
+    def flat(self, observation: Any, cure: str = "") -> np.ndarray:
+        """Return the leaf's part of an observation as a vector, float64; discrete values are one-hot.
+
+        Args:
+            observation: of the whole space.
+            cure: what to add to the message about a discrete value outside its space.
+
+        Raises:
+            ProblemError: the part is missing or not in the space.
+        """
+        value = self._find(observation)
+        numbers = as_numbers(value)
+        if numbers is None:
+            raise self._problem(f"is {shown(value)}, not numbers that NumPy can hold")
+        if isinstance(self.space, spaces.Discrete) and numbers.size == 1:
+            numbers = numbers.reshape(())
+        if numbers.shape != self.space.shape:
+            raise self._problem(f"has shape {numbers.shape}, but its space has {self.space.shape}")
+        if isinstance(self.space, spaces.Box):
+            return self._box(numbers).ravel()
+        return self._one_hot(numbers, cure)
+
+    def _find(self, observation: Any) -> Any:
+        value = observation
+        for entry, length in zip(self.path, self._lengths, strict=True):
+            is_dict = length is None
+            if not isinstance(value, Mapping if is_dict else tuple | list | np.ndarray):
+                raise ProblemError(f"gave an observation without its {self._what}")
+            if not is_dict and len(value) != length:
+                raise ProblemError(f"gave an observation of {len(value)} entries, but its space has {length}")
+            if is_dict and entry not in value:
+                raise ProblemError(f"gave an observation without its {self._what}")
+            entries: Any = value
+            value = entries[entry]
+        return value
+
+    def _read_bounds(self, box: spaces.Box) -> None:
+        self._own = np.dtype(box.dtype)
+        self._is_float = self._own.kind == "f"
+        self._low = box.low.astype(np.float64)
+        self._high = box.high.astype(np.float64)
+        # The dtype in which a number must be finite: the agent's, or the space's own if that is less precise.
+        self._holder = _coarser(self._own, _OBSERVED) if self._is_float else _OBSERVED
+        largest = float(np.finfo(self._holder).max)
+        slack = self._slack(self._own) if self._is_float else 0.0
+        self._lowest = np.maximum(self._low - slack, -largest)
+        self._highest = np.minimum(self._high + slack, largest)
+
+    def _slack(self, dtype: np.dtype) -> np.ndarray:
+        """Return how far beyond its bounds a number of this dtype may be by rounding."""
+        return _ROUNDING * float(np.finfo(dtype).eps) * np.maximum(_size(self._low), _size(self._high))
+
+    def _box(self, numbers: np.ndarray) -> np.ndarray:
+        values = numbers.astype(np.float64)
+        is_whole = self._is_float or numbers.dtype.kind != "f" or (values == np.floor(values)).all()
+        if not (is_whole and ((values >= self._lowest) & (values <= self._highest)).all()):
+            values = self._within_bounds(values, numbers.dtype)
+        elif self._out_of_bounds == "clip":
+            values = np.clip(values, self._low, self._high)
+        return values.astype(self._own).astype(np.float64) if self._is_float else values
+
+    def _within_bounds(self, values: np.ndarray, dtype: np.dtype) -> np.ndarray:
+        """Return numbers that are not all plainly inside, as `out_of_bounds` says.
+
+        Args:
+            values: the numbers.
+            dtype: in which the environment gave them.
+        """
+        self._refuse_where(~np.isfinite(values), values, "which is not finite")
+        if not self._is_float:
+            self._refuse_where(values != np.floor(values), values, f"which {self._own} cannot hold")
+        if self._out_of_bounds == "clip":
+            values = np.clip(values, self._low, self._high)
+        elif self._out_of_bounds == "refuse":
+            slack: Any = 0.0
+            if self._is_float:
+                slack = self._slack(_coarser(self._own, dtype) if dtype.kind == "f" else self._own)
+            is_outside = (values < self._low - slack) | (values > self._high + slack)
+            cure = "env.out_of_bounds=clip moves it there, allow keeps it"
+            self._refuse_where(is_outside, values, f"outside its bounds {{bounds}}; {cure}")
+        with np.errstate(over="ignore"):
+            is_too_large = ~np.isfinite(values.astype(self._holder))
+        self._refuse_where(is_too_large, values, f"which {self._holder} cannot hold")
+        return values
+
+    def _one_hot(self, numbers: np.ndarray, cure: str) -> np.ndarray:
+        dtype = self.space.dtype
+        assert dtype is not None
+        is_inside = True
+        if numbers.dtype.kind == "f":
+            with np.errstate(invalid="ignore"):
+                is_inside = bool((numbers == np.floor(numbers)).all() and (np.abs(numbers) < 2.0**62).all())
+        if is_inside:
+            whole = numbers.astype(np.int64)
+            low: Any = getattr(self.space, "start", 0)
+            size: Any = getattr(self.space, "nvec", 2 if isinstance(self.space, spaces.MultiBinary) else None)
+            size = self.space.n if isinstance(self.space, spaces.Discrete) else size
+            is_inside = bool(
+                (numbers <= np.iinfo(np.int64).max).all() and ((whole >= low) & (whole < low + size)).all()
+            )
+        if not is_inside:
+            raise self._problem(f"is {shown(numbers.tolist())}, outside {self.space}{cure}")
+        return np.asarray(flatten(self.space, whole.astype(dtype)), np.float64)
+
+    def _refuse_where(self, is_wrong: np.ndarray, values: np.ndarray, reason: str) -> None:
+        if not is_wrong.any():
+            return
+        place = tuple(map(int, np.argwhere(is_wrong)[0]))
+        reason = reason.format(bounds=f"{self._low[place]:.10g} to {self._high[place]:.10g}")
+        index = f" at index {', '.join(map(str, place))}" if place else ""
+        raise self._problem(f"is {values[place]:.10g}{index}, {reason}")
+
+    def _problem(self, fault: str) -> ProblemError:
+        return ProblemError(f"gave an observation whose {self._what} {fault}")
+
+
+def leaves(
+    space: spaces.Space,
+    out_of_bounds: OutOfBounds = "refuse",
+    path: tuple[int | str, ...] = (),
+    lengths: tuple[int | None, ...] = (),
+) -> Iterator[Leaf]:
+    """Yield the leaves of a space, in the order of its flattened vector.
+
+    Raises:
+        ValueError: `out_of_bounds` is none of its values.
+    """
+    if out_of_bounds not in get_args(OutOfBounds):
+        raise ValueError(f"out_of_bounds={out_of_bounds}, but must be one of {', '.join(get_args(OutOfBounds))}")
+    entries = children(space)
+    if not isinstance(space, spaces.Tuple | spaces.Dict):
+        yield Leaf(space, path, lengths, out_of_bounds)
+    for entry, child in entries.items():
+        length = len(entries) if isinstance(space, spaces.Tuple) else None
+        yield from leaves(child, out_of_bounds, (*path, entry), (*lengths, length))
+
+
+def children(space: spaces.Space) -> dict[int | str, spaces.Space]:
+    """Return the entries of a Tuple or Dict; none of another space."""
+    entries: dict[int | str, spaces.Space] = {}
+    if isinstance(space, spaces.Tuple):
+        entries.update(enumerate(space.spaces))
+    elif isinstance(space, spaces.Dict):
+        entries.update(space.spaces.items())
+    return entries
+
+
+def _coarser(one: np.dtype, other: np.dtype) -> np.dtype:
+    """Return the less precise of two dtypes of floats."""
+    return max(one, other, key=lambda dtype: float(np.finfo(dtype).eps))
+
+
+def _size(bounds: np.ndarray) -> np.ndarray:
+    """Return the sizes of finite bounds, and 0 for the others."""
+    return np.where(np.isfinite(bounds), np.abs(bounds), 0.0)

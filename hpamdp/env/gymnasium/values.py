@@ -1,0 +1,58 @@
+"""Numbers and flags that somebody else's environment returns, checked before any conversion can change them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from hpamdp.env.base import ProblemError
+from hpamdp.messages import one_line
+
+_LONGEST = 200
+
+
+def as_numbers(value: Any) -> np.ndarray | None:
+    """Return a value as an array of real numbers in its own dtype; None if it is something else.
+
+    Text, None, complex numbers, dates, arrays of objects, ragged lists, integers beyond 64 bits and arrays with masked
+    entries are something else.
+    """
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        return None
+    return array if array.dtype.kind in "biuf" and not np.ma.is_masked(value) else None
+
+
+def number(name: str, value: Any) -> float:
+    """Return what a step returned as a float; an array of one number counts as the number.
+
+    Raises:
+        ProblemError: the value is no number.
+    """
+    numbers = as_numbers(value)
+    if numbers is None or numbers.size != 1:
+        raise ProblemError(f"step returned {shown(value)} as {name}, which must be a number")
+    return float(numbers.item())
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return what a step returned as a bool: True, False, 1 or 0, of Python or NumPy, or an array of one of them.
+
+    Raises:
+        ProblemError: the value is something else.
+    """
+    numbers = as_numbers(value)
+    if numbers is None or numbers.size != 1 or numbers.item() not in (0, 1):
+        raise ProblemError(f"step returned {shown(value)} as {name}, which must be True or False")
+    return bool(numbers.item())
+
+
+def shown(value: object) -> str:
+    """Return a value of any kind as one short line of text."""
+    try:
+        text = one_line(repr(value))
+    except Exception:  # `repr` is the environment's own code, and refuses integers of over 4,300 digits
+        return f"a value of type {type(value).__name__}"
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."

@@ -1,0 +1,135 @@
+"""Observed values are compared with their space before any conversion, leaf by leaf."""
+
+from __future__ import annotations
+
+import warnings
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium_players import make, step
+from toy_environments import Toy
+
+from hpamdp.env.base import ProblemError
+from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+
+INT64 = spaces.Box(-9, 9, (2,), np.int64)
+BYTES = spaces.Box(0, 255, (2,), np.uint8)
+BOOLS = spaces.Box(0, 1, (2,), bool)
+HALVES = spaces.Box(-np.inf, np.inf, (2,), np.float16)
+UNIT = spaces.Box(-1.0, 1.0, (2,))
+WIDE = spaces.Box(-np.inf, np.inf, (2,), np.float64)
+PARTS = spaces.Dict(a=spaces.Box(-9, 9, (2,)), b=spaces.Dict(c=spaces.Box(-9, 9, (3,))))
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "complaint"),
+    [
+        (INT64, [0.7, 0.0], "value is 0.7 at index 0, which int64 cannot hold"),
+        (INT64, [0.0, np.nan], "value is nan at index 1, which is not finite"),
+        (INT64, [10**400, 1], "not numbers that NumPy can hold"),
+        (INT64, [10**5000, 1], "value is a value of type list, not numbers"),
+        (INT64, np.uint64([2**64 - 1, 0]), r"value is 1.844674407e\+19 at index 0, outside its bounds -9 to 9"),
+        (BYTES, [0, 300], "value is 300 at index 1, outside its bounds 0 to 255"),
+        (BYTES, [-1, 0], "value is -1 at index 0, outside its bounds 0 to 255"),
+        (BYTES, [np.inf, 0], "value is inf at index 0, which is not finite"),
+        (BOOLS, [0.5, 1.0], "value is 0.5 at index 0, which bool cannot hold"),
+        (BOOLS, [2, 0], "value is 2 at index 0, outside its bounds 0 to 1"),
+        (HALVES, [0.0, 70000.0], "value is 70000 at index 1, which float16 cannot hold"),
+        (WIDE, [1e300, 0.0], r"value is 1e\+300 at index 0, which float32 cannot hold"),
+        (UNIT, [0.0, 1.001], "value is 1.001 at index 1, outside its bounds -1 to 1; env.out_of_bounds=clip moves it "),
+        (UNIT, [[0.0, 0.0]], r"value has shape \(1, 2\), but its space has \(2,\)"),
+        (UNIT, 0.0, r"value has shape \(\), but its space has \(2,\)"),
+        (UNIT, [0.0, 1j], "not numbers"),
+        (UNIT, np.array([0.0, 1.0], object), "not numbers"),
+        (UNIT, [Fraction(1, 2), 0.0], "not numbers"),
+        (UNIT, [[0.0], [0.0, 0.0]], "not numbers"),
+        (UNIT, np.ma.masked_array([0.0, 0.0], [True, False]), "not numbers"),
+        (UNIT, torch.zeros(2, requires_grad=True), "not numbers"),
+        (UNIT, b"ab", "not numbers"),
+        (spaces.Box(-1.0, 1.0, ()), [0.0], r"value has shape \(1,\), but its space has \(\)"),
+        (spaces.Discrete(3), 0.7, r"value is 0.7, outside Discrete\(3\)"),
+        (spaces.Discrete(3), np.nan, r"value is nan, outside Discrete\(3\)"),
+        (spaces.Discrete(3), np.uint64(2**64 - 1), r"outside Discrete\(3\)"),
+        (spaces.Discrete(3), [1, 1], r"value has shape \(2,\), but its space has \(\)"),
+        (spaces.Discrete(3), None, "value is None, not numbers"),
+        (spaces.MultiDiscrete([2, 3]), [1.0, 2.5], r"value is \[1.0, 2.5\], outside MultiDiscrete"),
+        (spaces.MultiDiscrete([2, 3], start=[5, 0]), [4, 0], r"value is \[4, 0\], outside MultiDiscrete"),
+        (spaces.MultiDiscrete([2, 3]), [[1], [2]], r"value has shape \(2, 1\)"),
+        (spaces.MultiBinary(2), [1, 2], r"value is \[1, 2\], outside MultiBinary\(2\)"),
+        (spaces.MultiBinary(2), [1], r"value has shape \(1,\)"),
+        (PARTS, {"a": np.zeros(3), "b": {"c": np.zeros(2)}}, r"entry a has shape \(3,\), but its space has \(2,\)"),
+        (PARTS, {"a": np.zeros(2), "b": {"c": np.zeros(4)}}, r"entry b.c has shape \(4,\), but its space has \(3,\)"),
+        (PARTS, {"a": np.zeros(2), "b": np.zeros(3)}, "without its entry b.c"),
+        (PARTS, {"a": np.zeros(2), "b": {"c": [0, 0, 10]}}, "entry b.c is 10 at index 2, outside its bounds -9 to 9"),
+        (spaces.Tuple([UNIT, UNIT]), (np.zeros(2),) * 3, "gave an observation of 3 entries, but its space has 2"),
+        (spaces.Tuple([UNIT, UNIT]), "ab", "without its entry 0"),
+    ],
+)  # fmt: skip
+def test_what_a_space_does_not_hold_is_refused_in_a_line_that_names_the_leaf(space, value, complaint):
+    with warnings.catch_warnings(), pytest.raises(ProblemError, match=complaint) as raised:
+        warnings.simplefilter("error")
+        ObservationSpace(space, "bounds").flat(value)
+    assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("space", "value", "vector"),
+    [
+        (INT64, [1.0, -9.0], [1.0, -9.0]),
+        (BYTES, [0, 255], [0.0, 255.0]),
+        (BOOLS, [True, 0], [1.0, 0.0]),
+        (HALVES, [0.5, 65504.0], [0.5, 65504.0]),
+        # Rounding: bounds of float64 with values of float32, bounds of float32 with values of float64.
+        (spaces.Box(-0.1, 0.3, (2,), np.float64), np.float32([-0.1, 0.3]), np.float32([-0.1, 0.3])),
+        (spaces.Box(-0.1, 0.3, (2,)), [-0.1, 0.3], np.float32([-0.1, 0.3])),
+        (spaces.Box(-1.0, 1.0, (2,), np.float64), [0.0, 1.0 + 2e-16], [0.0, 1.0 + 2e-16]),
+        (spaces.Box(0.0, np.inf, (2,)), [0.0, 1e30], [0.0, np.float32(1e30)]),
+        (spaces.Discrete(3, start=-1), np.bool_(True), [0.0, 0.0, 1.0]),
+        (spaces.Discrete(3), 1.0, [0.0, 1.0, 0.0]),
+        (spaces.MultiDiscrete([2, 2], start=[5, 0]), [6.0, 0.0], [0.0, 1.0, 1.0, 0.0]),
+        (spaces.MultiBinary((1, 2)), [[True, False]], [1.0, 0.0]),
+        (spaces.Box(-1.0, 1.0, ()), np.float64(0.5), [0.5]),
+    ],
+)
+def test_what_a_space_holds_is_taken_whatever_its_dtype(space, value, vector):
+    assert ObservationSpace(space, "none").flat(value).tolist() == list(vector)
+
+
+def test_numbers_outside_their_bounds_are_clipped_or_kept_if_asked():
+    given = {"clip": [[0.0, 255.0], [-1.0, 1.0]], "allow": [[-1.0, 300.0], [-7.0, 2.5]]}
+    for setting, (counts, units) in given.items():
+        space = ObservationSpace(spaces.Tuple([BYTES, UNIT]), "none", None, setting)
+        assert space.flat(([-1, 300], [-7.0, 2.5])).tolist() == counts + units
+        with pytest.raises(ProblemError, match=r"entry 0 is 0\.5 at index 0, which uint8 cannot hold"):
+            space.flat(([0.5, 0], [0.0, 0.0]))
+        with pytest.raises(ProblemError, match="entry 1 is nan at index 0, which is not finite"):
+            space.flat(([0, 0], [np.nan, 0.0]))
+    with pytest.raises(ValueError, match="out_of_bounds=wrap, but must be one of refuse, clip, allow"):
+        ObservationSpace(UNIT, "none", None, "wrap")
+
+
+@pytest.mark.parametrize("entry_point", ["toy_environments:Toy", "toy_environments:OldToy"])
+def test_bounds_hold_for_resets_and_steps(entry_point, monkeypatch):
+    monkeypatch.setattr(Toy, "_observation", lambda self: np.array([0.0, -1.0 - self.steps]))
+    clipped, kept = (make(entry_point=entry_point, out_of_bounds=setting) for setting in ("clip", "allow"))
+    assert [clipped.reset()["observation"][0, 1], step(clipped)["observation"][0, 1]] == [0.0, 0.0]
+    assert [kept.reset()["observation"][0, 1], step(kept)["observation"][0, 1]] == [-1.0, -2.0]
+    env = make(entry_point=entry_point)
+    with pytest.raises(
+        ProblemError, match=r"^GymnasiumEnv: .* environment 0: .* value is -1 at index 1, outside its b"
+    ):
+        env.reset()
+    with pytest.raises(ProblemError, match=r"value is -2 at index 1, outside its bounds"):
+        step(env)
+
+
+def test_bounds_of_any_size_give_no_warning():
+    low = np.array([-np.inf, -1e308, 0.0, np.inf, -np.inf])
+    high = np.array([np.inf, 1e308, np.inf, np.inf, -np.inf])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for space in (spaces.Box(low, high, dtype=np.float64), spaces.Box(-np.inf, np.inf, (5,))):
+            assert ObservationSpace(space, "bounds").scaled(np.ones((1, 5))).tolist() == [[1.0] * 5]
