@@ -28,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.config import GROUPS, RUN_FILE, ConfigError, conf_dir, job_overrides, no_such, no_such_option
-from hpamdp.messages import first_line, one_line, warn
+from hpamdp.messages import first_line, one_line, reopen_standard_streams, warn
 from hpamdp.run import sweep
 
 _MISTAKE, _INTERRUPTED = 2, 130
@@ -78,6 +78,7 @@ def main() -> None:
 
     Exits with 0, 1 (a bug, with its traceback), 2 (a user's mistake, told in one line) or 130 (interrupted).
     """
+    reopen_standard_streams()
     # Classes of one's own may lie in the working directory, as with `python -m`.
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())

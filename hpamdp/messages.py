@@ -19,27 +19,51 @@ def first_line(text: object) -> str:
     return one_line(str(text).strip().partition("\n")[0])
 
 
-class LenientStream:
-    """A text stream on which writing never fails: a terminal that was closed or a full disk costs the text alone."""
+def reopen_standard_streams() -> None:
+    """Open the null device in the place of standard streams that are closed, as in `2>&-` and in some daemons.
 
-    def __init__(self, stream: TextIO) -> None:
+    Otherwise the next file that is opened gets the number of the closed stream, and libraries write their messages into
+    it. Call it before anything else is opened.
+    """
+    for number, (name, mode) in enumerate({"stdin": "r", "stdout": "w", "stderr": "w"}.items()):
+        try:
+            os.fstat(number)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)  # gets the lowest free number, which is this one
+            os.set_inheritable(opened, True)
+        if getattr(sys, name) is None:
+            stream = open(number, mode, encoding="utf-8", closefd=False)  # noqa: SIM115  # stays open
+            setattr(sys, name, stream)
+
+
+class LenientStream:
+    """A text stream on which writing never fails: a terminal that was closed or a full disk costs the text alone.
+
+    Args:
+        stream: where the text goes; None, as `sys.stderr` is if it was closed: nowhere.
+    """
+
+    def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream
 
     def write(self, text: str) -> int:
         """Write the text if possible."""
-        with suppress(OSError, ValueError):
-            self._stream.write(text)
+        if self._stream is not None:
+            with suppress(OSError, ValueError):
+                self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         """Flush the stream if possible."""
-        with suppress(OSError, ValueError):
-            self._stream.flush()
+        if self._stream is not None:
+            with suppress(OSError, ValueError):
+                self._stream.flush()
 
     def isatty(self) -> bool:
         """Return whether the stream is a terminal."""
-        with suppress(OSError, ValueError):
-            return self._stream.isatty()
+        if self._stream is not None:
+            with suppress(OSError, ValueError):
+                return self._stream.isatty()
         return False
 
 
@@ -53,7 +77,9 @@ def warn(message: str) -> None:
     _print(message, sys.stderr)
 
 
-def _print(text: str, stream: TextIO) -> None:
+def _print(text: str, stream: TextIO | None) -> None:
+    if stream is None:  # which `print` takes for stdout
+        return
     try:
         print(text, file=stream, flush=True)
     except (OSError, ValueError):

@@ -9,17 +9,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any
 
 import pytest
 import torch
-from conftest import CONF, compose_config
+from conftest import CONF, compose_config, forked
 from test_grid import SHORT
 
 from hpamdp import cli, keys
 from hpamdp.config import ConfigError
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.messages import LenientStream, warn
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.run import checkpoint
 from hpamdp.run.train import DIVERGED_NAME, run
@@ -186,6 +188,39 @@ def test_a_run_whose_output_is_full_goes_on_and_saves(tmp_path):
         process.terminate()
         assert process.wait(60) == 130
     assert frames_of(tmp_path / "run") > 0
+
+
+def _main_without_streams(folder: Path) -> None:
+    os.chdir(folder)
+    os.closerange(0, 1000)  # a file that is opened now gets the number of a standard stream
+    sys.stdin = sys.stdout = sys.stderr = sys.__stderr__ = None  # as Python starts then
+    sys.argv = [*PROGRAM, "total_frames=64", "film=false", "high=ucb", "hydra.run.dir=run"]
+    cli.main()
+    for number in range(3):
+        assert os.path.samestat(os.fstat(number), os.stat(os.devnull))
+        assert os.get_inheritable(number)
+
+
+def test_a_run_goes_on_without_standard_streams(tmp_path):
+    assert forked(_main_without_streams, tmp_path) == 0
+    assert frames_of(tmp_path / "run") == 64
+
+
+def test_without_stderr_nothing_is_said_on_stdout_in_its_place(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stderr", None)
+    warn("a warning")
+    LenientStream(sys.stderr).write("a progress bar")
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("collector", ["single", pytest.param("multi", marks=pytest.mark.slow)])
+def test_a_run_in_a_thread_is_the_run_of_the_main_thread(collector, tmp_path):
+    given = [*SMALL, "low=random", f"collector={collector}"]
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(run, compose_config(given), tmp_path / "thread", given).result() == 0
+    assert run(compose_config(given), tmp_path / "main", given) == 0
+    scores = [json.loads((tmp_path / name / "summary.json").read_text())["score"] for name in ("thread", "main")]
+    assert scores[0] == scores[1]
 
 
 def test_a_killed_run_loses_no_more_than_the_minutes_between_two_checkpoints(tmp_path, printed):

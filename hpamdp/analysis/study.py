@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from scipy import stats
 
 from hpamdp.files import replacing
+from hpamdp.messages import warn
 from hpamdp.run.metrics import read_rows
 
 Rows = list[dict[str, Any]]
@@ -51,7 +51,7 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
             assert isinstance(config, DictConfig)
             runs.append(Run(file.parent, summary, config))
         else:
-            print(f"{file.parent}: was stopped, left out", file=sys.stderr)
+            warn(f"{file.parent}: was stopped, left out")
     return runs
 
 

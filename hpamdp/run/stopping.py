@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -31,9 +32,12 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Note the signals that stop a run, until the block ends; those that are ignored stay so."""
+    """Note the signals that stop a run, until the block ends; those that are ignored stay so.
+
+    In a thread other than the main one, nothing is noted: signals reach the main thread alone.
+    """
     request = StopRequest()
-    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+    before = {number: signal.getsignal(number) for number in _changeable_signals()}
     handled = {number: handler for number, handler in before.items() if handler != signal.SIG_IGN}
     for number in handled:
         signal.signal(number, request.note)
@@ -47,9 +51,14 @@ def stop_on_signals() -> Iterator[StopRequest]:
 @contextmanager
 def signals_ignored() -> Iterator[None]:
     """Ignore the signals that stop a run, while it saves."""
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in STOP_SIGNALS}
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in _changeable_signals()}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _changeable_signals() -> tuple[signal.Signals, ...]:
+    """Return the signals whose handlers this thread can set: those that stop a run, in the main thread."""
+    return STOP_SIGNALS if threading.current_thread() is threading.main_thread() else ()

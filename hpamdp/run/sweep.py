@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from hpamdp.config import Config, ConfigError, job_overrides
 from hpamdp.files import remove_link, replacing
-from hpamdp.messages import one_line, say
+from hpamdp.messages import one_line, say, warn
 from hpamdp.run.folder import check_no_link, locked
 
 _MISTAKE, _INTERRUPTED = 2, 130
@@ -224,14 +224,14 @@ def report(start: str, error: BaseException | None = None) -> int:
     _print_tally(jobs)
     for job in failed:
         told = Path(job.folder, "error.txt")
-        print(f"{job.overrides}: {job.reason} ({_shown(told if told.exists() else told.parent)})", file=sys.stderr)
+        warn(f"{job.overrides}: {job.reason} ({_shown(told if told.exists() else told.parent)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if not is_stopped:
             with replacing(sweep_dir / "error.txt") as partial:
                 partial.write_text("".join(traceback.format_exception(error)))
             reason = one_line("".join(traceback.format_exception_only(error)))
-            print(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})", file=sys.stderr)
-        print(f"To go on: the same command with hydra.sweep.dir={_shown(sweep_dir)}")
+            warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})")
+        say(f"To go on: the same command with hydra.sweep.dir={_shown(sweep_dir)}")
         return _INTERRUPTED if is_stopped else 1
     if not failed:
         return 0
@@ -240,11 +240,11 @@ def report(start: str, error: BaseException | None = None) -> int:
 
 def _print_tally(jobs: list[Job]) -> None:
     counts = Counter(job.state for job in jobs)
-    print(f"{len(jobs)} jobs: {'; '.join(f'{count} {state}' for state, count in counts.items())}")
+    say(f"{len(jobs)} jobs: {'; '.join(f'{count} {state}' for state, count in counts.items())}")
     scored = [(job.score, job) for job in jobs if job.score is not None]
     if len(scored) > 1:
         score, best = max(scored, key=lambda entry: entry[0])
-        print(f"Best score {score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
+        say(f"Best score {score:.3f}: {best.overrides} ({_shown(Path(best.folder))})")
 
 
 def _shown(path: Path) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -22,6 +21,7 @@ from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SH
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
+from hpamdp.messages import one_line, reopen_standard_streams, warn
 
 _USAGE_ERROR = 2
 _INTERRUPTED = 130
@@ -38,11 +38,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         The exit code: 0, 2 after an error (printed to stderr in one line) or 130 after an interrupt.
     """
+    reopen_standard_streams()
     options = _parser().parse_args(arguments)
     try:
         options.run(options)
     except DataError as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
+        warn(one_line(error))
         return _USAGE_ERROR
     except KeyboardInterrupt:
         return _INTERRUPTED
