@@ -120,8 +120,17 @@ def main() -> None:
 def _run_command(name: str, words: list[str]) -> int:
     """Run a command that has options of its own, and return its exit code."""
     command = importlib.import_module(_COMMANDS[name])
+    from hpamdp.env.base import ProblemError  # takes seconds, which the other commands need not wait for
+    from hpamdp.run.stopping import ProgramExitError, exits_told
+
     parser = _Parser(prog=f"hpamdp {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
-    return command.main(words, parser)
+    try:
+        with exits_told():
+            return command.main(words, parser)
+    except ProblemError as error:
+        raise ConfigError(f"env: {first_line(error)}") from error
+    except ProgramExitError as error:
+        _exit_with(str(error), 1)
 
 
 class _Parser(argparse.ArgumentParser):

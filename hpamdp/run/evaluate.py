@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import PAMDPEnv, ProblemError
 from hpamdp.policies.agent import HierarchicalAgent
 
 
@@ -62,6 +62,9 @@ class Evaluation:
             - `option_changes`: how often the option changed in each episode, where options may end inside episodes;
             - `path` `[N, T + 1, 2]`, NaN past an episode's end, where the environment has positions;
             - what the environment's `describe` and `results` give.
+
+        Raises:
+            ProblemError: the return of an episode is not finite.
         """
         device = self.env.device
         td = self._reset()
@@ -90,6 +93,9 @@ class Evaluation:
                 over = td.get(keys.DONE).squeeze(-1)
                 if over.all():
                     break
+        if not total.isfinite().all():
+            row = int((~total.isfinite()).nonzero()[0])
+            raise ProblemError(f"{self.problem.title}: the return of evaluation episode {row} is {total[row].item()}")
         played: dict[str, Tensor] = {"return": total, "steps": steps, "score": total, **self.known}
         if options[0] is not None:
             played["option"] = options[0]

@@ -1,12 +1,15 @@
-"""How a run is stopped from outside: signals are noted and take effect between two batches."""
+"""How a run is stopped from outside: by signals, which take effect between two batches, and by `sys.exit`."""
 
 from __future__ import annotations
 
 import signal
 import threading
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+
+from hpamdp.messages import one_line
 
 # A Ctrl-C; a cluster's stop; what SLURM and others send before the time is up; a closed terminal.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGXCPU)
@@ -62,3 +65,24 @@ def signals_ignored() -> Iterator[None]:
 def _changeable_signals() -> tuple[signal.Signals, ...]:
     """Return the signals whose handlers this thread can set: those that stop a run, in the main thread."""
     return STOP_SIGNALS if threading.current_thread() is threading.main_thread() else ()
+
+
+class ProgramExitError(RuntimeError):
+    """A call of `sys.exit` in somebody else's code, told in one line."""
+
+
+@contextmanager
+def exits_told() -> Iterator[None]:
+    """Turn a call of `sys.exit` inside the block into an error that says where it is; those of argparse stay.
+
+    Raises:
+        ProgramExitError: there was such a call.
+    """
+    try:
+        yield
+    except SystemExit as error:
+        frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
+        if frame.f_globals.get("__name__") == "argparse":
+            raise
+        where = f"{frame.f_code.co_filename}, line {line}"
+        raise ProgramExitError(one_line(f"{where}: called sys.exit({error.code!r}), which stopped the run")) from error

@@ -26,6 +26,7 @@ from hpamdp.config import Config, ConfigError, job_overrides
 from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, say, warn
 from hpamdp.run.folder import check_no_link, locked
+from hpamdp.run.stopping import exits_told
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
@@ -110,7 +111,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     records.write(job)
     say(f"Job {job.number}: {job.overrides}")
     try:
-        with locked(folder, _PATIENCE_S):
+        with locked(folder, _PATIENCE_S), exits_told():
             job.state, job.score, job.reason = _go_on(cfg, overrides, folder)
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))

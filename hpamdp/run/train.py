@@ -25,7 +25,7 @@ from hpamdp.run.collection.base import Collection, WorkerDiedError
 from hpamdp.run.folder import POLICY_NAME, TENSORBOARD_NAME, WANDB_NAME, check_no_link, check_unused
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import check_saved_options, resolve
-from hpamdp.run.stopping import StopRequest, signals_ignored, stop_on_signals
+from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_told, signals_ignored, stop_on_signals
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
 INTERRUPTED, DIVERGED, FAILED = 130, 3, 1  # exit codes
@@ -48,7 +48,8 @@ def run(
     """Train or score an agent, write everything under `output_dir`, return the exit code.
 
     0: the run reached its end. 130: it was stopped by a signal, and saved. 3: a reward, a loss or a weight was not
-    finite; the last good checkpoint is kept. 1: a worker process died; what was learned is saved.
+    finite; the last good checkpoint is kept. 1: a worker process died, or somebody else's code called `sys.exit`; what
+    was learned is saved.
 
     Args:
         cfg: the composed config.
@@ -61,13 +62,17 @@ def run(
     Raises:
         ConfigError: a wrong value or path, or values that do not go together.
     """
-    config, source = resolve(cfg, overrides)
-    source = stopped_at or source
-    with memory_errors_explained(config):
-        try:
-            return _run(config, source, output_dir, overrides, may_overwrite=may_overwrite, tell=tell)
-        except ProblemError as error:
-            raise ConfigError(f"env: {first_line(error)}") from error
+    try:
+        with exits_told():
+            config, source = resolve(cfg, overrides)
+            source = stopped_at or source
+            with memory_errors_explained(config):
+                return _run(config, source, output_dir, overrides, may_overwrite=may_overwrite, tell=tell)
+    except ProblemError as error:
+        raise ConfigError(f"env: {first_line(error)}") from error
+    except ProgramExitError as error:
+        tell(str(error))
+        return FAILED
 
 
 def _run(

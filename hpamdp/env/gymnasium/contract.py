@@ -9,7 +9,7 @@ import gymnasium
 
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.values import flag, number, shown
-from hpamdp.messages import one_line
+from hpamdp.messages import one_line, warn
 
 
 class ContractCheck(gymnasium.Wrapper):
@@ -31,7 +31,7 @@ class ContractCheck(gymnasium.Wrapper):
                 raise
             raise ProblemError(f"reset must take seed and options: {one_line(error)}") from error
         except SystemExit as error:
-            raise ProblemError(f"reset called sys.exit({error.code})") from error
+            raise ProblemError(f"reset called sys.exit({shown(error.code)})") from error
         if not isinstance(values, tuple) or len(values) != 2 or not isinstance(values[1], Mapping):
             raise ProblemError("reset must return an observation and an info, a dictionary")
         return values[0], dict(values[1])
@@ -41,7 +41,7 @@ class ContractCheck(gymnasium.Wrapper):
         try:
             values: Any = self.env.step(action)
         except SystemExit as error:
-            raise ProblemError(f"step called sys.exit({error.code})") from error
+            raise ProblemError(f"step called sys.exit({shown(error.code)})") from error
         if not isinstance(values, tuple) or len(values) != 5:
             given = f"{len(values)} values" if isinstance(values, tuple) else type(values).__name__
             raise ProblemError(f"step returned {given}, not observation, reward, terminated, truncated and info")
@@ -55,6 +55,13 @@ class ContractCheck(gymnasium.Wrapper):
             flag("truncated", truncated),
             dict(info),
         )
+
+    def close(self) -> None:
+        """Close the environment; what ends the program there is told, and the run goes on."""
+        try:
+            self.env.close()
+        except SystemExit as error:
+            warn(f"{type(self.unwrapped).__name__}: close called sys.exit({shown(error.code)}); the run goes on")
 
 
 def checked(env: gymnasium.Env) -> gymnasium.Env:

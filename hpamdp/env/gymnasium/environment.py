@@ -24,6 +24,7 @@ from hpamdp.env.gymnasium.contract import checked
 from hpamdp.env.gymnasium.four_value import FourValueEnv
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
+from hpamdp.env.gymnasium.time_limit import with_limit
 from hpamdp.env.gymnasium.values import as_numbers, flag, shown
 from hpamdp.messages import one_line
 
@@ -53,7 +54,7 @@ class GymnasiumEnv(PAMDPEnv):
         entry_point: instead of `id`, a class or function `package.module:name` that returns the environment. An
             environment that is no `gymnasium.Env` must have the four-value interface of `gym`: see `FourValueEnv`.
         kwargs: passed to the environment's constructor.
-        max_steps: steps after which an episode is truncated; None: the environment's own time limit.
+        max_steps: steps after which an episode is truncated; None: the environment's own time limit, see `with_limit`.
         parameter_dims: how many parameters each discrete action takes of one box for all; None: each takes the whole
             box.
         option_key: the option's name in a `Dict` of actions, or its number in a `Tuple`; None: the entry `option`, if
@@ -103,11 +104,9 @@ class GymnasiumEnv(PAMDPEnv):
         self.envs = [self._make(id, entry_point, kwargs or {}, max_steps) for _ in range(num_envs)]
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         self._check_spaces()
-        limit = getattr(self.envs[0].spec, "max_episode_steps", None) if max_steps is None else max_steps
-        if limit is None:
-            raise ValueError(f"{self._name}: has no time limit of its own; set env.max_steps")
-        self.max_steps = limit
         try:
+            self.envs, limits = map(list, zip(*[with_limit(env, max_steps) for env in self.envs], strict=True))
+            self.max_steps = max(limits)
             self._options = OptionSpace(self.envs[0].action_space, option_key)
             self._actions = ActionSpace(self._options.rest, parameter_dims)
             self._place_masks(action_mask)
@@ -202,15 +201,14 @@ class GymnasiumEnv(PAMDPEnv):
             env = self._load(entry_point)(**kwargs)
         except (gymnasium.error.Error, ImportError) as error:
             raise ValueError(f"{self._name}: {one_line(error)}") from error
-        except TypeError as error:
+        except (TypeError, ValueError) as error:
             cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
             if not _is_about_the_call(cause):
                 raise
             raise ValueError(f"{self._name}: {one_line(cause)}") from error
         if not isinstance(env, gymnasium.Env):
             env = FourValueEnv(env)
-        env = checked(env)
-        return env if max_steps is None else gymnasium.wrappers.TimeLimit(env, max_steps)
+        return checked(env)
 
     def _check_spaces(self) -> None:
         first = self.envs[0]
@@ -407,6 +405,6 @@ def _rows(mask: Tensor) -> list[int]:
 
 
 def _is_about_the_call(error: BaseException) -> bool:
-    """Return whether a TypeError is about a call's arguments: raised by the caller, here or in Gymnasium."""
+    """Return whether an error is about a call's arguments or a registered time limit: raised here or in Gymnasium."""
     frame, _ = list(traceback.walk_tb(error.__traceback__))[-1]
-    return frame.f_globals["__name__"] in (__name__, "gymnasium.envs.registration")
+    return frame.f_globals["__name__"] in (__name__, "gymnasium.envs.registration", "gymnasium.wrappers.common")

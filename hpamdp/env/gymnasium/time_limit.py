@@ -1,0 +1,52 @@
+"""The time limit of a Gymnasium environment: its own or the one given, applied by Gymnasium's TimeLimit."""
+
+from __future__ import annotations
+
+import numbers
+
+import gymnasium
+from gymnasium.wrappers import TimeLimit
+
+from hpamdp.env.gymnasium.values import shown
+
+
+def with_limit(env: gymnasium.Env, max_steps: int | None) -> tuple[gymnasium.Env, int]:
+    """Return the environment with its time limit applied, and the number of steps after which it truncates.
+
+    Args:
+        env: its limit is the lowest of the TimeLimit wrappers around it. If there is none, it is that of its spec.
+        max_steps: the limit to apply; None: the environment's own.
+
+    Raises:
+        ValueError: the environment has no valid limit of its own, and none is given.
+    """
+    applied = _applied_limits(env)
+    if max_steps is None and not applied:
+        max_steps = _limit_of_spec(env)
+    if max_steps is not None and max_steps not in applied:
+        env = TimeLimit(env, max_steps)
+        applied.append(max_steps)
+    return env, min(applied)
+
+
+def _applied_limits(env: gymnasium.Env) -> list[int]:
+    limits = []
+    layer = env
+    while isinstance(layer, gymnasium.Wrapper):
+        if isinstance(layer, TimeLimit):
+            limits.append(layer._max_episode_steps)
+        layer = layer.env
+    return limits
+
+
+def _limit_of_spec(env: gymnasium.Env) -> int:
+    limit = getattr(env.unwrapped.spec, "max_episode_steps", None)
+    is_whole = isinstance(limit, numbers.Integral) and not isinstance(limit, bool)
+    if limit is None or (is_whole and limit == -1):  # -1 is none, too, for `gymnasium.make`
+        raise ValueError("has no time limit of its own; set env.max_steps")
+    if not is_whole or limit < 1:
+        raise ValueError(
+            f"its spec has max_episode_steps={shown(limit)}, which must be a whole number of at least 1; "
+            "set env.max_steps"
+        )
+    return int(limit)

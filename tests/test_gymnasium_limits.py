@@ -1,0 +1,165 @@
+"""A time limit is applied wherever an environment has one, and no environment ends the program unheard."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import compose_config
+from gymnasium_players import step
+from toy_environments import OldToy, Toy
+
+from hpamdp.config import ConfigError
+from hpamdp.env.base import ProblemError
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+from hpamdp.run.train import run
+
+WORDS = ["env=gymnasium", "env.entry_point=test_gymnasium_limits:Leaving", "env.max_steps=3", "high=none", "low=random"]
+WORDS += ["num_envs=2", "steps_per_batch=4", "total_frames=64", "eval.layouts=2"]
+
+
+class Limited(Toy):
+    """Says itself, in its spec, after how many steps it should end; no wrapper sees to it."""
+
+    def __init__(self, limit: object = 4):
+        super().__init__()
+        self.spec = gymnasium.envs.registration.EnvSpec("Limited-v0", max_episode_steps=limit)
+
+
+class OldLimited(OldToy):
+    """The same with the interface of gym."""
+
+    def __init__(self, limit: object = 4):
+        super().__init__()
+        self.spec = SimpleNamespace(max_episode_steps=limit)
+
+
+def wrapped(*limits: int) -> gymnasium.Env:
+    env: gymnasium.Env = Limited()
+    for limit in limits:
+        env = gymnasium.wrappers.OrderEnforcing(gymnasium.wrappers.TimeLimit(env, limit))
+    return env
+
+
+class Leaving(Toy):
+    """Calls `sys.exit` somewhere."""
+
+    def __init__(self, where: str = "constructor"):
+        super().__init__()
+        self.where = where
+        self.leave("constructor")
+
+    def leave(self, where: str) -> None:
+        if self.where == where:
+            sys.exit(0)
+
+    @property
+    def option_names(self) -> tuple[str, ...]:
+        self.leave("option_names")
+        return ()
+
+    def reset(self, **arguments):
+        self.leave("reset")
+        return super().reset(**arguments)
+
+    def step(self, action):
+        self.leave("step")
+        return super().step(action)
+
+    def close(self):
+        self.leave("close")
+
+
+def episode_length(env: GymnasiumEnv) -> int:
+    env.reset()
+    flags = [step(env)["truncated"].item() for _ in range(env.max_steps)]
+    assert flags.index(True) == len(flags) - 1
+    return len(flags)
+
+
+@pytest.mark.parametrize(
+    ("options", "length"),
+    [
+        ({"entry_point": "Limited"}, 4),
+        ({"entry_point": "OldLimited"}, 4),
+        ({"entry_point": "Limited", "kwargs": {"limit": np.int64(3)}}, 3),
+        ({"entry_point": "Limited", "max_steps": 2}, 2),
+        ({"entry_point": "Limited", "max_steps": 6}, 6),
+        ({"entry_point": "OldLimited", "max_steps": 6}, 6),
+        ({"entry_point": "Limited", "kwargs": {"limit": "ten"}, "max_steps": 5}, 5),
+    ],
+)
+def test_the_limit_of_a_spec_is_applied_if_no_wrapper_does_so(options, length):
+    options = {"max_steps": None, **options, "entry_point": f"{__name__}:{options['entry_point']}"}
+    assert episode_length(GymnasiumEnv(observation_scaling="none", **options)) == length
+
+
+@pytest.mark.parametrize(("limits", "given", "length"), [([3], None, 3), ([5, 2], None, 2), ([3], 5, 3), ([3], 2, 2)])
+def test_of_several_limits_the_lowest_counts(limits, given, length, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "made", lambda: wrapped(*limits), raising=False)
+    assert episode_length(GymnasiumEnv(entry_point=f"{__name__}:made", max_steps=given)) == length
+
+
+@pytest.mark.parametrize("limit", [0, -5, "ten", 10.0, True, float("nan"), [3]])
+@pytest.mark.parametrize("name", ["Limited", "OldLimited"])
+def test_a_limit_that_is_no_number_of_steps_is_told_in_one_line(name, limit):
+    expected = (
+        r"imited: its spec has max_episode_steps=.*, which must be a whole number of at least 1; set env.max_steps$"
+    )
+    with pytest.raises(ValueError, match=expected):
+        GymnasiumEnv(entry_point=f"{__name__}:{name}", kwargs={"limit": limit})
+
+
+@pytest.mark.parametrize("limit", [None, -1])
+def test_no_limit_is_asked_for(limit):
+    with pytest.raises(ValueError, match=r"has no time limit of its own; set env\.max_steps"):
+        GymnasiumEnv(entry_point=f"{__name__}:Limited", kwargs={"limit": limit})
+
+
+def test_a_registered_limit_that_is_no_number_of_steps_is_told_in_one_line():
+    gymnasium.register("Wrongly-v0", entry_point=Toy, max_episode_steps=0)
+    try:
+        with pytest.raises(ValueError, match=r"^GymnasiumEnv: Wrongly-v0: .*max_episode_steps"):
+            GymnasiumEnv(id="Wrongly-v0")
+    finally:
+        del gymnasium.registry["Wrongly-v0"]
+
+
+@pytest.mark.parametrize("where", ["constructor", "option_names", "import"])
+def test_an_environment_that_ends_the_program_while_it_is_built_is_told_in_one_line(where, tmp_path, monkeypatch):
+    words = [*WORDS, f"env.kwargs={{where:{where}}}"]
+    if where == "import":
+        (tmp_path / "leaving_at_once.py").write_text("import sys\nsys.exit(0)\n")
+        monkeypatch.syspath_prepend(tmp_path)
+        words = [*WORDS, "env.entry_point=leaving_at_once:Env"]
+    told: list[str] = []
+    assert run(compose_config(words), tmp_path / "run", tell=told.append) == 1
+    (line,) = told
+    assert line.endswith("called sys.exit(0), which stopped the run") and ".py, line " in line and "\n" not in line
+
+
+def test_a_reward_of_an_evaluation_that_is_not_finite_is_told_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(Toy, "step", lambda self, action: (self._observation(), float("nan"), False, False, {}))
+    words = [word for word in WORDS if "entry_point" not in word]
+    with pytest.raises(ConfigError, match=r"^env: GymnasiumEnv: .*: the return of evaluation episode 0 is nan$"):
+        run(compose_config([*words, "env.entry_point=toy_environments:Toy"]), tmp_path)
+
+
+def test_an_environment_that_ends_the_program_later_is_told_in_one_line(capsys):
+    for where in ("reset", "step", "close"):
+        env = GymnasiumEnv(2, entry_point=f"{__name__}:Leaving", kwargs={"where": where}, max_steps=3)
+        if where == "close":
+            env.close()
+            assert capsys.readouterr().err == "Leaving: close called sys.exit(0); the run goes on\n" * 2
+            continue
+        with pytest.raises(ProblemError, match=rf"Leaving: environment 0: {where} called sys.exit\(0\)$"):
+            env.reset()
+            step(env)
+
+
+def test_a_command_tells_in_one_line_that_an_environment_ended_the_program(command):
+    code, _, err = command("watch", "low=random", *WORDS[:3])
+    assert code == 1 and err.count("\n") == 1 and "called sys.exit(0), which stopped the run" in err
