@@ -15,6 +15,7 @@ from PIL import Image
 from hpamdp.config import ConfigError
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import human_normalised
+from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.evaluate import Evaluation
@@ -118,20 +119,41 @@ def test_ctrl_c_saves_says_how_to_resume_and_resuming_ends_the_run(tmp_path, cap
 
     monkeypatch.setattr(Recorder, "take", interrupted)
     assert start(tmp_path / "stopped", "low=random", "total_frames=100_000_000", "eval.every=0") == 130
-    assert f"resume={tmp_path / 'stopped'}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"resume={tmp_path / 'stopped'}" in printed
     stopped = json.loads((tmp_path / "stopped" / "summary.json").read_text())
     assert 0 < stopped["frames"] <= 5 * 128 and not stopped["finished"]
+    before = rows_of(tmp_path / "stopped")
+    played = np.load(tmp_path / "stopped" / "evaluation.npz")["score"].mean()
+    assert float(before[-1]["eval/score"]) == stopped["score"] == pytest.approx(played)
+    assert float(before[-1]["frames"]) == stopped["frames"] and f" {stopped['score']:.3f} " in printed
     total = stopped["frames"] + 2048
     more = [f"resume={tmp_path / 'stopped'}", f"total_frames={total}"]
     assert run(compose_config(more), tmp_path / "resumed", more) == 0
     resumed = json.loads((tmp_path / "resumed" / "summary.json").read_text())
     assert resumed["frames"] >= total and resumed["wall_s"] > stopped["wall_s"]
-    before, after = rows_of(tmp_path / "stopped"), rows_of(tmp_path / "resumed")
-    assert [row["frames"] for row in after][: len(before)] == [row["frames"] for row in before]
-    assert float(after[-1]["frames"]) == resumed["frames"]
+    after = rows_of(tmp_path / "resumed")
+    assert [row["frames"] for row in after] == ["0.0", str(float(resumed["frames"]))], "without the row of the stop"
 
 
-def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_path, draw_all, monkeypatch):
+def test_a_second_ctrl_c_within_an_update_scores_the_agent_as_it_is_then(tmp_path, monkeypatch):
+    learn, batches = HierarchicalAgent.learn, itertools.count(1)
+
+    def interrupted(self, batch):
+        scalars = learn(self, batch)
+        if next(batches) == 2:
+            raise KeyboardInterrupt
+        return scalars
+
+    monkeypatch.setattr(HierarchicalAgent, "learn", interrupted)
+    assert start(tmp_path, "low=random", "eval.every=128") == 130
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    rows = rows_of(tmp_path)
+    assert [(row["frames"], row["stopped"]) for row in rows] == [("0.0", ""), ("128.0", ""), ("128.0", "1.0")]
+    assert float(rows[-1]["eval/score"]) == summary["score"]
+
+
+def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_path, capsys, draw_all, monkeypatch):
     start(tmp_path / "run", "low=random", "high=uniform")
     words = ["mode=eval", f"checkpoint={tmp_path / 'run'}"]
     with monkeypatch.context() as patch:
@@ -139,6 +161,8 @@ def test_a_saved_agent_is_scored_again_with_the_same_result_and_pictures(tmp_pat
         assert run(compose_config(words), tmp_path / "scored", words) == 0
     again, first = (json.loads((tmp_path / name / "summary.json").read_text()) for name in ("scored", "run"))
     assert again["score"] == first["score"] and again["high"] == "uniform" and again["low"] == "random"
+    assert again["frames"] == 1024 and again["wall_s"] < first["wall_s"]
+    assert "1,024 frames of training, evaluated in " in capsys.readouterr().out
     assert (tmp_path / "scored" / "trajectories.png").is_file()
     words.append("eval.layouts=33")
     run(compose_config(words), tmp_path / "more", words)

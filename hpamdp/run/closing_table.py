@@ -23,8 +23,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     """Return a plain aligned table of this agent beside the references.
 
     Args:
-        summary: the agent's figures by their names, `references`, `frames` and `wall_s`. Rows that the agent has no
-            figure for are left out, and so are columns without any.
+        summary: the agent's figures by their names, `references`, `mode`, `frames` and `wall_s`. Rows that the agent
+            has no figure for are left out, and so are columns without any.
         metrics: the rows.
     """
     titles = {name: title for name, (title, _, _) in REFERENCES.items()}
@@ -64,4 +64,5 @@ def _effort(summary: Mapping[str, Any]) -> list[str]:
         parts.append(f"{summary[FRAMES]:,.0f} frames")
     if _is_known(summary.get(WALL_SECONDS)):
         parts.append(duration(summary[WALL_SECONDS]))
-    return [" in ".join(parts)] if parts else []
+    joint = " of training, evaluated in " if summary.get("mode") == "eval" else " in "
+    return [joint.join(parts)] if parts else []

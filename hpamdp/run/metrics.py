@@ -13,6 +13,7 @@ from typing import Any
 from hpamdp.files import replacing
 
 FRAMES, WALL_SECONDS = "frames", "wall_s"
+STOPPED = "stopped"  # 1 in the row that was written because the run was stopped
 EVALUATION = "eval/"
 
 
@@ -43,7 +44,7 @@ class MetricsFile:
         path: the file. It stays as it is until the first row; what an earlier run left there is then kept as
             `<name>.previous`.
         resume_from: the metrics file of the run that is resumed, which may be `path` itself; its rows come first.
-        up_to_frames: leave out the resumed rows from the first one past this many frames on.
+        up_to_frames: leave out the resumed rows from the first one past this many frames on, and that of the stop.
     """
 
     def __init__(self, path: Path, resume_from: Path | None = None, up_to_frames: float = math.inf) -> None:
@@ -52,7 +53,7 @@ class MetricsFile:
         resumed = read_rows(resume_from) if resume_from is not None else []
         # Rows that wait for the first one of this run; None once they are in the file.
         self._resumed: list[dict[str, float]] | None = list(
-            takewhile(lambda row: row.get(FRAMES, 0.0) <= up_to_frames, resumed)
+            takewhile(lambda row: STOPPED not in row and row.get(FRAMES, 0.0) <= up_to_frames, resumed)
         )
 
     def append(self, row: Mapping[str, float]) -> None:

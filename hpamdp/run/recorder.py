@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from hpamdp.files import replacing
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
 from hpamdp.run.closing_table import closing_table
-from hpamdp.run.metrics import MetricsFile
+from hpamdp.run.metrics import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
 from hpamdp.run.summary import summarise
 
 FILM_NAME = "episodes.gif"
@@ -68,7 +69,7 @@ class Recorder:
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
         """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
         self._scalars |= scalars
-        self._played = None
+        self.forget_evaluation()
         if batch is None:
             return
         is_end = batch.get(("next", keys.DONE)).squeeze(-1)
@@ -77,9 +78,18 @@ class Recorder:
             ended.set(keys.OPTION, batch.get(keys.OPTION)[is_end])
         self._ended.append(ended)
 
-    def log(self, frames: int, wall_s: float, is_evaluated: bool) -> dict[str, float]:
-        """Write a row of metrics, with an evaluation if `is_evaluated`, and return it."""
-        row = {"frames": float(frames), "wall_s": wall_s, **self._training_scores(), **self._scalars}
+    def forget_evaluation(self) -> None:
+        """Evaluate again when the scores are needed next, as the agent may have changed."""
+        self._played = None
+
+    def log(self, frames: int, wall_s: float, is_evaluated: bool, *, is_stopped: bool = False) -> dict[str, float]:
+        """Write a row of metrics, with an evaluation if `is_evaluated`, and return it.
+
+        A row with `is_stopped` is the last one of a stopped run. The run that continues it leaves the row out.
+        """
+        row = {FRAMES: float(frames), WALL_SECONDS: wall_s, **self._training_scores(), **self._scalars}
+        if is_stopped:
+            row[STOPPED] = 1.0
         if is_evaluated:
             measured = self.parts.evaluation.measure(self._play())
             row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
@@ -89,8 +99,20 @@ class Recorder:
         self._scalars = {}
         return row
 
-    def finish(self, frames: int, wall_s: float, cpu_s: float, is_finished: bool) -> str:
-        """Evaluate, write the summary and the figures, close the logger; return the closing table."""
+    def finish(self, frames: int, wall_s: float, cpu_s: float, *, is_finished: bool) -> str:
+        """Evaluate, write the summary and the figures, close the logger; return the closing table.
+
+        Args:
+            frames: of training.
+            wall_s, cpu_s: of training; with `mode=eval`, the time of the evaluation takes their place.
+            is_finished: whether training reached its end; otherwise the evaluation is the last row of the metrics.
+        """
+        if self.config.run.mode == "eval":
+            wall_before, cpu_before = time.perf_counter(), time.process_time()
+            self._play()
+            wall_s, cpu_s = time.perf_counter() - wall_before, time.process_time() - cpu_before
+        if not is_finished and self._played is None:
+            self.log(frames, wall_s, is_evaluated=True, is_stopped=True)
         played = self._play()
         arrays: dict[str, Any] = dict(played)
         with replacing(self.output_dir / "evaluation.npz") as partial:

@@ -30,10 +30,12 @@ def summarise(
         env: the problem, which knows the references.
         measured: means of the agent's final evaluation, from `Evaluation.measure`.
         random: the same for the uniformly random agent.
-        effort: `frames`, `wall_s` and `cpu_s` of training, evaluations included.
+        effort: `frames` of training, `wall_s` and `cpu_s` of this run: of training, evaluations included, or with
+            `mode=eval` of the evaluation.
         is_finished: whether the run reached its end.
     """
     return {
+        "mode": config.run.mode,
         "high": config.high.name,
         "low": config.low.name,
         "env": config.env.name,

@@ -112,7 +112,7 @@ def _run(
         except WorkerDiedError as error:
             tell(f"{error} at frame {trainer.frames:,}; to go on: python run.py resume={output_dir}")
             return FAILED
-    say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, not is_interrupted))
+    say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, is_finished=not is_interrupted))
     say(f"Everything is in {output_dir}")
     if is_interrupted:
         mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
@@ -178,8 +178,8 @@ class Trainer:
             try:
                 self._continue(collection)
                 self._loop(collection, request)
-            except KeyboardInterrupt:  # the second signal
-                pass
+            except KeyboardInterrupt:  # the second signal, perhaps in the middle of an update
+                self.recorder.forget_evaluation()
             except (DivergedError, ConfigError):
                 collection.close()
                 raise
@@ -214,6 +214,11 @@ class Trainer:
         wall_before = self.wall_s - time.perf_counter()
         cpu_before = self.cpu_s - time.process_time()
         saved_at = time.monotonic()
+
+        def take_time() -> None:
+            self.wall_s = wall_before + time.perf_counter()
+            self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
+
         bar = tqdm(
             total=run.num_frames,
             initial=self.frames,
@@ -231,8 +236,7 @@ class Trainer:
                 num = self._learn(collection)
                 last = self.frames
                 self.frames += num
-                self.wall_s = wall_before + time.perf_counter()
-                self.cpu_s = cpu_before + time.process_time() + collection.cpu_s
+                take_time()
                 bar.update(num)
                 if self.frames >= run.num_frames or _is_due(last, self.frames, run.eval_every):
                     self._evaluate(bar)
@@ -242,6 +246,7 @@ class Trainer:
                 if not self._is_over() and (is_time or _is_due(last, self.frames, run.checkpoint_every)):
                     self.save(collection)
                     saved_at = time.monotonic()
+            take_time()
 
     def _learn(self, collection: Collection) -> int:
         """Let the agent learn from a batch of steps or from the data set; return the number of frames.
