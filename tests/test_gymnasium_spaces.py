@@ -36,6 +36,8 @@ TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
         (Tuple([Discrete(2), Box(0, 9, (2,), dtype=np.int64)]), "parameters must be Boxes of floats"),
         (Tuple([Discrete(2), Box(0, np.inf, (40, 2))]), "parameters must have finite bounds"),
         (Tuple([Discrete(2), Box(-1e300, 1e300, (2,), dtype=np.float64)]), "parameters must have finite bounds"),
+        (Tuple([Discrete(2), Box(-1e308, 1e308, (2,), dtype=np.float64)]), "parameters must have finite bounds"),
+        (Tuple([Discrete(2), Box(1.7e9, 1.7e9, (2,), dtype=np.float64)]), "a parameter's lower bound must be less"),
         (Tuple([Discrete(2), Box(1, 1, (2,))]), "a parameter's lower bound must be less than its upper bound"),
         (Tuple([Discrete(2), Box(0, 1, (0,))]), "no discrete action has a parameter"),
     ],
@@ -46,7 +48,38 @@ def test_another_action_space_is_refused_in_one_line(space, reason):
         ActionSpace(space)
     line = str(raised.value)
     assert line.startswith(f"action space {type(space).__name__}(") and "\n" not in line and len(line) < 700
-    assert f": {reason}; accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P" in line
+    assert f": {reason}" in line and "; accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P" in line
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(1.7e9, 1.7e9 + 3600.0), (-5e4, -5e4 + 1e-3), (0.0, 1e-320), (1e30, 1e30 + 1e20), (99.0, 100.0)]
+)
+def test_bounds_that_float32_cannot_resolve_are_reached_in_float64(low, high):
+    wide, narrow = Box(low, high, (1,), np.float64), Box(-3.0, 5.0, (1,), np.float64)
+    space = ActionSpace(Tuple([Discrete(2), Tuple([narrow, wide])]))
+    assert space.parameter_dims == (1, 1)
+    assert space.low.tolist() == [-3.0, -1.0] and space.high.tolist() == [5.0, 1.0]
+    units = np.linspace(-1.0, 1.0, 3601, dtype=np.float32)
+    values = np.array([space.to_native(1, np.array([0.5, unit], np.float32))[1][1][0] for unit in units])
+    assert values[0] == low and values[-1] == high and values.dtype == np.float64
+    exact = low + 0.5 * (units.astype(np.float64) + 1.0) * (high - low)
+    np.testing.assert_allclose(
+        values - low, exact - low, rtol=0, atol=1e-6 * (high - low) + np.spacing(max(-low, high))
+    )
+    if high - low > 1e-300:
+        assert len(np.unique(values)) == 3601
+    others = {-np.inf: low, np.inf: high, 9.0: high, np.nan: low}
+    assert all(space.to_native(1, np.float32([9.0, given]))[1][1][0] == value for given, value in others.items())
+    assert space.to_native(0, np.float32([9.0, 0.0]))[1][0] == 5.0
+
+
+def test_bounds_that_float32_resolves_are_passed_as_they_are():
+    boxes = [Box(-1.0, 1.0, (1,), np.float64), Box(1.7e9, 1.7e9 + 4096, (1,)), Box(0, 1, (1,), np.float16)]
+    space = ActionSpace(Tuple([Discrete(3), Tuple(boxes)]))
+    assert space.low.tolist() == [-1.0, np.float32(1.7e9), 0.0]
+    given = np.float32([0.123, 1.7e9 + 256, 0.25])
+    values = [part[0] for part in space.to_native(0, given)[1]]
+    assert values == given.tolist()
 
 
 def test_the_sizes_of_a_split_box_must_add_up():

@@ -12,7 +12,9 @@ entry, with any names, and a `OneOf` of K boxes. The `Discrete` may have any `st
   whole. Without, each discrete action takes the whole box: the vector holds one copy for each, and the chosen action's
   copy is passed.
 
-Boxes hold floats with finite bounds, in any shape.
+Boxes hold floats with finite bounds, in any shape. An agent's parameters are float32. If float32 cannot resolve a
+parameter of a more precise Box to a millionth of its width, as with times in seconds since 1970, the agent's parameter
+lies in [-1, 1] instead. It is mapped to the Box in float64.
 
 A space may have one more entry, a `Discrete`: the option, which the agent chooses less often than the action. It is the
 entry `option` of a `Dict`, or the entry that `option_key` names. What is left without it has one of the forms above, or
@@ -34,6 +36,9 @@ _ACCEPTED = (
     "one Box for all discrete actions, Tuple(Discrete(K), Box, ..., Box) with K Boxes, and OneOf(K Boxes)"
 )
 
+# Of a parameter, in widths of its Box.
+_RESOLUTION = 1e-6
+
 
 class ActionSpace:
     """A parameterised action space, and the way from a discrete action and its parameters to the space's own format.
@@ -44,7 +49,7 @@ class ActionSpace:
 
     Attributes:
         parameter_dims: number of parameters of each discrete action, K entries.
-        low, high: bounds of the parameters, float32 `[sum(parameter_dims)]`.
+        low, high: bounds of the agent's parameters, float32 `[sum(parameter_dims)]`.
 
     Raises:
         ValueError: the space has none of the accepted forms, or its box cannot be split as `parameter_dims` says.
@@ -67,8 +72,12 @@ class ActionSpace:
         self.parameter_dims = tuple(sizes if parameter_dims is None else parameter_dims)
         if sum(self.parameter_dims) == 0:
             raise self._refusal("no discrete action has a parameter")
-        self.low = np.concatenate([_float32(box.low) for box in self._boxes])
-        self.high = np.concatenate([_float32(box.high) for box in self._boxes])
+        self._low = np.concatenate([box.low.ravel().astype(np.float64) for box in self._boxes])
+        self._high = np.concatenate([box.high.ravel().astype(np.float64) for box in self._boxes])
+        is_precise = np.concatenate([np.full(box.shape, box.dtype.itemsize > 4).ravel() for box in self._boxes])
+        self._is_unit = is_precise & ~_is_resolved(self._low, self._high)
+        self.low = np.where(self._is_unit, -1.0, self._low).astype(np.float32)
+        self.high = np.where(self._is_unit, 1.0, self._high).astype(np.float32)
 
     def to_native(self, discrete: int, parameters: np.ndarray) -> Any:
         """Return an action in the space's own format.
@@ -78,6 +87,9 @@ class ActionSpace:
             parameters: of all discrete actions, `[sum(parameter_dims)]`. Values outside their bounds are clipped; NaN
                 becomes the lower bound.
         """
+        if self._is_unit.any():
+            share = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
+            parameters = np.where(self._is_unit, self._low + share * (self._high - self._low), parameters)
         native_discrete = self._discrete.dtype.type(self._discrete.start + discrete)
         values: Any
         if self._has_one_box:
@@ -130,12 +142,10 @@ class ActionSpace:
     def _checked_box(self, box: spaces.Space) -> spaces.Box:
         if not isinstance(box, spaces.Box) or box.dtype.kind != "f":
             raise self._refusal("parameters must be Boxes of floats")
-        low = _float32(box.low)
-        high = _float32(box.high)
         with np.errstate(over="ignore", invalid="ignore"):
-            if not np.isfinite(high - low).all():
-                raise self._refusal("parameters must have finite bounds")
-        if not (low < high).all():
+            if not np.isfinite(box.high.astype(np.float32) - box.low.astype(np.float32)).all():
+                raise self._refusal("parameters must have finite bounds, at most 3.4e38 apart")
+        if not (box.low < box.high).all():
             raise self._refusal("a parameter's lower bound must be less than its upper bound")
         return box
 
@@ -237,9 +247,10 @@ def _fill(box: spaces.Box, values: np.ndarray) -> np.ndarray:
     return values.reshape(box.shape)
 
 
-def _float32(bounds: np.ndarray) -> np.ndarray:
-    with np.errstate(over="ignore"):
-        return bounds.astype(np.float32).ravel()
+def _is_resolved(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return whether neighbouring numbers of float32 within the bounds lie at most a millionth of their width apart."""
+    largest = np.maximum(np.abs(low), np.abs(high)).astype(np.float32)
+    return np.spacing(largest).astype(np.float64) <= _RESOLUTION * (high - low)
 
 
 def written(space: spaces.Space) -> str:
