@@ -16,9 +16,10 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard, get_type_hints
 
 import hydra
+import yaml
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -50,14 +51,22 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "collector": ("config", "parts", "frames"),
 }
 RUN_FILE = "conf/config.yaml"
+TARGET = "_target_"
 
 _CAN_BE_NONE = ("high", "data")
-_TARGET = "_target_"
 _MOST_COMPLAINTS = 3
 # Larger numbers leave those that a computation can hold; infinity is refused as well.
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
-# Entries of a group that are not options of its class.
-_NO_OPTIONS = {"low": ("budget", "checkpoint", "freeze", "per_option"), "env": ("options",)}
+# Entries of a group that are values of the run, not options of its class.
+RUN_ENTRIES: dict[str, tuple[str, ...]] = {"low": ("budget", "checkpoint", "freeze", "per_option"), "env": ("options",)}
+# Entries of a learner that the learner of a single option cannot have, and what to do instead.
+_NOT_PER_OPTION = {
+    TARGET: "the class is that of the yaml file; give its name",
+    "budget": "a run has one budget; set total_frames, num_envs, steps_per_batch or eval.every",
+    "checkpoint": "a checkpoint fills all learners; set low.checkpoint",
+    "freeze": "all learners are frozen or none; set low.freeze",
+    "per_option": "an option has one learner",
+}
 
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
 
@@ -66,6 +75,18 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]  # NumPy takes no larger ones
 
 class ConfigError(ValueError):
     """A user's mistake, told in one line."""
+
+
+class MissingChoiceError(ConfigError):
+    """A choice whose yaml file is in no folder that is searched.
+
+    Attributes:
+        known: the names that the group has.
+    """
+
+    def __init__(self, choice: str, known: Iterable[str]) -> None:
+        super().__init__(f"the saved run chose {choice}, which is not there; is a --config-dir missing?")
+        self.known = tuple(known)
 
 
 def _check_device(name: str) -> str:
@@ -108,7 +129,8 @@ class OfflineConfig(BaseModel):
 class StartConfig(BaseModel):
     """The learners that a run starts with, and which of them are of another class than `low`.
 
-    `per_option` maps the name of an option to the name of a learner, or to its `name` and options.
+    `per_option` maps the name of an option to the name of a learner, or to its `name` and options; once checked, to the
+    name and all options.
     """
 
     model_config = _STRICT
@@ -166,6 +188,9 @@ class RunConfig(BaseModel):
     compile_updates: bool = False
     update_precision: Literal["float32", "bfloat16"] = "float32"
 
+    # A permission of one command, which no file can give and no run saves.
+    trust: bool = False
+
     @property
     def num_frames(self) -> int:
         """Length of the training: in updates with mode=offline, else in steps or decisions."""
@@ -212,6 +237,15 @@ class Component:
 
     def __str__(self) -> str:
         return f"{self.group}={self.name}"
+
+    def is_guarded(self, name: str, value: object) -> bool:
+        """Return whether a saved config cannot give a setting this value unasked.
+
+        The class says so in `guarded_settings`, by the name of the setting, or by `name=value` if only that value is
+        guarded.
+        """
+        guarded = getattr(self.cls, "guarded_settings", ())
+        return name in guarded or f"{name}={value}" in guarded
 
     def build(self, **context: Any) -> Any:
         """Build the object; None where there is no class.
@@ -264,13 +298,22 @@ class Config:
         return [self.low, *self.low_of.values()]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the config as plain values, with the classes by their names: what a run saves and is resumed from."""
-        values = self.run.model_dump(mode="json")
+        """Return the config as plain values: what a run saves and is resumed from.
+
+        A value has its name on the command line, such as `low` / `lr`. `choices` has the name that was chosen for each
+        group, so that a class may have a setting of any name.
+        """
+        values = self.run.model_dump(mode="json", exclude={"trust"})
+        values["choices"] = {group: getattr(self, group).name for group in GROUPS}
         for group in GROUPS:
             component: Component = getattr(self, group)
             options = json.loads(json.dumps(dict(component.options)))  # tuples become lists
-            values[group] = {"name": component.name, **options, **values.get(group, {})}
+            values[group] = {**options, **values.get(group, {})}
         return values
+
+    def to_yaml(self) -> str:
+        """Return the same as text; a reader must not resolve what looks like an interpolation in it."""
+        return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
 
 
 def conf_dir() -> Path:
@@ -301,43 +344,64 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     """
     names = chosen_names(cfg) if choices is None else choices
     for group in GROUPS:
-        if cfg.get(group) is None or _TARGET not in cfg[group]:
+        if cfg.get(group) is None or TARGET not in cfg[group]:
             if names.get(group) is not None:
-                raise ConfigError(f"{group}={names[group]}: {_file(group, names[group])} names no class as {_TARGET}")
+                raise ConfigError(f"{group}={names[group]}: {_file(group, names[group])} names no class as {TARGET}")
             raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
     own = cfg.copy()
     OmegaConf.set_struct(own, False)
     own.pop("hydra", None)
-    plain = _plain(own)
-    values = {name: value for name, value in plain.items() if name not in GROUPS}
-    values["env"] = {name: plain["env"].get(name) for name in EnvConfig.model_fields}
-    values["low"] = {name: plain["low"].get(name) for name in StartConfig.model_fields}
+    return check(plain(own), names)
+
+
+def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
+    """Check the config as plain values, in which no text is resolved.
+
+    Args:
+        given: the values of the run; for each group a mapping of `_target_` and the settings.
+        names: the name that was chosen for each group.
+
+    Raises:
+        ConfigError: a wrong value.
+    """
+    values = {name: value for name, value in given.items() if name not in GROUPS}
+    values["env"] = {name: given["env"].get(name) for name in EnvConfig.model_fields}
+    values["low"] = {name: given["low"].get(name) for name in StartConfig.model_fields}
     run = _validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
-    if "budget" in plain["low"]:
+    if "budget" in given["low"]:
         file = _file("low", names["low"])
-        budget = plain["low"]["budget"]
+        budget = given["low"]["budget"]
         if not isinstance(budget, dict):
             raise ConfigError(f"low.budget={_as_json(budget)}: must be a mapping ({file})")
         _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
-    components = {group: component(group, names[group], plain[group]) for group in GROUPS}
-    return Config(run, **components, low_of=_learners_of_options(run.low.per_option or {}))
+    components = {group: component(group, names[group], given[group]) for group in GROUPS}
+    low_of = _learners_of_options(run, names["env"])
+    if low_of:
+        # With all their settings, so that a saved run keeps them if their yaml files change.
+        in_full = {option: {**low.options, "name": low.name} for option, low in low_of.items()}
+        run = run.model_copy(update={"low": run.low.model_copy(update={"per_option": in_full})})
+    return Config(run, **components, low_of=low_of)
 
 
-def _learners_of_options(choices: Mapping[str, str | Mapping[str, Any]]) -> dict[str, Component]:
-    """Return the learner of each of these options: its yaml with the given options."""
+def _learners_of_options(run: RunConfig, env: str) -> dict[str, Component]:
+    """Return the learner of each option in `low.per_option`: its yaml and its recipe with the given settings."""
     learners = {}
-    for option, choice in choices.items():
+    for option, choice in (run.low.per_option or {}).items():
         given = {"name": choice} if isinstance(choice, str) else dict(choice)
-        name = str(given.pop("name", ""))
-        if not re.fullmatch(r"\w+", name):
-            given_choice = f"low.per_option.{option}={_as_json(choice)}"
-            raise ConfigError(f"{given_choice}: must be the name of a learner, or its name and options")
+        where = f"low.per_option.{option}"
+        name = given.pop("name", None)
+        if not is_name(name):
+            raise ConfigError(f"{where}={_as_json(choice)}: must be the name of a learner, or its name and options")
+        for word, instead in _NOT_PER_OPTION.items():
+            if word in given:
+                raise ConfigError(f"{where}.{word}: {instead}")
         try:
-            node = _compose([f"low={name}"]).low
+            cfg = compose([f"env={env}", f"low={name}"])
         except ConfigError as error:
-            raise ConfigError(f"low.per_option.{option}={name}: there is no {_file('low', name)}") from error
-        learners[option] = component("low", name, {**_plain(node, "low"), **given})
+            raise ConfigError(f"{where}={name}: there is no {_file('low', name)}") from error
+        yaml = plain_groups(cfg, run.model_dump(), ["low"])["low"]
+        learners[option] = component("low", name, {**yaml, **given})
     return learners
 
 
@@ -349,7 +413,9 @@ def compose_words(words: list[str]) -> DictConfig:
     """
     try:
         with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-            return hydra.compose("config", words, return_hydra_config=True)
+            cfg = hydra.compose("config", words, return_hydra_config=True)
+            HydraConfig.instance().set_config(cfg)  # as for a job; `compose` takes the searched folders from it
+            return cfg
     except (hydra.errors.HydraException, OmegaConfBaseException) as error:
         raise ConfigError(f"{' '.join(words)}: {first_line(error)}") from error
 
@@ -404,34 +470,48 @@ def component(group: str, name: str, node: Any) -> Component:
     Raises:
         ConfigError: all that is wrong with this group, in one line.
     """
-    options = _plain(node, group)
-    for entry in _NO_OPTIONS.get(group, ()):
+    options = plain(node, group)
+    own = RUN_ENTRIES.get(group, ())
+    for entry in own:
         options.pop(entry, None)
-    target = options.pop(_TARGET, None)
+    target = options.pop(TARGET, None)
     file = _file(group, name)
     cls = None if target is None and group in _CAN_BE_NONE else _load_target(group, target, file)
     class_name = "none" if cls is None else cls.__name__
+    taken = [] if cls is None else [entry for entry in (TARGET, *own) if entry in constructor_arguments(cls)]
+    if taken:
+        raise ConfigError(
+            f"{group}={name}: {class_name} has an argument {taken[0]}, but {group}.{taken[0]} is a value of the run; "
+            f"rename the argument ({file})"
+        )
     schema = create_model(class_name, __config__=_STRICT) if cls is None else _schema(cls, GROUPS[group])
     model = _validated(schema, options, f"{group}.", f"option of {class_name} ({file})", f"{class_name}, {file}")
     return Component(group, name, cls, {option: getattr(model, option) for option in schema.model_fields})
 
 
-def compose_saved(saved: Mapping[str, Any]) -> tuple[DictConfig, dict[str, str]]:
-    """Return a config that `Config.to_dict` gave as `read` takes it, with the classes of today's yaml files.
+def plain_groups(cfg: DictConfig, run: Mapping[str, Any], groups: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return these groups of a composed config as plain values.
+
+    Settings that refer to a number of the run, such as `${total_frames}`, get it from `run`. Text of `run` is not used.
+    """
+    cfg = cfg.copy()
+    for name in RunConfig.model_fields:
+        if name in cfg and isinstance(run.get(name), int | float):
+            cfg[name] = run[name]
+    return {group: plain(cfg[group], group) for group in groups}
+
+
+def is_name(name: object) -> TypeGuard[str]:
+    """Return whether this can be the name of a group's yaml file: words and slashes, but no way out of the folder."""
+    return isinstance(name, str) and re.fullmatch(r"\w[\w.+-]*(/\w[\w.+-]*)*", name) is not None
+
+
+def compose(overrides: list[str]) -> DictConfig:
+    """Return the config of these words, in the folders that the running job searches for yaml files.
 
     Raises:
-        ConfigError: a name of the saved config is in no folder that is searched for yaml files.
+        MissingChoiceError: a word chooses what is in none of these folders.
     """
-    choices = {group: saved[group]["name"] for group in GROUPS}
-    today = _compose([f"{group}={name}" for group, name in choices.items()])
-    values = dict(saved)
-    for group in GROUPS:
-        options = {name: value for name, value in saved[group].items() if name != "name"}
-        values[group] = {**{str(key): value for key, value in today[group].items()}, **options}
-    return OmegaConf.create(values), choices
-
-
-def _compose(overrides: list[str]) -> DictConfig:
     if HydraConfig.initialized():
         given = HydraConfig.get().overrides.hydra
         overrides = [*(word for word in given if word.startswith("hydra.searchpath=")), *overrides]
@@ -441,9 +521,16 @@ def _compose(overrides: list[str]) -> DictConfig:
         with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
             return hydra.compose("config", overrides)
     except hydra.errors.MissingConfigException as error:
-        raise ConfigError(
-            f"the saved run chose {error.missing_cfg_file}, which is not there; is a --config-dir missing?"
-        ) from error
+        raise MissingChoiceError(str(error.missing_cfg_file), error.options or ()) from error
+
+
+def names_of(group: str) -> tuple[str, ...]:
+    """Return the names of a group's yaml files in all folders that are searched."""
+    try:
+        compose([f"{group}=__none__"])
+    except MissingChoiceError as error:  # Hydra lists the names only here.
+        return error.known
+    return ()
 
 
 def constructor_arguments(cls: type) -> dict[str, inspect.Parameter]:
@@ -478,13 +565,13 @@ def _load_target(group: str, target: Any, file: str) -> type:
     try:
         return load_class(str(target))
     except ConfigError as error:
-        raise ConfigError(f"{group}.{_TARGET}={error} ({file})") from error
+        raise ConfigError(f"{group}.{TARGET}={error} ({file})") from error
 
 
 def no_such_option(node: Mapping[str, Any], name: str, file: str) -> str:
     """Return that the class which a group's part of the config describes has no such option."""
-    cls = str(node.get(_TARGET) or "none").rpartition(".")[2]
-    return no_such(f"option of {cls} ({file})", name, [option for option in node if option not in (_TARGET, "budget")])
+    cls = str(node.get(TARGET) or "none").rpartition(".")[2]
+    return no_such(f"option of {cls} ({file})", name, [option for option in node if option not in (TARGET, "budget")])
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:
@@ -495,7 +582,7 @@ def no_such(what: str, name: str, known: Iterable[str]) -> str:
     return f"no such {what}; {guess} has {', '.join(known) or 'none'}"
 
 
-def _plain(node: Any, where: str = "the config") -> dict[str, Any]:
+def plain(node: Any, where: str = "the config") -> dict[str, Any]:
     """Resolve a part of the config into plain Python values."""
     if not isinstance(node, Mapping | DictConfig):
         raise ConfigError(f"{where}={_as_json(node)}: must be a mapping")

@@ -11,8 +11,9 @@ from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
 from hpamdp import config as config_module
-from hpamdp.config import GROUPS, ConfigError, component, compose_saved, load_class, read
+from hpamdp.config import GROUPS, ConfigError, component, load_class, read
 from hpamdp.run.train import run
+from hpamdp.saved_config import read_saved
 
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
 
@@ -175,7 +176,7 @@ def test_a_saved_config_has_names_instead_of_modules_and_is_read_back_the_same(w
     config = make_config([*words, "seed=3"])
     saved = config.to_dict()
     assert not module_paths(saved) and "_target_" not in str(saved)
-    assert read(*compose_saved(saved)) == config
+    assert read_saved(saved) == config
 
 
 @pytest.mark.parametrize(
@@ -203,9 +204,9 @@ def test_a_number_of_steps_goes_with_options_that_end_after_steps_alone(words, c
 
 def test_a_name_of_a_saved_config_that_is_nowhere_is_told_in_one_line():
     saved = make_config([]).to_dict()
-    saved["low"]["name"] = "gone"
+    saved["choices"]["low"] = "gone"
     with pytest.raises(ConfigError, match=r"the saved run chose low/gone, which is not there; is a --config-dir miss"):
-        compose_saved(saved)
+        read_saved(saved)
 
 
 def test_one_run_checks_its_config_once(tmp_path, monkeypatch):

@@ -8,9 +8,10 @@ from test_assemble import QUICK_CRITIC, make, train
 from test_grid import SHORT, SMALL
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, compose_saved, read
+from hpamdp.config import ConfigError
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.paddpg import PADDPG
+from hpamdp.saved_config import read_saved
 
 WORDS = [*SMALL, "env=platform", "+env.options=default", *QUICK_CRITIC, "low=hppo", *SHORT["hppo"]]
 PER_OPTION = "+low.per_option={jump: {name: paddpg, hidden_dims: [16], warmup_frames: 10, batch_size: 16}}"
@@ -31,7 +32,7 @@ def test_learners_of_two_classes_train_side_by_side(tmp_path):
 def test_the_other_options_keep_the_learner_of_the_run():
     config = make_config([*WORDS, "+low.per_option={jump: random}"])
     assert config.low.name == "hppo" and {name: low.name for name, low in config.low_of.items()} == {"jump": "random"}
-    assert read(*compose_saved(config.to_dict())) == config
+    assert read_saved(config.to_dict()) == config
 
 
 @pytest.mark.parametrize(

@@ -9,12 +9,13 @@ from test_assemble import QUICK_CRITIC, make, train
 from test_grid import SHORT, SMALL
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, compose_saved, read
+from hpamdp.config import ConfigError
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import make_env
+from hpamdp.saved_config import read_saved
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")
@@ -91,7 +92,7 @@ def test_an_action_that_the_option_does_not_allow_is_refused():
 def test_options_of_actions_are_saved_with_the_config():
     config = make_config(["env=platform", "high=uniform", "low=random", "+env.options={a: [0], b: [leap]}"])
     assert config.run.env.options == {"a": [0], "b": ["leap"]}
-    assert read(*compose_saved(config.to_dict())) == config
+    assert read_saved(config.to_dict()) == config
 
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])

@@ -256,5 +256,5 @@ def test_a_resumed_run_keeps_the_saved_options_of_the_choices_that_it_does_not_c
     for number, words in enumerate((["env.max_steps=50"], ["env=platform", "low=hppo"])):
         assert command(f"resume={saved}", f"hydra.run.dir={number}", *words)[0] == 0
         config = OmegaConf.load(tmp_path / f"{number}/config.yaml")
-        assert config.env.noise == 0.5 and config.low.name == "hppo"
+        assert config.env.noise == 0.5 and config.choices.low == "hppo"
         assert config.env.max_steps == (50 if number == 0 else 200)

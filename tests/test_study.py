@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 
 from hpamdp.analysis.study import (
     Run,
@@ -68,7 +67,7 @@ def test_finished_runs_are_found_at_any_depth_and_unfinished_ones_left_out(tmp_p
     (tmp_path / "c").mkdir()
     (tmp_path / "c/metrics.csv").write_text("frames\n1\n")
     runs = finished([tmp_path])
-    assert [run.summary["seed"] for run in runs] == [2, 1] and runs[1].config.env.reward == "paper"
+    assert [run.summary["seed"] for run in runs] == [2, 1] and runs[1].config["env"]["reward"] == "paper"
     assert finished([tmp_path / "b", str(tmp_path / "a")])[0].summary["seed"] == 1
 
 
@@ -203,7 +202,7 @@ def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length
 
 def test_few_steps_keeps_runs_that_were_left_running_apart(tmp_path):
     learner = dict(augment="auto", num_members=5, posterior_sampling="auto", updates_per_frame=10.0, horizon=2)
-    config = OmegaConf.create({"low": learner, "env": {"reward": "paper"}})
+    config = {"low": learner, "env": {"reward": "paper"}}
     runs = []
     for name, frames in (("short", 384), ("long", 2000)):
         leave_run(tmp_path / name, low="pets")

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import yaml
 
 AGENTS = Path(__file__).resolve().parents[2] / "agents"
 # What of a problem's settings tells one agent from another.
@@ -22,12 +22,12 @@ HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success"
 def row(folder: Path) -> list[str]:
     """Return an agent's cells."""
     summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    env = OmegaConf.load(folder / "config.yaml").env
+    env = yaml.safe_load((folder / "config.yaml").read_text())["env"]
     told = [f"{name}={env[name]}" for name in TOLD if name in env and env[name] != "choose"]
     ceiling = summary.get("ceiling")
     return [
         f"`{folder.name}`",
-        ", ".join([env.name, *told]),
+        ", ".join([summary["env"], *told]),
         summary["high"],
         summary["low"],
         f"{summary['score']:.3f}",
@@ -49,7 +49,7 @@ def main(words: Sequence[str]) -> None:
 
 def _order(folder: Path) -> tuple[bool, str, int, str]:
     """Return what puts the boats first, then the problems by name, and Hard Move by its number of actuators."""
-    problem = OmegaConf.load(folder / "config.yaml").env.name
+    problem = json.loads((folder / "summary.json").read_text())["env"]
     return problem != "boatdock", problem, len(folder.name), folder.name
 
 

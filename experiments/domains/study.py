@@ -78,7 +78,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
 def domain(run: Run) -> str:
     """Return the domain's name; Hard Move's has its number of actuators."""
     name = str(run.summary["env"])
-    return f"{name}_{run.config.env.n}" if name == "hard_move" else name
+    return f"{name}_{run.config['env']['n']}" if name == "hard_move" else name
 
 
 def learner(run: Run) -> str:
@@ -87,12 +87,12 @@ def learner(run: Run) -> str:
     `AUGMENTED` may follow.
     """
     name = str(run.summary["low"])
-    low = run.config.low
-    if name == "paddpg" and low.twin:
+    low = run.config["low"]
+    if name == "paddpg" and low["twin"]:
         name = "patd3"
-    elif name == "pdqn_published" and low.multipass:
+    elif name == "pdqn_published" and low["multipass"]:
         name = "mpdqn_published"
-    elif name == "hyar" and low.rl == "ddpg":
+    elif name == "hyar" and low["rl"] == "ddpg":
         name = "hyar_ddpg"
     return f"{name}{AUGMENTED}" if low.get("augment", False) is True else name
 

@@ -55,7 +55,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
     augment: Rows = []
     for run in runs:
         evaluations = [{short: round(row[column], 4) for column, short in COLUMNS.items()} for row in run.evaluations()]
-        name = {"augment": str(run.config.low.augment), "seed": run.summary["seed"]}
+        name = {"augment": str(run.config["low"]["augment"]), "seed": run.summary["seed"]}
         if run.summary["low"] != "pets":
             presses = presses_to(HUMAN_SCORE, evaluations)
             augment.append(
@@ -68,7 +68,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
             continue
         name |= {
             "boat": run.summary["controller"],
-            "reward": "sparse" if run.config.env.reward == "sparse" else "shaped",
+            "reward": "sparse" if run.config["env"]["reward"] == "sparse" else "shaped",
             "variant": variant(run),
         }
         curves += [name | row for row in evaluations]
@@ -77,7 +77,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 def variant(run: Run) -> str:
     """Return what an ablation changed."""
-    values = {name: getattr(run.config.low, name) for name in ABLATED}
+    values = {name: run.config["low"][name] for name in ABLATED}
     return " ".join(f"{name}={value}" for name, value in values.items() if value not in ABLATED[name])
 
 

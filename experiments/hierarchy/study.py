@@ -60,8 +60,8 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
         name = {
             "high": run.summary["high"],
             "low": run.summary["low"],
-            "total": run.config.total_frames,
-            "uniform_option_frames": run.config.agent.get("uniform_option_frames", 0),
+            "total": run.config["total_frames"],
+            "uniform_option_frames": run.config["agent"].get("uniform_option_frames", 0),
             "seed": run.summary["seed"],
         }
         figures = {column: round(run.summary[key], 4) for column, key in COLUMNS.items()}

@@ -52,7 +52,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
         name = {
             "low": _name(run),
             "problem": summary.get("controller", summary["env"]),
-            "reward": "sparse" if run.config.env.get("reward") == "sparse" else "shaped",
+            "reward": "sparse" if run.config["env"].get("reward") == "sparse" else "shaped",
             "seed": summary["seed"],
         }
         reached = first_at(evaluations, "eval/score", HUMAN["chosen"]["score"])
@@ -77,10 +77,10 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
 
 def _name(run: Run) -> str:
     """Return the learner's name; P-DQN's published forms have names of their own."""
-    low = run.config.low
-    if run.summary["low"] != "pdqn" or low.twin_q:
+    low = run.config["low"]
+    if run.summary["low"] != "pdqn" or low["twin_q"]:
         return run.summary["low"]
-    return "pdqn as MP-DQN" if low.multipass else "pdqn as P-DQN"
+    return "pdqn as MP-DQN" if low["multipass"] else "pdqn as P-DQN"
 
 
 def table(results: Rows) -> str:

@@ -80,17 +80,17 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
 
 def _start(run: Run) -> str:
     """Return what a run's agent began with."""
-    if run.config.mode == "offline":
+    if run.config["mode"] == "offline":
         return OFFLINE
-    return SCRATCH if run.config.low.checkpoint is None else PRETRAINED
+    return SCRATCH if run.config["low"]["checkpoint"] is None else PRETRAINED
 
 
 def _data(run: Run) -> tuple[str, str]:
     """Return which form of the data's presses a run learned from, and which episodes."""
-    if run.config.mode != "offline":
+    if run.config["mode"] != "offline":
         return "none", "all"
-    data = REST_TO_REST if run.config.data.rest_to_rest else RECORDED
-    return data, "successes" if run.config.data.successes else "all"
+    data = REST_TO_REST if run.config["data"]["rest_to_rest"] else RECORDED
+    return data, "successes" if run.config["data"]["successes"] else "all"
 
 
 def table(results: Rows) -> str:

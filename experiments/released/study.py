@@ -34,7 +34,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
         summary = run.summary
         if summary["env"] != "boatdock_released":
             continue
-        name = {"low": summary["low"], "boat": run.config.env.controller, "seed": summary["seed"]}
+        name = {"low": summary["low"], "boat": run.config["env"]["controller"], "seed": summary["seed"]}
         learned.append(
             {
                 **name,

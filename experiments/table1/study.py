@@ -79,13 +79,13 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
         name = {
             "low": summary["low"],
             "boat": summary["controller"],
-            "reward": "sparse" if run.config.env.reward == "sparse" else "shaped",
+            "reward": "sparse" if run.config["env"]["reward"] == "sparse" else "shaped",
             "seed": summary["seed"],
         }
         evaluations = [
             {**name, **{column: round(row[column], 4) for column in EVALUATION_COLUMNS}} for row in run.evaluations()
         ]
-        if run.config.eval.get("stop_score") is not None:
+        if run.config["eval"].get("stop_score") is not None:
             efficiency.extend(evaluations)
             continue
         curves.extend(evaluations)

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+import yaml
 from scipy import stats
 
 from hpamdp.files import replacing
@@ -29,7 +29,7 @@ class Run:
 
     folder: Path
     summary: dict[str, Any]
-    config: DictConfig
+    config: dict[str, Any]
 
     def evaluations(self) -> list[dict[str, float]]:
         """Return the rows of its metrics that hold an evaluation."""
@@ -47,8 +47,7 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     for file in (file for folder in folders for file in sorted(Path(folder).glob("**/summary.json"))):
         summary = json.loads(file.read_text())
         if summary["finished"]:
-            config = OmegaConf.load(file.parent / "config.yaml")
-            assert isinstance(config, DictConfig)
+            config = yaml.safe_load((file.parent / "config.yaml").read_text())
             runs.append(Run(file.parent, summary, config))
         else:
             warn(f"{file.parent}: was stopped, left out")

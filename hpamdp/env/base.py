@@ -76,6 +76,9 @@ class PAMDPEnv(EnvBase):
     # longer than simple physics of 65,536 environments, would change nothing and is left out.
     reset_returns_all_rows: ClassVar[bool] = False
 
+    # Settings that can run code, read files or reach servers. A saved config sets them only if the user says so.
+    guarded_settings: ClassVar[tuple[str, ...]] = ()
+
     # Settings that leave the choice of an option to the agent and that take it away, to name in an error.
     choice_setting: ClassVar[str] = ""
     no_choice_setting: ClassVar[str] = ""

@@ -131,6 +131,7 @@ class Selector(TensorDictModuleBase):
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
+    guarded_settings: ClassVar[tuple[str, ...]] = ()
     asks_learners: ClassVar[bool] = False
     is_bandit: ClassVar[bool] = False
     ends_options: ClassVar[bool] = False
@@ -312,6 +313,7 @@ class Learner(nn.Module):
         specs: sizes and bounds of the problem.
         policy: the module that acts.
         needs: what the environment must reveal beyond its observation, as in `Selector`.
+        guarded_settings: settings that can run code, read files or reach servers, as in `Selector`.
         modes: what the learner can learn from. `train`: transitions that the agent collects (`mode=train`). `offline`:
             a data set (`mode=offline`, or `data=...` with `mode=train`).
         value_option: name of the setting without which there is no `value`; None: where there is the method, there is.
@@ -321,6 +323,7 @@ class Learner(nn.Module):
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
+    guarded_settings: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_option: ClassVar[str | None] = None
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})

@@ -6,7 +6,7 @@ import netrc
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 from urllib.parse import urlsplit
 
 from pydantic import Field, ValidationError
@@ -134,6 +134,8 @@ class WandbLogger:
         output_dir: the run's folder; offline runs lie in `wandb` in it, ready for `wandb sync`.
         config: the run's settings, to be shown beside its numbers.
     """
+
+    guarded_settings: ClassVar[tuple[str, ...]] = ("entity", "mode=online")
 
     def __init__(
         self,

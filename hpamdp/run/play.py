@@ -22,6 +22,7 @@ from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.folder import POLICY_NAME, SUMMARY_NAME
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.run.players import Player, load_player, split_words, whole_number
+from hpamdp.saved_config import choices_of
 
 _DESCRIPTION = """\
 Play a problem yourself, beside agents.
@@ -89,7 +90,7 @@ def own_agents(config: Config) -> list[dict[str, Any]]:
         return []
     files = sorted(folder.glob(f"*/{POLICY_NAME}"))
     # Most are of other problems, and an agent takes half a second to build.
-    folders = [file.parent for file in files if progress_of(file)["config"]["env"]["name"] == config.env.name]
+    folders = [file.parent for file in files if choices_of(progress_of(file)["config"])["env"] == config.env.name]
     agents = [_agent(path, load_player(str(path), _ONE_EPISODE)) for path in folders]
     return [agent for agent in agents if agent is not None]
 

@@ -9,14 +9,19 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config import GROUPS, Config, ConfigError, chosen_names, compose_saved, read
+from hpamdp.config import GROUPS, Config, ConfigError, chosen_names, plain, read
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env
+from hpamdp.saved_config import choices_of, in_todays_form, read_saved
 
 # Parts of the config that make the agent what it is.
 _AGENT = ("high", "low", "agent", "experiment", "search")
+# How the saved run began does not matter to one that starts from it.
+_BEGIN = ("mode", "resume", "checkpoint", "overwrite", "trust")
+# Groups that an evaluation does not take from the saved run: it collects no steps and logs where the command line says.
+_NOT_EVALUATED = ("data", "logger", "collector")
 
 
 def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | None]:
@@ -42,15 +47,18 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
         raise ConfigError(
             f"resume={source}: a run with mode={saved['mode']}; resume it so, or start one with low.checkpoint={source}"
         )
-    merged, names = compose_saved(saved)
-    for key in ("mode", "resume", "checkpoint", "overwrite"):  # how that run began does not matter to this one
-        merged[key] = cfg[key]
-    for override in _anew(overrides, saved, file, where):
-        key = _key(override)
-        OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False)
-        if key in GROUPS:
-            names[key] = chosen_names(cfg)[key]
-    return read(merged, names), file
+    values = {key: cfg[key] for key in _BEGIN}
+    if config.run.mode == "eval":
+        values |= {group: _plain_value(cfg, group) for group in _NOT_EVALUATED}
+    keys = map(_key, _anew(overrides, saved, file, where))
+    values |= {key: _plain_value(cfg, key) for key in keys if not key.startswith("hydra")}
+    names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
+    return read_saved(saved, values, names, trust=config.run.trust, file=file), file
+
+
+def _plain_value(cfg: DictConfig, key: str) -> Any:
+    value = OmegaConf.select(cfg, key)
+    return plain(value, key) if isinstance(value, DictConfig) else value
 
 
 def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str, str]:
@@ -67,7 +75,8 @@ def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str
     file = checkpoint.find(source, where)
     saved = checkpoint.progress_of(file)["config"]
     _anew(overrides, saved, file, where)
-    return {group: saved[group]["name"] for group in GROUPS}
+    left_out = () if where == "resume" else _NOT_EVALUATED
+    return {group: name for group, name in choices_of(saved).items() if group not in left_out}
 
 
 def check_saved_options(config: Config, env: PAMDPEnv) -> None:
@@ -88,9 +97,10 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
     if source is None:
         return
     progress = checkpoint.progress_of(checkpoint.find(source, where))
-    if progress["config"]["env"] == config.to_dict()["env"]:
+    saved, now_env = in_todays_form(progress["config"]), config.to_dict()
+    if (saved["choices"]["env"], saved["env"]) == (now_env["choices"]["env"], now_env["env"]):
         return
-    before, now = _option_names(progress), env.option_names if env.has_choice else ()
+    before, now = _option_names(progress, where, source), env.option_names if env.has_choice else ()
     if not before or not now or before == now:
         return
     both = f"{where}={source}: its agent chooses among {', '.join(before)}, but {config.env} has {', '.join(now)}"
@@ -101,23 +111,26 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
     warn(f"{both}, which take their places")
 
 
-def _option_names(progress: Mapping[str, Any]) -> tuple[str, ...]:
+def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple[str, ...]:
     """Return the options that a saved run's agent chose among; none if they are not known."""
     if "option_names" in progress:
         return tuple(progress["option_names"])
-    saved = progress["config"]  # Checkpoints of earlier versions lack the names.
+    # A checkpoint of an earlier version lacks the names, which a problem of the package tells without guarded settings.
     try:
-        env = make_env(read(*compose_saved({**saved, "resume": None, "checkpoint": None})), 1, torch.device("cpu"), 0)
-    except ConfigError:
+        config = read_saved(progress["config"], {"mode": "train", "resume": None, "checkpoint": None})
+        if config.env.cls is None or not config.env.cls.__module__.startswith("hpamdp."):
+            raise ConfigError(f"{config.env}: not a problem of this package")
+        env = make_env(config, 1, torch.device("cpu"), 0)
+    except ConfigError as error:
+        warn(f"{where}={source}: its options cannot be compared with those of the environment ({error})")
         return ()
     return env.option_names if env.has_choice else ()
 
 
 def _anew(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
     """Return the words that set something anew: without those that choose for a group what the saved run has."""
-    anew = [
-        word for word in overrides if _key(word) not in GROUPS or word != f"{_key(word)}={saved[_key(word)]['name']}"
-    ]
+    choices = choices_of(saved)
+    anew = [word for word in overrides if _key(word) not in GROUPS or word != f"{_key(word)}={choices[_key(word)]}"]
     for word in anew:
         if _key(word).split(".")[0] in _AGENT:
             raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")

@@ -20,13 +20,14 @@ from typing import Any, ClassVar
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from hpamdp.config import Config, ConfigError, job_overrides
 from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, say, warn
 from hpamdp.run.folder import check_no_link, locked
 from hpamdp.run.stopping import exits_told
+from hpamdp.saved_config import in_todays_form
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
@@ -166,9 +167,9 @@ def _final_score(folder: Path) -> float | None:
 
 def _check_same(wanted: Config, file: Path) -> None:
     """Refuse to continue in a folder with the results of another config."""
-    saved = _flat(yaml.safe_load(file.read_text())) if file.is_file() else {}
+    saved = _flat(in_todays_form(yaml.safe_load(file.read_text()))) if file.is_file() else {}
     # Written and read as the saved one was.
-    own = _flat(yaml.safe_load(OmegaConf.to_yaml(OmegaConf.create(wanted.to_dict()))))
+    own = _flat(yaml.safe_load(wanted.to_yaml()))
     keys = [key for key in {**own, **saved} if own.get(key) != saved.get(key)]
     if keys:
         there, here = (json.dumps(values.get(keys[0]), default=str) for values in (saved, own))

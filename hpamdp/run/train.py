@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import cast
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict import TensorDictBase
 from tqdm import tqdm
 
@@ -101,7 +101,7 @@ def _run(
                 check_more(word, trainer.frames, config.run.num_frames)
     output_dir.mkdir(parents=True, exist_ok=True)
     with replacing(output_dir / "config.yaml") as partial:
-        OmegaConf.save(OmegaConf.create(config.to_dict()), partial)
+        partial.write_text(config.to_yaml())
     is_interrupted = False
     if config.run.mode != "eval":
         try:

@@ -105,6 +105,7 @@ class BoatDockEnv(PAMDPEnv):
     """
 
     option_names: tuple[str, ...] = harbour.CONTROLLERS
+    guarded_settings = ("recording",)
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
     result_keys = (keys.OUTCOME, episode.FUEL)

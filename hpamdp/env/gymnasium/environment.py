@@ -77,6 +77,7 @@ class GymnasiumEnv(PAMDPEnv):
     """
 
     result_keys = (_SUCCESS,)
+    guarded_settings = ("id", "entry_point", "kwargs")
 
     def __init__(
         self,

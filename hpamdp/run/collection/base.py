@@ -21,6 +21,7 @@ class Collection:
     """
 
     package: ClassVar[str | None] = None  # an optional package that it needs; also the name of the extra
+    guarded_settings: ClassVar[tuple[str, ...]] = ()  # which can run code, read files or reach servers
     has_workers: ClassVar[bool] = False  # whether other processes step the environments
     cpu_s: float = 0.0  # spent collecting in other processes
 

@@ -24,6 +24,7 @@ class RayCollection(WorkerCollection):
     """Steps the environments in the actors of TorchRL's RayCollector."""
 
     package: ClassVar[str | None] = "ray"
+    guarded_settings: ClassVar[tuple[str, ...]] = ("address",)
 
     def __init__(
         self,

@@ -1,0 +1,171 @@
+"""The config in a file, which may be somebody else's: its values are taken as text and numbers, and nothing runs.
+
+Classes come from today's yaml files alone. No text of a saved config is resolved, so `${oc.env:HOME}` stays as it is.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hpamdp.config import (
+    GROUPS,
+    RUN_ENTRIES,
+    TARGET,
+    Config,
+    ConfigError,
+    MissingChoiceError,
+    RunConfig,
+    check,
+    compose,
+    is_name,
+    names_of,
+    plain_groups,
+)
+
+_CHOICES = "choices"
+
+
+def choices_of(saved: Mapping[str, Any]) -> dict[str, str]:
+    """Return the name that a saved config has for each group.
+
+    Raises:
+        ConfigError: it is no config of this program.
+    """
+    choices = in_todays_form(saved)[_CHOICES]
+    return {group: choices[group] for group in GROUPS}
+
+
+def read_saved(
+    saved: Mapping[str, Any],
+    given: Mapping[str, Any] | None = None,
+    names: Mapping[str, str] | None = None,
+    *,
+    trust: bool = False,
+    file: object = "the saved run",
+) -> Config:
+    """Check a config that `Config.to_dict` gave, changed by what is given.
+
+    Args:
+        saved: the config, of this version or an earlier one.
+        given: values by their names on the command line, such as `low.lr`; by its name a whole group, with its class.
+        names: the names of the groups in `given`.
+        trust: whether the saved config may set the `guarded_settings` of a class.
+        file: where the config was read from.
+
+    Raises:
+        ConfigError: a wrong value, a name that is in no folder that is searched for yaml files, or a guarded setting
+            that neither the yaml file nor `given` has.
+    """
+    given, names = given or {}, names or {}
+    saved = in_todays_form(saved)
+    groups = [group for group in GROUPS if group not in given]
+    choices = {group: saved[_CHOICES][group] for group in groups}
+    today = plain_groups(compose([f"{group}={name}" for group, name in choices.items()]), saved, groups)
+    values = {name: value for name, value in saved.items() if name not in (*GROUPS, _CHOICES)}
+    for group in groups:
+        values[group] = {**today[group], **saved[group], TARGET: today[group][TARGET]}
+    for name, value in given.items():
+        _set(values, name.split("."), value)
+    config = check(values, {**choices, **names})
+    found = {} if trust else _guarded(config, saved, today, given)
+    if found:
+        settings = ", ".join(f"{setting}={_shown(value)}" for setting, value in found.items())
+        raise ConfigError(
+            f"{settings}: set by {file}, and can run code, read files or reach servers; set {' and '.join(found)} on "
+            "the command line, or add trust=true if you trust the file"
+        )
+    return config
+
+
+def needs_trust(config: Config) -> bool:
+    """Return whether a run that starts from a run of this config needs `trust=true`."""
+    saved = config.to_dict()
+    today = plain_groups(compose([f"{group}={name}" for group, name in saved[_CHOICES].items()]), saved, GROUPS)
+    return bool(_guarded(config, saved, today, {}))
+
+
+def _guarded(
+    config: Config, saved: Mapping[str, Any], today: Mapping[str, Mapping[str, Any]], given: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the guarded settings that have their values from a saved config alone."""
+    found = {}
+    for group, yaml in today.items():
+        for name, value in saved[group].items():
+            setting = f"{group}.{name}"
+            if setting not in given and value != yaml.get(name) and getattr(config, group).is_guarded(name, value):
+                found[setting] = value
+    for option, low in config.low_of.items():
+        choice = (saved["low"].get("per_option") or {}).get(option)
+        for name, value in choice.items() if isinstance(choice, Mapping) else ():
+            if low.is_guarded(name, value):
+                found[f"low.per_option.{option}.{name}"] = value
+    return found
+
+
+def in_todays_form(saved: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a saved config in the form that `Config.to_dict` has today, with the defaults of values that it lacks.
+
+    Raises:
+        ConfigError: it is no config of this program.
+    """
+    for group in GROUPS:
+        if not isinstance(saved.get(group), Mapping):
+            raise ConfigError(f"the saved config has no {group}; it is damaged, or not of this program")
+    values = dict(saved) if _CHOICES in saved else _from_first_form(saved)
+    choices = values[_CHOICES]
+    for group in GROUPS:
+        name = choices.get(group) if isinstance(choices, Mapping) else None
+        if not is_name(name):
+            raise ConfigError(f"the saved config chose {group}={_shown(name)}, which is no name of a yaml file")
+    values.pop("trust", None)
+    fields = {name: field for name, field in RunConfig.model_fields.items() if name != "trust"}
+    return {name: field.default for name, field in fields.items() if not field.is_required()} | values
+
+
+def _from_first_form(saved: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the config of an earlier version, where a group's entry `name` is its choice, in today's form.
+
+    A class with a setting `name` put its value in the place of the choice. Such a choice is found by its settings.
+    """
+    choices, groups = {}, {}
+    for group in GROUPS:
+        groups[group] = {name: value for name, value in saved[group].items() if name != "name"}
+        choices[group] = saved[group].get("name")
+    known = _settings_of(choices)
+    for group, settings in groups.items():
+        if "name" in known[group] or not settings.keys() <= known[group]:
+            for name in names_of(group):
+                its_own = _settings_of({group: name})[group]
+                if "name" in its_own and saved[group].keys() <= its_own:
+                    choices[group], groups[group] = name, dict(saved[group])
+    return {**saved, **groups, _CHOICES: choices}
+
+
+def _settings_of(choices: Mapping[str, Any]) -> dict[str, set[str]]:
+    """Return all entries that a group can have by the yaml file of its choice; of no file, those of any choice."""
+    of_any = {group: {*RUN_ENTRIES.get(group, ())} for group in choices}
+    try:
+        if all(map(is_name, choices.values())):
+            cfg = compose([f"{group}={name}" for group, name in choices.items()])
+            return {group: of_any[group] | {str(name) for name in cfg[group]} for group in choices}
+    except MissingChoiceError:
+        pass
+    if len(choices) == 1:
+        return of_any
+    return {group: _settings_of({group: name})[group] for group, name in choices.items()}
+
+
+def _set(values: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    """Set a nested value; mappings on the way are copied."""
+    *outer, last = path
+    for name in outer:
+        inner = values.get(name)
+        values[name] = dict(inner) if isinstance(inner, Mapping) else {}
+        values = values[name]
+    values[last] = value
+
+
+def _shown(value: object) -> str:
+    return f"{json.dumps(value, default=str):.80}"

@@ -1,0 +1,258 @@
+"""A saved config is read back as it was, and nothing in it runs: `hpamdp.saved_config`, and every way in."""
+
+import importlib.util
+import json
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from conftest import OWN, choices, compose_config, make_config
+from test_grid import SHORT
+
+from hpamdp.config import GROUPS, Config, ConfigError
+from hpamdp.run.checkpoint import progress_of
+from hpamdp.run.resume import check_saved_options
+from hpamdp.run.train import run
+from hpamdp.saved_config import read_saved
+
+TINY = ["num_envs=2", "steps_per_batch=2", "total_frames=8", "eval.layouts=2", "eval.every=0", "film=false"]
+TOY = ["env=gymnasium", "env.entry_point=toy_environments:Toy", "env.kwargs={length:4}", "env.max_steps=6"]
+MOST = max(len(choices(group)) for group in GROUPS)
+
+
+def saved(config: Config) -> dict:
+    """Return the config as a file holds it."""
+    return json.loads(json.dumps(config.to_dict()))
+
+
+def first_form(config: Config) -> dict:
+    """Return the config as earlier versions saved it: a group's choice is its entry `name`, below the settings."""
+    values = saved(config)
+    names = values.pop("choices")
+    return values | {group: {"name": names[group], **values[group]} for group in GROUPS}
+
+
+@pytest.mark.parametrize("n", range(MOST))
+def test_every_value_of_every_group_is_read_back_as_it_was_saved(n):
+    config = make_config([f"{group}={choices(group)[n % len(choices(group))]}" for group in GROUPS])
+    assert read_saved(saved(config)) == config
+    if n == 0:
+        assert read_saved(first_form(config)) == config
+
+
+@pytest.mark.parametrize("name", ["null", "csv", "wandb"])
+def test_a_wandb_run_of_an_earlier_version_is_known_by_its_settings(name):
+    config = make_config(["logger=wandb", f"logger.name={name}", "low=random"])
+    assert read_saved(first_form(config)) == config
+
+
+def assert_all_commands_work(command, *words: str, trust: str = "trust=false", own: tuple[str, ...] = ()) -> None:
+    """Train a run, then go on with it, score it and film it."""
+    code, _, err = command(*own, *TINY, *words, "hydra.run.dir=a")
+    assert code == 0, err
+    is_offline = "mode=offline" in words
+    more = ["mode=offline", "offline.updates=2"] if is_offline else ["total_frames=16"]
+    for again in (["resume=a", *more, "hydra.run.dir=b"], ["mode=eval", "checkpoint=a", "hydra.run.dir=c"]):
+        code, _, err = command(*own, *again, trust)
+        assert code == 0, err
+    code, _, err = command("watch", "a", *own, trust, "--episodes=1", "--size=40", "--fps=5")
+    assert code == 0 or "has no pictures to film" in err, err
+
+
+def test_settings_called_as_entries_of_a_saved_config_keep_their_values(command, tmp_path):
+    values = ["name=csv", "budget=7", "checkpoint=x", "freeze=true", "choices={low: hppo}", "per_option={a: random}"]
+    words = [f"{group}.{value}" for group in ("logger", "env") for value in values]
+    words += ["logger.options=[b]", "logger=named", "env=named", "high=none", "low=random"]
+    assert_all_commands_work(command, *words, own=(OWN,))
+    # The evaluation logs where its own command line says.
+    line = "('csv', 7, 'x', {'low': 'hppo'}, True, ['b'], {'a': 'random'})"
+    assert (tmp_path / "logged.txt").read_text().splitlines() == [line, line]
+    assert yaml.safe_load((tmp_path / "c/config.yaml").read_text())["env"]["checkpoint"] == "x"
+
+
+ONE_BOAT = ["env.controller=random", "high=none", "low=random"]
+PEOPLE = ["mode=offline", "offline.updates=1", "data=human", "low=bc", "high=linucb"]
+# What a value needs, if not the default problem with random actions.
+NEEDS = {
+    "env=gymnasium": ["high=none", *TOY],
+    "env=rooms": ["high=uniform"],
+    "env=boatdock": [],
+    "env=boatdock_released": ["high=none", "env.max_steps=9"],
+    "high=none": ONE_BOAT,
+    "high=value": ["low=pdqn"],
+    "high=option_critic": ["low=hppo", "low.minibatch_size=16", "agent.termination=learned", "env.switch_cost=0.1"],
+    "low=bc": PEOPLE,
+    "data=human": PEOPLE,
+    "logger=wandb": ["logger.mode=disabled"],
+}
+SKIPPED = {"data=recorded"}  # needs a file of one's own
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("value", [f"{group}={name}" for group in GROUPS for name in choices(group)])
+def test_a_run_of_every_value_of_every_group_is_resumed_scored_and_filmed(value, command):
+    if value in SKIPPED or (NEEDS.get(value) == PEOPLE and "HPAMDP_HUMAN_DATA" not in os.environ):
+        pytest.skip(f"{value} needs a data set")
+    if value in ("collector=ray", "logger=tensorboard") and importlib.util.find_spec(value.partition("=")[2]) is None:
+        pytest.skip(f"{value} is not installed")
+    group, _, name = value.partition("=")
+    needs = NEEDS.get(value, ["high=none"] if group == "env" else [])
+    learner = [] if any(word.startswith("low=") for word in [value, *needs]) else ["low=random"]
+    short = SHORT.get(name, []) if group == "low" else []
+    trust = "trust=true" if value == "env=gymnasium" else "trust=false"
+    assert_all_commands_work(command, *learner, *needs, *short, *({value} - {*needs}), trust=trust)
+
+
+@pytest.fixture(scope="module")
+def of_toy(tmp_path_factory):
+    """Return the folder of a run on an environment that is named by its entry point."""
+    folder = tmp_path_factory.mktemp("toy") / "run"
+    words = [*TOY, "high=none", "low=random", *TINY]
+    assert run(compose_config(words), folder, words) == 0
+    return folder
+
+
+def forged(folder: Path, target: Path, change: Callable[[dict], None]) -> Path:
+    """Copy a run's checkpoint and networks, with its config changed."""
+    target.mkdir()
+
+    def changed(progress: dict) -> dict:
+        change(progress["config"])
+        return progress
+
+    with zipfile.ZipFile(folder / "checkpoint.zip") as old, zipfile.ZipFile(target / "checkpoint.zip", "w") as new:
+        for name in old.namelist():
+            data = old.read(name)
+            if name == "manifest.json":
+                manifest = json.loads(data)
+                data = json.dumps(manifest | {"progress": changed(manifest["progress"])}).encode()
+            new.writestr(name, data)
+    policy = torch.load(folder / "policy.pt", weights_only=True)
+    torch.save(policy | {"progress": json.dumps(changed(json.loads(policy["progress"])))}, target / "policy.pt")
+    return target
+
+
+def set_to(group: str, name: str, value: object) -> Callable[[dict], None]:
+    return lambda config: config[group].update({name: value})
+
+
+@pytest.fixture
+def bait(tmp_path, monkeypatch):
+    """Return how to tell whether the module `bait` was imported."""
+    (tmp_path / "bait.py").write_text("from pathlib import Path\nPath('taken').touch()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    return (tmp_path / "taken").exists
+
+
+WAYS_IN = {
+    "eval": ["mode=eval", "checkpoint={}"],
+    "networks": ["mode=eval", "checkpoint={}/policy.pt"],
+    "resume": ["resume={}", "total_frames=16"],
+    "watch": ["watch", "{}", "--episodes=1"],
+    "play": ["play", "--agent={}", "--export=site"],
+    "low.checkpoint": [*TOY[:2], *TOY[3:], "low.checkpoint={}", "high=none", "low=random", *TINY],
+}
+
+
+@pytest.mark.parametrize("way", WAYS_IN)
+def test_a_file_names_no_code_by_any_way_in(way, of_toy, bait, command, tmp_path):
+    forgeries = [
+        *(set_to("env", name, "bait:make") for name in ("entry_point", "id")),
+        *(set_to(group, "_target_", "bait.Anything") for group in GROUPS),
+        set_to("low", "per_option", {"option0": {"name": "random", "_target_": "bait.Anything"}}),
+        set_to("low", "per_option", {"option0": "../../bait"}),
+        set_to("choices", "env", "../../bait"),
+        set_to("choices", "low", "random,bait"),
+    ]
+    for number, change in enumerate(forgeries if way == "eval" else forgeries[:1] + forgeries[-4:]):
+        folder = forged(of_toy, tmp_path / str(number), change)
+        code, _, err = command(*(word.format(folder) for word in WAYS_IN[way]))
+        assert (code, err.count("\n")) == (2, 1) or way == "low.checkpoint", err  # which takes the networks alone
+        assert not bait()
+
+
+def test_classes_come_from_the_yaml_files_even_with_trust(of_toy, bait, command, tmp_path):
+    def change(config: dict) -> None:
+        for group in GROUPS:
+            config[group]["_target_"] = "bait.Anything"
+
+    folder = forged(of_toy, tmp_path / "forged", change)
+    assert command(f"resume={folder}", "trust=true", "total_frames=16")[0] == 0
+    assert not bait()
+
+
+def test_guarded_settings_are_taken_if_they_are_said_again_or_the_file_is_trusted(of_toy, command):
+    evaluation = ["mode=eval", f"checkpoint={of_toy}"]
+    code, _, err = command(*evaluation)
+    line = 'env.entry_point="toy_environments:Toy", env.kwargs={"length": 4}: set by '
+    assert code == 2 and err.startswith(line) and err.count("\n") == 1
+    assert "set env.entry_point and env.kwargs on the command line, or add trust=true" in err
+    assert command(*evaluation, "env.entry_point=toy_environments:Toy")[0] == 2
+    said = ["env.entry_point=toy_environments:Toy", "env.kwargs={length:3}"]
+    assert command(*evaluation, *said)[0] == 0
+    assert command(f"resume={of_toy}", "trust=true", "total_frames=16", "hydra.run.dir=b")[0] == 0
+    assert "trust" not in yaml.safe_load(Path("b/config.yaml").read_text())
+    assert "has no pictures" in command("watch", str(of_toy), "trust=true")[2]
+    assert "has no pictures" in command("watch", str(of_toy), *said)[2]
+
+
+def test_no_file_gives_itself_trust(of_toy, command, tmp_path):
+    folder = forged(of_toy, tmp_path / "forged", lambda config: config.update(trust=True))
+    code, _, err = command("mode=eval", f"checkpoint={folder}")
+    assert code == 2 and "trust=true" in err
+
+
+def test_files_and_servers_that_a_file_names_are_not_reached_unasked():
+    config = make_config(["logger=wandb", "collector=ray", "low=random"])
+    for group, name, value in (
+        ("env", "recording", "/etc/passwd"),
+        ("logger", "entity", "somebody"),
+        ("logger", "mode", "online"),
+        ("collector", "address", "ray://elsewhere:10001"),
+    ):
+        values = saved(config)
+        values[group][name] = value
+        with pytest.raises(ConfigError, match=rf"^{group}\.{name}=\"{value}\": set by .*trust=true"):
+            read_saved(values)
+        assert getattr(read_saved(values, trust=True), group).options[name] == value
+        assert getattr(read_saved(values, {f"{group}.{name}": value}), group).options[name] == value
+
+
+def test_text_of_a_saved_config_stays_text(of_toy, monkeypatch, tmp_path, command):
+    monkeypatch.setenv("SECRET", "told")
+    folder = forged(of_toy, tmp_path / "forged", set_to("low", "checkpoint", "${oc.env:SECRET}"))
+    assert command("mode=eval", f"checkpoint={folder}", "trust=true", "hydra.run.dir=b")[0] == 0
+    written = Path("b/config.yaml").read_text()
+    assert yaml.safe_load(written)["low"]["checkpoint"] == "${oc.env:SECRET}" and "told" not in written
+    values = saved(make_config(["logger=wandb", "low=random"]))
+    for text in ("${oc.env:SECRET}", "${", "???", "a\\${seed}"):
+        values["logger"]["name"] = text
+        values["env"]["options"] = {text: [text]}
+        config = read_saved(values)
+        assert config.logger.options["name"] == text and config.run.env.options == {text: [text]}
+        assert read_saved(saved(config)) == config
+
+
+def test_an_earlier_checkpoint_without_the_names_of_its_options_is_compared_only_if_nothing_is_run(
+    of_toy, tmp_path, capsys
+):
+    words = ["low=random", "high=uniform", *TINY]
+    assert run(compose_config(words), tmp_path / "boats", words) == 0
+
+    def warning(folder: Path, *given: str) -> str:
+        config = make_config([*given, f"low.checkpoint={folder / 'policy.pt'}", "low=random"])
+        policy = torch.load(folder / "policy.pt", weights_only=True)
+        progress = json.loads(policy["progress"])
+        progress.pop("option_names", None)
+        torch.save(policy | {"progress": json.dumps(progress)}, folder / "policy.pt")
+        assert "option_names" not in progress_of(folder / "policy.pt")
+        check_saved_options(config, config.env.build(num_envs=1))
+        return capsys.readouterr().err
+
+    swapped = ["env.boats=[incongruent1,congruent]", "high=uniform"]
+    assert "its agent chooses among incongruent, congruent, but" in warning(tmp_path / "boats", *swapped)
+    assert "its options cannot be compared" in warning(of_toy, *swapped)
