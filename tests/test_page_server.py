@@ -3,12 +3,14 @@
 import http.client
 import json
 import random
+import resource
 import socket
 import threading
 from contextlib import contextmanager
 
 import pytest
 import torch
+from filelock import FileLock
 from play_players import docked
 
 from hpamdp.env.boatdock.play.boat_page import BoatPage
@@ -128,6 +130,82 @@ def test_a_file_of_something_else_is_refused(tmp_path):
         EpisodeFile(path, BoatPage(seed=0))
     with pytest.raises(EpisodeError, match="there is no folder"):
         EpisodeFile(tmp_path / "nowhere" / "a.jsonl", BoatPage(seed=0))
+
+
+@pytest.mark.parametrize("text", ["dear diary", "{}", '{"player": "me", "index": 1}', "[1, 2]\n", "\0\0\0", "{\n}\n"])
+def test_a_file_without_an_episode_is_refused_and_left_as_it_is(tmp_path, text, command):
+    path = tmp_path / "notes.txt"
+    path.write_text(text)
+    with pytest.raises(EpisodeError, match="line 1: no episode, nor is any other line; take another file"):
+        EpisodeFile(path, BoatPage(seed=0))
+    assert path.read_text() == text and [*tmp_path.iterdir()] == [path]
+
+
+def test_a_damaged_line_is_named_and_the_file_is_added_to(tmp_path, capsys):
+    path = tmp_path / "a.jsonl"
+    cut = json.dumps(EPISODES[1])[:50]
+    path.write_text(f"{cut}{json.dumps(EPISODES[0])}\n{json.dumps(EPISODES[2])}\n")
+    with serving(path) as server:
+        assert capsys.readouterr().err == f"{path}: 1 of 2 lines left out: line 1 (no episode)\n"
+        assert [send(server, episode)[0] for episode in EPISODES[:3]] == [201, 201, 200]
+
+
+def test_two_servers_store_an_episode_once(tmp_path):
+    path = tmp_path / "a.jsonl"
+    with serving(path) as one, serving(path) as other:
+        assert [send(server, EPISODES[0])[0] for server in (one, other, one)] == [201, 200, 200]
+        assert [send(server, EPISODES[1])[0] for server in (other, one)] == [201, 200]
+        path.rename(tmp_path / "kept.jsonl")  # and a file that is taken away begins again
+        assert send(one, EPISODES[0])[0] == 201
+    assert len(path.read_text().splitlines()) == 1 and len((tmp_path / "kept.jsonl").read_text().splitlines()) == 2
+
+
+def test_a_lock_that_is_held_is_told_in_time_and_the_episode_can_be_sent_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(page_server, "_LOCK_PATIENCE", 0.2)
+    with serving(tmp_path / "a.jsonl") as server:
+        with FileLock(tmp_path / ".a.jsonl.lock"):
+            status, text, _ = send(server, EPISODES[0])
+        assert status == 503 and text == "the episode was not stored: another program holds the lock of a.jsonl\n"
+        assert send(server, EPISODES[0])[0] == 201
+
+
+def test_links_in_a_folder_of_somebody_else_empty_no_file(tmp_path):
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / ".a.jsonl.lock").symlink_to("mine")
+    with pytest.raises(EpisodeError, match=r"\.a\.jsonl\.lock: is a link; remove it"):
+        EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))
+    (tmp_path / "b.jsonl").symlink_to("mine")
+    with pytest.raises(EpisodeError, match="no episode"):
+        EpisodeFile(tmp_path / "b.jsonl", BoatPage(seed=0))
+    assert (tmp_path / "mine").read_text() == "precious"
+
+
+def test_a_place_that_cannot_be_written_to_is_told_at_the_start(tmp_path, monkeypatch):
+    monkeypatch.setattr(page_server.os, "access", lambda path, mode: False)
+    with pytest.raises(EpisodeError, match="cannot be written to"):
+        EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))
+    (tmp_path / "a.jsonl").write_text(json.dumps(EPISODES[0]))
+    with pytest.raises(EpisodeError, match=r"a\.jsonl cannot be written to"):
+        EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))
+    with pytest.raises(EpisodeError, match="File name too long"):
+        EpisodeFile(tmp_path / ("a" * 300), BoatPage(seed=0))
+
+
+@pytest.mark.parametrize("after", [0, 1, 500])
+def test_a_disk_that_is_full_in_the_middle_of_a_line_leaves_the_file_as_it_was(tmp_path, after):
+    path = tmp_path / "a.jsonl"
+    with serving(path) as server:
+        assert send(server, EPISODES[0])[0] == 201
+        before = path.read_bytes()
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + after, limits[1]))  # as a full disk: a short write
+        try:
+            status, text, _ = send(server, EPISODES[1])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        assert status == 507 and text.startswith("the episode was not stored: ") and path.read_bytes() == before
+        assert send(server, EPISODES[1])[0] == 201
+    assert [json.loads(line) for line in path.read_text().splitlines()] == EPISODES[:2]
 
 
 def forged(rng, number):

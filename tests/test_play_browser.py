@@ -289,7 +289,7 @@ def test_the_exported_page_plays_from_files_and_gives_its_episodes_as_a_file(bro
     with player.page.expect_download() as download:
         player.page.click("#download")
     download.value.save_as(tmp_path / "mine.jsonl")
-    (episode,) = episodes.read(tmp_path / "mine.jsonl")
+    (episode,) = episodes.read(tmp_path / "mine.jsonl").values()
     assert episodes.check(episode.model_dump(mode="json")).outcome == "too_fast" and player.errors == []
     context.close()
 

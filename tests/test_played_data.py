@@ -1,6 +1,8 @@
 """Episodes of `hpamdp play` as data: the tables, the command line of the recording, learning, and references."""
 
 import json
+import os
+import re
 
 import numpy as np
 import pytest
@@ -17,6 +19,10 @@ from hpamdp.data.human.episodes import score
 from hpamdp.data.human.statistics import figures
 from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.play import episodes
+from hpamdp.env.boatdock.play.boat_page import BoatPage
+from hpamdp.env.page import EpisodeError
+from hpamdp.run.page_server import EpisodeFile
 from hpamdp.run.train import run
 
 START, GOAL = (0.0, 60.0), (0.0, -60.0)
@@ -125,8 +131,11 @@ def test_the_commands_of_the_recording_work_on_the_file(file, tmp_path, capsys):
         (None, "there is no such file"),
         ("", "no episode"),
         ("{}\n", "line 1"),
-        ("no json\n" + json.dumps(EPISODES[0]) + "\n", "line 1: no JSON"),
-        (json.dumps({**EPISODES[0], "outcome": "too_fast", "score": -1.0}) + "\n", "do not end as it says"),
+        ("no json\n[]\n", "line 1: no JSON; no line is an episode"),
+        (
+            json.dumps({**EPISODES[0], "outcome": "too_fast", "score": -1.0}) + "\n",
+            "line 1: outcome: too_fast, but the presses come to success",
+        ),
         (json.dumps(EPISODES[-1]) + "\n", "but those of practice"),
         ("\x00\xff" * 10 + "\n", "line 1"),
     ],
@@ -140,6 +149,64 @@ def test_a_file_that_is_not_one_of_episodes_is_refused_in_a_line(tmp_path, text,
     assert "\n" not in str(refused.value)
 
 
+def test_lines_that_are_no_episodes_are_named_and_the_others_read(tmp_path, capsys):
+    good = [json.dumps(episode) for episode in EPISODES[:3]]
+    first = EPISODES[0]
+    bad = {
+        "no JSON": [b'{"format":1,"soft' + good[0].encode(), b"\0" * 99, bytes(range(128, 255)), b"{" * 9999, b"1 2"],
+        "UTF-16, but must be UTF-8": [good[0].encode("utf-16").replace(b"\n", b"")],
+        "longer than 1048576 bytes": [b"[" + b"1," * 600_000 + b"1]"],
+        "the same episode as line 1": [good[0].encode(), json.dumps({**first, "software": "9"}).encode()],
+        "fuel: not what the presses come to": [json.dumps({**first, "fuel": 0.123}).encode()],
+        "presses.0.duration: Input should be greater than 0": [changed(first, duration=-1.0)],
+        "presses.0.duration: Input should be a valid number": [changed(first, duration="0.5")],
+        "presses.0.key: Field required": [changed(first, key=None)],
+        "extra: Extra inputs are not permitted": [json.dumps({**first, "extra": 1}).encode()],
+        "episode: Input should be an object": [b"[]", b"17", b"null", b'"text"'],
+    }
+    for constant in ("NaN", "Infinity", "-Infinity"):
+        bad["no JSON"].append(good[0].replace('"end": [', f'"end": [{constant}, ').encode())
+    bad["episode: no JSON object"] = [re.sub('"end": .[^,]*', '"end": [1e999', good[0]).encode()]
+    for problem, lines in bad.items():
+        for line in lines:
+            path = tmp_path / "a.jsonl"
+            path.write_bytes(b"\xef\xbb\xbf" + f"{good[0]}\r\n".encode() + line + f"\n\n{good[1]}\n{good[2]}".encode())
+            assert len(played_file.read(path).episodes) == 3
+            episodes._warn_once.cache_clear()
+            said = capsys.readouterr().err
+            assert said.startswith(f"{path}: 1 of 4 lines left out: line 2 ({problem}") and said.count("\n") == 1, line
+            assert main(["check", str(path)]) == 2
+            assert f"line 2: {problem}" in capsys.readouterr().err
+
+
+def changed(episode, **fields):
+    press = {name: value for name, value in {**episode["presses"][0], **fields}.items() if value is not None}
+    return json.dumps({**episode, "presses": [press, *episode["presses"][1:]]}).encode()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda path: path.mkdir(), "is a folder, but must be a regular file"),
+        (os.mkfifo, "is a named pipe, but must be a regular file"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a device, but must be a regular file"),
+        (lambda path: path.symlink_to(path), "Too many levels of symbolic links"),
+        (lambda path: os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**33), "may have at most"),
+    ],
+)
+def test_what_is_no_file_of_episodes_is_refused_in_a_line_and_blocks_nobody(tmp_path, make, said):
+    path = tmp_path / "a.jsonl"
+    make(path)
+    page = BoatPage(seed=0)
+    for read, error in ((played_file.read, DataError), (lambda path: EpisodeFile(path, page), EpisodeError)):
+        with pytest.raises(error, match=said) as refused:
+            read(path)
+        assert "\n" not in str(refused.value)
+    for ending in (".mat", ".jsonl"):  # and as people's recording
+        assert main(["check", str(path.rename(path.with_suffix(ending)))]) == 2
+        path = path.with_suffix(ending)
+
+
 def test_a_last_line_that_was_cut_short_is_left_out(file, tmp_path):
     (tmp_path / "a.jsonl").write_text(file.read_text()[:-40])
     assert len(played_file.read(tmp_path / "a.jsonl", practice=True).episodes) == len(EPISODES) - 1
@@ -150,7 +217,7 @@ def test_a_forged_episode_is_found_by_the_check(tmp_path, capsys):
     forged = {**EPISODES[0], "events": [{**events[0], "t": events[0]["t"] + 0.001}, *events[1:]]}
     (tmp_path / "a.jsonl").write_text(json.dumps(forged) + "\n")
     assert main(["check", str(tmp_path / "a.jsonl")]) == 2
-    assert "episode 1: presses.0: not what the events come to" in capsys.readouterr().err
+    assert "line 1: presses.0: not what the events come to" in capsys.readouterr().err
 
 
 def test_a_missing_recording_is_told_in_one_line(tmp_path):

@@ -6,26 +6,32 @@ installation. It is meant for one's own computer and listens on the loopback add
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 from urllib.parse import urlsplit
 
 from filelock import FileLock
-from pydantic_core import from_json
 
 from hpamdp.env.page import EpisodeError, Page
-from hpamdp.messages import one_line
+from hpamdp.json_lines import MAX_LINE_BYTES, LineError, left_out, lines_of, read_json
+from hpamdp.messages import one_line, warn
+from hpamdp.regular_files import read_regular, regular_size
 
 DATA_NAME = "data.js"
 EPISODES = "/episodes"
-_MAX_BODY = 1 << 20  # bytes
+_MAX_FILE = 1 << 28  # bytes
 _PATIENCE = 10.0  # s that a connection may keep silent
+_LOCK_PATIENCE = 4.0  # s that an episode waits for the file's lock
+_NAME_LENGTH = 200  # letters of the file's name in that of its lock
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -58,7 +64,7 @@ class EpisodeFile:
         page: knows which episodes are the same.
 
     Raises:
-        EpisodeError: the file is not one of episodes, or its folder is missing.
+        EpisodeError: the file is not one of episodes, it cannot be written, or its folder is missing.
     """
 
     def __init__(self, path: Path, page: Page) -> None:
@@ -66,51 +72,114 @@ class EpisodeFile:
         self.page = page
         self.num_added = 0
         self._lock = threading.Lock()
-        self._file_lock = FileLock(path.with_name(f".{path.name}.lock"))
-        if not path.parent.is_dir():
-            raise EpisodeError(f"{path}: there is no folder {path.parent}")
-        self._known = self._identities()
+        lock_path = path.with_name(f".{path.name[:_NAME_LENGTH]}.lock")
+        self._file_lock = FileLock(lock_path)
+        self._known: set[str] = set()
+        self._read_to = 0  # bytes of the file whose episodes are known
+        self._inode: int | None = None
+        try:
+            if not path.parent.is_dir():
+                raise EpisodeError(f"{path}: there is no folder {path.parent}")
+            if lock_path.is_symlink():  # it would be emptied
+                raise EpisodeError(f"{lock_path}: is a link; remove it")
+            self._check_file()
+        except OSError as error:
+            raise EpisodeError(f"{path}: {error.strerror or error}") from error
 
     def add(self, episode: Mapping[str, Any]) -> bool:
         """Add a checked episode and return whether it is new; on return it is on the disk.
 
         Raises:
-            OSError: it cannot be written.
+            TimeoutError: another program holds the file's lock.
+            OSError: the episode cannot be written; the file is as it was.
         """
         identity = self.page.identity(episode)
         line = json.dumps(episode, separators=(",", ":"), allow_nan=False).encode() + b"\n"
-        with self._lock:
+        until = time.monotonic() + _LOCK_PATIENCE
+        if not self._lock.acquire(timeout=_LOCK_PATIENCE):
+            raise TimeoutError
+        try:
+            with self._file_lock.acquire(timeout=max(until - time.monotonic(), 0.0)):
+                return self._append(identity, line)
+        finally:
+            self._lock.release()
+
+    def _append(self, identity: str, line: bytes) -> bool:
+        """Add a line, while both locks are held, unless somebody has added its episode."""
+        with suppress(FileNotFoundError):
+            regular_size(self.path)
+        # Without a buffer, what could not be written is not written later, either.
+        with self.path.open("a+b", buffering=0) as file:
+            size = file.seek(0, os.SEEK_END)
+            inode = os.fstat(file.fileno()).st_ino
+            if inode != self._inode or size < self._read_to:  # it was replaced, or its lines were removed
+                self._known.clear()
+                self._read_to, self._inode = 0, inode
+            file.seek(self._read_to)
+            added = file.read(size - self._read_to)
+            self._known |= {identity for _, identity in self._identities(added) if identity is not None}
+            self._read_to = size
             if identity in self._known:
                 return False
-            with self._file_lock, self.path.open("a+b") as file:
-                size = file.seek(0, os.SEEK_END)
-                if size:
-                    file.seek(size - 1)
-                    if file.read(1) != b"\n":  # a line that was cut short stays a line of its own
-                        line = b"\n" + line
-                file.write(line)
-                file.flush()
+            if size and not _ends_line(file, size):  # a line that was cut short stays a line of its own
+                line = b"\n" + line
+            try:
+                if file.write(line) < len(line):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
                 os.fsync(file.fileno())
-            self._known.add(identity)
-            self.num_added += 1
+            except OSError:
+                with suppress(OSError):
+                    file.truncate(size)
+                raise
+            self._read_to = size + len(line)
+        self._known.add(identity)
+        self.num_added += 1
         return True
 
-    def _identities(self) -> set[str]:
-        """Return the identities of the episodes that the file has."""
-        known: set[str] = set()
-        if not self.path.exists():
-            return known
+    def _check_file(self) -> None:
+        """Read the file, if it is there, and tell which lines are no episodes.
+
+        Raises:
+            EpisodeError: no line is an episode.
+            OSError: it cannot be read or written.
+        """
+        is_there = self.path.exists() or self.path.is_symlink()
+        data = read_regular(self.path, _MAX_FILE) if is_there else b""
+        files = [self.path, Path(self._file_lock.lock_file)]
+        for place in dict.fromkeys(file if file.exists() else file.parent for file in files):
+            if not os.access(place, os.W_OK):
+                raise PermissionError(errno.EACCES, f"{place} cannot be written to")
+        if not is_there:
+            return
+        lines = [*self._identities(data)]
+        problems = {number: "no episode" for number, identity in lines if identity is None}
+        if lines and not any(self._is_episode(line) for _, line in lines_of(data)):
+            raise EpisodeError(f"{self.path}, line {lines[0][0]}: no episode, nor is any other line; take another file")
+        if problems:
+            warn(f"{self.path}: {left_out(len(lines), problems)}")
+        self._known = {identity for _, identity in lines if identity is not None}
+        self._inode = self.path.stat().st_ino
+        self._read_to = data.rfind(b"\n") + 1  # another server may be about to write the rest of the last line
+
+    def _is_episode(self, line: bytes) -> bool:
         try:
-            lines = self.path.read_bytes().splitlines()
-        except OSError as error:
-            raise EpisodeError(f"{self.path}: {error.strerror or error}") from error
-        for number, line in enumerate(lines, 1):
+            self.page.check(read_json(line))
+        except (LineError, EpisodeError):
+            return False
+        return True
+
+    def _identities(self, data: bytes) -> Iterator[tuple[int, str | None]]:
+        """Yield the number and the episode's identity of each line; None: it has no episode."""
+        for number, line in lines_of(data):
             try:
-                known.add(self.page.identity(from_json(line)))
-            except (ValueError, TypeError, KeyError) as error:
-                if number < len(lines) and line.strip():
-                    raise EpisodeError(f"{self.path}, line {number}: no episode; take another file") from error
-        return known
+                yield number, self.page.identity(read_json(line))
+            except (ValueError, TypeError, KeyError):
+                yield number, None
+
+
+def _ends_line(file: IO[bytes], size: int) -> bool:
+    file.seek(size - 1)
+    return file.read(1) == b"\n"
 
 
 class PageServer(ThreadingHTTPServer):
@@ -180,19 +249,26 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer(HTTPStatus.BAD_REQUEST, "the body is shorter than its Content-Length")
             return
         try:
-            episode = self.server.page.check(from_json(body))
+            episode = self.server.page.check(read_json(body))
         except EpisodeError as error:
             self._answer(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
             return
-        except ValueError:  # of from_json
+        except LineError:
             self._answer(HTTPStatus.BAD_REQUEST, "the body is no JSON")
             return
+        self._answer(*self._stored(episode))
+
+    def _stored(self, episode: Mapping[str, Any]) -> tuple[HTTPStatus, str]:
+        """Store an episode and return the answer."""
+        file = self.server.episodes
         try:
-            is_new = self.server.episodes.add(episode)
+            is_new = file.add(episode)
+        except TimeoutError:
+            held = f"another program holds the lock of {file.path.name}"
+            return HTTPStatus.SERVICE_UNAVAILABLE, f"the episode was not stored: {held}"
         except OSError as error:
-            self._answer(HTTPStatus.INSUFFICIENT_STORAGE, f"the episode was not stored: {error.strerror}")
-            return
-        self._answer(HTTPStatus.CREATED if is_new else HTTPStatus.OK, "stored")
+            return HTTPStatus.INSUFFICIENT_STORAGE, f"the episode was not stored: {error.strerror or error}"
+        return HTTPStatus.CREATED if is_new else HTTPStatus.OK, "stored"
 
     def _refusal(self) -> tuple[HTTPStatus, str] | None:
         """Return why a POST is refused before its body is read, if it is."""
@@ -203,8 +279,8 @@ class _Handler(BaseHTTPRequestHandler):
             return HTTPStatus.NOT_FOUND, f"nothing takes a POST but {EPISODES}"
         if self.headers.get("Transfer-Encoding") is not None or not (length.isascii() and length.isdecimal()):
             return HTTPStatus.LENGTH_REQUIRED, "a Content-Length is required"
-        if len(length) > 10 or int(length) > _MAX_BODY:
-            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"an episode has at most {_MAX_BODY} bytes"
+        if len(length) > 10 or int(length) > MAX_LINE_BYTES:
+            return HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"an episode has at most {MAX_LINE_BYTES} bytes"
         if self.headers.get_content_type() != "application/json":
             return HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "an episode is application/json"
         return None

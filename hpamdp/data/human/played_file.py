@@ -23,49 +23,45 @@ SUFFIX = ".jsonl"
 
 
 def read(path: Path | str, *, practice: bool = False) -> HumanData:
-    """Read a file of played episodes.
+    """Read a file of played episodes; lines that are no episode are left out, with a warning.
 
     Args:
         path: of `hpamdp play`, or downloaded from its page.
         practice: whether the episodes of practice count, too.
 
     Raises:
-        DataError: the file is missing, a line is no episode, an episode does not end as it says, or none counts.
+        DataError: the file cannot be read, or no episode counts.
     """
     try:
-        read_episodes = played.read(Path(path))
+        read_episodes = played.read(Path(path)).values()
     except EpisodeError as error:
         raise DataError(str(error)) from error
     counted = [episode for episode in read_episodes if practice or episode.mode != played.PRACTICE]
     if not counted:
-        raise DataError(f"{path}: no episode{'' if practice else ' but those of practice'}")
-    return _tables(counted, path)
+        raise DataError(f"{path}: no episode{' but those of practice' if read_episodes else ''}")
+    return _tables(counted)
 
 
 def verify(path: Path | str) -> int:
-    """Check every episode of a file as the page's server does, from its raw events on; return how many there are.
+    """Check every line of a file as the page's server does, from the raw events on; return how many episodes there are.
 
     Raises:
-        DataError: with the first that nobody can have played.
+        DataError: the file cannot be read, or a line has no episode that can have been played, or one that an earlier
+            line has.
     """
     try:
-        found = played.read(Path(path))
-        for number, episode in enumerate(found, 1):
-            try:
-                played.check(episode.model_dump(mode="json"))
-            except EpisodeError as error:
-                raise DataError(f"{path}, episode {number}: {error}") from error
+        found, problems = played.read_with_problems(Path(path))
     except EpisodeError as error:
         raise DataError(str(error)) from error
+    if problems:
+        number, problem = min(problems.items())
+        raise DataError(f"{path}, line {number}: {problem}; {len(found)} of {len(found) + len(problems)} are right")
     return len(found)
 
 
-def _tables(episodes: list[Episode], path: Path | str) -> HumanData:
+def _tables(episodes: list[Episode]) -> HumanData:
     sailed = played.sail(episodes)
     outcome = np.array([physics.OUTCOMES.index(episode.outcome) for episode in episodes])
-    differs = outcome != sailed.outcome.numpy()
-    if differs.any():
-        raise DataError(f"{path}, episode {int(differs.argmax()) + 1}: its presses do not end as it says")
     players = list(dict.fromkeys(episode.player for episode in episodes))
     person = np.array([players.index(episode.player) for episode in episodes])
     num_presses = np.array([len(episode.presses) for episode in episodes])

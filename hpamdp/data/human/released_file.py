@@ -21,6 +21,7 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human import schema
 from hpamdp.data.human.matfile import read_variable
 from hpamdp.env.boatdock import harbour, physics
+from hpamdp.regular_files import read_regular
 
 FILE_NAME = "BDtrajectory40.mat"
 SHA256 = "9de16874b43de9e377c2c10749cb2bd435a6db3ca7cead445b826d64ec399d20"
@@ -99,17 +100,14 @@ def load_bytes(path: Path) -> bytes:
         DataError: the file is missing, unreadable or too large for a recording.
     """
     try:
-        size = path.stat().st_size
-        if size > _MAX_BYTES:
-            raise DataError(f"{path}: {size} bytes; a recording has at most {_MAX_BYTES}")
-        return path.read_bytes()
+        return read_regular(path, _MAX_BYTES)
     except FileNotFoundError as error:
         raise DataError(
             f"{path}: there is no such file; set {PATH_VARIABLE} to the path of {FILE_NAME}, or fetch it with "
             "`python -m hpamdp.data.human download --url URL`"
         ) from error
     except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from error
+        raise DataError(f"{path}: {error.strerror or error}") from error
 
 
 def check_sum(data: bytes, checksum: str, path: Path) -> None:

@@ -596,7 +596,7 @@ def _figures_of(recording: str, controller: str) -> dict[str, float]:
     from hpamdp.env.boatdock.play import episodes  # only recordings need it
 
     of_controller = controller if controller in harbour.CONTROLLERS else None
-    means = episodes.figures(episodes.read(Path(recording)), of_controller)
+    means = episodes.figures([*episodes.read(Path(recording)).values()], of_controller)
     return {
         **means,
         "human_normalised": human_normalised(means["score"], "chosen" if of_controller is None else controller),

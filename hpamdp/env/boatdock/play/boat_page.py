@@ -101,7 +101,7 @@ class BoatPage:
 
     def identity(self, episode: Mapping[str, Any]) -> str:
         """Return the player and the episode's number."""
-        return f"{episode['player']}-{episode['index']}"
+        return episodes.identity(episode["player"], episode["index"])
 
     def _layouts(self) -> dict[str, list[dict[str, Any]]]:
         """Return the layouts of each mode: start, goal, people's choice, and each boat's best score and plan.

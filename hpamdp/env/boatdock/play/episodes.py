@@ -9,18 +9,21 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import from_json  # refuses deep nesting by itself, where json runs into Python's recursion limit
 from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.episode import MAX_PRESSES
 from hpamdp.env.boatdock.play.replay import HELD, Press, Replay, replay, settle
 from hpamdp.env.page import EpisodeError
+from hpamdp.json_lines import left_out, lines_of, read_json
+from hpamdp.messages import warn
+from hpamdp.regular_files import read_regular
 
 FORMAT = 1
 PRACTICE = "practice"
@@ -82,18 +85,6 @@ class Episode(BaseModel):
     resolution: Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-class Sailed(NamedTuple):
-    """Episodes with what their presses come to.
-
-    Attributes:
-        episodes: as they were read.
-        replay: of their presses.
-    """
-
-    episodes: list[Episode]
-    replay: Replay
-
-
 def check(value: object) -> Episode:
     """Return an episode if it is one, and if its events come to its presses, and these to its end.
 
@@ -101,15 +92,15 @@ def check(value: object) -> Episode:
         EpisodeError: with what is wrong, in one line.
     """
     episode = _parse(value)
-    _check_layout(episode)
-    times = [event.t for event in episode.events]
-    if times != sorted(times):
-        raise EpisodeError("events: their times go back")
-    settled = settle((event.t, event.type, event.key) for event in episode.events)
-    played = sail([episode], [settled])
-    _check_presses(episode, settled, played)
-    _check_end(episode, played)
+    (problem,) = _problems([episode])
+    if problem is not None:
+        raise EpisodeError(problem)
     return episode
+
+
+def identity(player: object, index: object) -> str:
+    """Return what tells an episode from all others: who played it, and as which of that player's."""
+    return f"{player}-{index}"
 
 
 def sail(episodes: Sequence[Episode], presses: Sequence[Sequence[Press | SettledPress]] | None = None) -> Replay:
@@ -131,40 +122,60 @@ def direction_rows(episodes: Sequence[Episode]) -> Tensor:
     return torch.tensor([2 if e.controller == "congruent" else e.keymap - 1 for e in episodes], dtype=torch.long)
 
 
-def read(path: Path) -> list[Episode]:
-    """Read a file of episodes and check its schema, line by line; a last line that was cut short is left out.
+def read(path: Path) -> dict[int, Episode]:
+    """Read a file and return its episodes by the numbers of their lines, each checked as by `check`.
+
+    Lines that are no episode are left out, as are episodes that an earlier line has; a warning names them.
 
     Raises:
-        EpisodeError: the file is missing, or a line is no episode.
+        EpisodeError: the file cannot be read, or it has lines but no episode.
     """
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise EpisodeError(f"{path}: larger than {_MAX_BYTES // 2**20} MB")
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise EpisodeError(f"{path}: there is no such file; `hpamdp play` writes one") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise EpisodeError(f"{path}: cannot be read ({type(error).__name__})") from error
-    lines = text.split("\n")
-    complete, rest = lines[:-1], lines[-1]
-    episodes = []
-    for number, line in enumerate([*complete, rest] if _is_json(rest) else complete, 1):
-        if not line.strip():
-            continue
-        try:
-            episodes.append(_parse(from_json(line)))
-        except ValueError as error:
-            what = error if isinstance(error, EpisodeError) else "no JSON"
-            raise EpisodeError(f"{path}, line {number}: {what}") from error
+    episodes, problems = read_with_problems(path)
+    if problems:
+        _warn_once(f"{path}: {left_out(len(episodes) + len(problems), problems)}")
     return episodes
 
 
-def _is_json(text: str) -> bool:
+def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
+    """Read a file as `read` does; return the episodes, and what is wrong with the lines that were left out.
+
+    Raises:
+        EpisodeError: as `read` does.
+    """
     try:
-        from_json(text)
-    except ValueError:
-        return False
-    return True
+        data = read_regular(path, _MAX_BYTES)
+    except FileNotFoundError as error:
+        raise EpisodeError(f"{path}: there is no such file; `hpamdp play` writes one") from error
+    except OSError as error:
+        raise EpisodeError(f"{path}: {error.strerror or error}") from error
+    parsed: dict[int, Episode] = {}
+    problems: dict[int, str] = {}
+    for number, line in lines_of(data):
+        try:
+            parsed[number] = _parse(read_json(line))
+        except ValueError as error:
+            problems[number] = str(error)
+    episodes: dict[int, Episode] = {}
+    line_of: dict[str, int] = {}
+    for (number, episode), problem in zip(parsed.items(), _problems([*parsed.values()]), strict=True):
+        name = identity(episode.player, episode.index)
+        if problem is None and name in line_of:
+            problem = f"the same episode as line {line_of[name]}"
+        if problem is None:
+            line_of[name] = number
+            episodes[number] = episode
+        else:
+            problems[number] = problem
+    if problems and not episodes:
+        number, problem = min(problems.items())
+        raise EpisodeError(f"{path}, line {number}: {problem}; no line is an episode")
+    return episodes, problems
+
+
+@cache
+def _warn_once(message: str) -> None:
+    """Tell what was left out of a file once, however many environments read it."""
+    warn(message)
 
 
 def _parse(value: object) -> Episode:
@@ -183,6 +194,24 @@ def _points(points: Sequence[Point]) -> Tensor:
     return torch.tensor(points, dtype=torch.float64).reshape(-1, 2)
 
 
+def _problems(episodes: Sequence[Episode]) -> list[str | None]:
+    """Return what is wrong with each episode, if anything: whether it can have been played as it says."""
+    settled = [settle((event.t, event.type, event.key) for event in episode.events) for episode in episodes]
+    from_events, from_presses = sail(episodes, settled), sail(episodes)
+    problems: list[str | None] = []
+    for i, episode in enumerate(episodes):
+        try:
+            _check_layout(episode)
+            _check_presses(episode, settled[i], from_events, i)
+            _check_end(episode, from_events, i)
+            _check_outcome(episode, from_presses, i)
+        except EpisodeError as error:
+            problems.append(str(error))
+        else:
+            problems.append(None)
+    return problems
+
+
 def _check_layout(episode: Episode) -> None:
     for name in ("start", "goal"):
         if math.hypot(*getattr(episode, name)) > harbour.LAYOUT_RADIUS + 1e-3:
@@ -191,25 +220,33 @@ def _check_layout(episode: Episode) -> None:
         raise EpisodeError(f"goal: not {harbour.MIN_SEPARATION:g} px from the start")
 
 
-def _check_presses(episode: Episode, settled: Sequence[Press], played: Replay) -> None:
-    num = int(played.num_presses)
+def _check_presses(episode: Episode, settled: Sequence[Press], played: Replay, row: int) -> None:
+    times = [event.t for event in episode.events]
+    if times != sorted(times):
+        raise EpisodeError("events: their times go back")
+    num = int(played.num_presses[row])
     if len(episode.presses) != num:
         raise EpisodeError(f"presses: {len(episode.presses)}, but the events come to {num}")
+    burnt = played.burnt[row].tolist()
     for i, (said, found) in enumerate(zip(episode.presses, settled[:num], strict=True)):
-        errors = (said.start - found.start, said.duration - played.burnt[0, i].item())
+        errors = (said.start - found.start, said.duration - burnt[i])
         if said.key != found.key or max(map(abs, errors)) > _TOLERANCE:
             raise EpisodeError(f"presses.{i}: not what the events come to")
 
 
-def _check_end(episode: Episode, played: Replay) -> None:
-    outcome = physics.OUTCOMES[int(played.outcome)]
-    if outcome == physics.OUTCOMES[physics.SAILING]:
-        raise EpisodeError("outcome: the boat rests with fuel left, so the episode is not over")
+def _check_outcome(episode: Episode, played: Replay, row: int) -> None:
+    outcome = physics.OUTCOMES[int(played.outcome[row])]
     if outcome != episode.outcome:
         raise EpisodeError(f"outcome: {episode.outcome}, but the presses come to {outcome}")
-    fuel = played.fuel[0] / physics.TANK
-    score = harbour.score(played.outcome, fuel)
-    end = math.dist(episode.end, (played.end_x.item(), played.end_y.item()))
+
+
+def _check_end(episode: Episode, played: Replay, row: int) -> None:
+    if int(played.outcome[row]) == physics.SAILING:
+        raise EpisodeError("outcome: the boat rests with fuel left, so the episode is not over")
+    _check_outcome(episode, played, row)
+    fuel = played.fuel[row] / physics.TANK
+    score = harbour.score(played.outcome[row], fuel)
+    end = math.dist(episode.end, (played.end_x[row].item(), played.end_y[row].item()))
     for name, error in (("fuel", episode.fuel - fuel.item()), ("score", episode.score - score.item()), ("end", end)):
         if abs(error) > _TOLERANCE:
             raise EpisodeError(f"{name}: not what the presses come to")

@@ -256,7 +256,7 @@
       while (game.unsent.length) {
         const body = JSON.stringify(game.unsent[0]);
         const answer = await fetch("episodes", { method: "POST", headers: { "Content-Type": "application/json" }, body });
-        if (answer.status >= 500) throw new Error(`the server answered ${answer.status}`);
+        if (answer.status >= 500) throw new Error((await answer.text()).trim() || `the server answered ${answer.status}`);
         if (answer.ok) game.sent += 1;
         else {
           game.refused += 1;
