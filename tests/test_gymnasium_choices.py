@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium import spaces
 from gymnasium_players import action
 from torchrl.envs.utils import check_env_specs
+from toy_masked_gymnasium import UNIT, Masked
 
 from hpamdp import keys
 from hpamdp.env.base import ProblemError
@@ -48,7 +51,8 @@ def test_a_mask_can_be_ignored():
     [
         (
             {"source": "info"},
-            "gave an action_mask in its info; set env.action_mask=info to honour it, or env.action_mask=i",
+            r"gave an action_mask as info\['action_mask'\], which is not read; give it as action_mask in a Dict of "
+            r"observations, or in the info of every reset and step with env\.action_mask=info; env\.action_mask=ignor",
         ),
         ({"action_mask": "info"}, "gave None as action_mask, which must be 2 numbers, 0 or 1"),
         (
@@ -59,12 +63,84 @@ def test_a_mask_can_be_ignored():
             {"source": "info", "action_mask": "info", "mask": [1, float("nan")]},
             r"gave \[1, nan\] as action_mask, which ",
         ),
+        (
+            {"source": "info", "action_mask": "info", "mask": [[1, 1]]},
+            r"gave \[\[1, 1\]\] as action_mask, which must be 2",
+        ),
+        ({"source": "info", "action_mask": "info", "mask": "ab"}, "gave 'ab' as action_mask, which must be 2 numbers"),
         ({"source": "info", "action_mask": "info", "mask": [1]}, r"gave \[1\] as action_mask, which must be 2 numbers"),
     ],
 )
 def test_a_mask_that_is_not_what_was_set_is_told_in_one_line(options, complaint):
     with pytest.raises(ProblemError, match=rf"^GymnasiumEnv: toy_masked_gymnasium:Masked: environment 0: {complaint}"):
         make(**options).reset()
+
+
+def misplaced(where: str, name: str, value: object) -> None:
+    """Make an environment that says somewhere what it forbids, and take a step."""
+    env = GymnasiumEnv(entry_point=f"{__name__}:Misplaced", kwargs={"where": where, "name": name, "value": value})
+    env.reset()
+    env.step(action(env, [0], torch.zeros(1, 2)).set(keys.OPTION, torch.tensor([0])))
+
+
+class Misplaced(Masked):
+    """Says what it forbids at one of several places that are not read."""
+
+    def __init__(self, where: str, name: str, value: object):
+        super().__init__(form="dict", source="none")
+        self.spec = gymnasium.envs.registration.EnvSpec("Misplaced-v0", max_episode_steps=5)
+        self.where, self.what = where, {name: value}
+        if where == "attribute":
+            setattr(self, name, value)
+        if where == "nested observation":
+            self.observation_space = spaces.Dict(agent=spaces.Dict({"place": UNIT, name: spaces.MultiBinary(2)}))
+
+    def _info(self):
+        if self.where == "attribute at reset":
+            self.__dict__.update(self.what)
+        said = {"info": self.what, "nested info": {"agent": self.what}, "late info": self.what}.get(self.where, {})
+        return {} if self.where == "late info" and self.steps == 0 else said
+
+
+@pytest.mark.parametrize(
+    "name", ["action_masks", "avail_actions", "legal_actions", "validActions", "mask", "option_masks"]
+)
+@pytest.mark.parametrize(
+    "where", ["info", "nested info", "late info", "attribute", "attribute at reset", "nested observation"]
+)
+def test_a_mask_in_a_place_that_is_not_read_is_told_in_one_line(where, name):
+    kind = "option_mask" if name == "option_masks" else "action_mask"
+    expected = rf"^GymnasiumEnv: .*gave an {kind} as .*{name}.*, which is not read; give it as {kind} in a Dict of obs"
+    with pytest.raises(ValueError, match=expected):
+        misplaced(where, name, [1, 0])
+
+
+class Methods(gymnasium.Wrapper):
+    """Has the method of sb3-contrib, as its ActionMasker does."""
+
+    def action_masks(self) -> list[bool]:
+        return [True, False]
+
+
+def with_method() -> gymnasium.Env:
+    return gymnasium.wrappers.OrderEnforcing(Methods(Masked(source="none")))
+
+
+def test_a_method_that_gives_a_mask_is_told_in_one_line_unless_masks_are_ignored():
+    gymnasium.register("with-method-v0", entry_point=with_method)
+    for options in ({}, {"id": "with-method-v0", "entry_point": None}):
+        arguments = {"entry_point": f"{__name__}:with_method", "max_steps": 5, **options}
+        with pytest.raises(ValueError, match=r"gave an action_mask as the method Methods\.action_masks, which is not "):
+            GymnasiumEnv(**arguments)
+        assert GymnasiumEnv(**arguments, action_mask="ignore").reset()[keys.OBSERVATION].shape == (1, 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("mask", [3, 4]), ("mask", np.zeros((2, 2))), ("valid_action", True), ("legal_actions", None)]
+)
+def test_other_entries_with_such_names_are_no_masks(name, value):
+    for where in ("info", "attribute"):
+        misplaced(where, name, value)
 
 
 def test_a_mask_that_allows_nothing_is_told_in_one_line():

@@ -7,7 +7,7 @@ import importlib
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -23,9 +23,10 @@ from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import checked
 from hpamdp.env.gymnasium.four_value import FourValueEnv
 from hpamdp.env.gymnasium.leaves import OutOfBounds
+from hpamdp.env.gymnasium.masks import Masks, MaskSource
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
 from hpamdp.env.gymnasium.time_limit import with_limit
-from hpamdp.env.gymnasium.values import as_numbers, flag, shown
+from hpamdp.env.gymnasium.values import flag
 from hpamdp.messages import one_line
 
 _SUCCESS = "success"
@@ -61,7 +62,8 @@ class GymnasiumEnv(PAMDPEnv):
             there is one.
         action_mask: where the environment says which discrete actions it forbids, and which options, as K numbers that
             are 0 where one is: `info`: as `action_mask` and `option_mask` in the info of every reset and step;
-            `ignore`: what it says is ignored; None: in the observation, a `Dict`, if it has these entries.
+            `ignore`: what it says is ignored; None: in the observation, a `Dict`, if it has these entries. A mask in
+            another place, such as a method `action_masks`, is refused.
         observation_keys: of a `Tuple` (numbers from 0) or `Dict` (names) of observations, the entries to keep, in this
             order; None: all but masks.
         observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
@@ -89,7 +91,7 @@ class GymnasiumEnv(PAMDPEnv):
         max_steps: int | None = None,
         parameter_dims: list[int] | None = None,
         option_key: int | str | None = None,
-        action_mask: Literal["info", "ignore"] | None = None,
+        action_mask: MaskSource | None = None,
         observation_keys: list[int | str] | None = None,
         observation_scaling: Scaling = "bounds",
         out_of_bounds: OutOfBounds = "refuse",
@@ -110,10 +112,14 @@ class GymnasiumEnv(PAMDPEnv):
             self.max_steps = max(limits)
             self._options = OptionSpace(self.envs[0].action_space, option_key)
             self._actions = ActionSpace(self._options.rest, parameter_dims)
-            self._place_masks(action_mask)
-            if self._mask_source == "observation" and observation_keys is None:
+            sizes = {
+                keys.ACTION_MASK: len(self._actions.parameter_dims),
+                keys.OPTION_MASK: self._options.num_options,
+            }
+            self._masks = Masks(self.envs[0], num_envs, sizes, action_mask)
+            if self._masks.in_observation and observation_keys is None:
                 space = self.envs[0].observation_space
-                observation_keys = [name for name in getattr(space, "spaces", {}) if name not in self._masks]
+                observation_keys = [name for name in getattr(space, "spaces", {}) if name not in self._masks.rows]
             self.observations = ObservationSpace(
                 self.envs[0].observation_space, observation_scaling, observation_keys, out_of_bounds
             )
@@ -228,42 +234,10 @@ class GymnasiumEnv(PAMDPEnv):
             raise ValueError(f"{self._name}: there is no class or function {name} in {module_name}")
         return entry
 
-    def _place_masks(self, action_mask: str | None) -> None:
-        """Note where masks come from, and make room for them: `[N, K]` each."""
-        if action_mask not in (None, "info", "ignore"):
-            raise ValueError(f"action_mask={action_mask}: must be info, ignore or null")
-        sizes = {keys.ACTION_MASK: len(self._actions.parameter_dims), keys.OPTION_MASK: self._options.num_options}
-        sizes = {name: size for name, size in sizes.items() if size > 0}
-        if action_mask is None:
-            space = self.envs[0].observation_space
-            entries = space.spaces if isinstance(space, gymnasium.spaces.Dict) else {}
-            sizes = {name: size for name, size in sizes.items() if name in entries}
-        self._mask_source = "observation" if action_mask is None and sizes else action_mask
-        if action_mask == "ignore":
-            sizes = {}
-        self._masks = {name: np.ones((self.num_envs, size), bool) for name, size in sizes.items()}
-
     def _names_of_options(self) -> tuple[str, ...]:
         num_options = self._options.num_options
         names = tuple(map(str, getattr(self.envs[0].unwrapped, "option_names", ())))
         return names if num_options and len(names) == num_options else tuple(f"option{i}" for i in range(num_options))
-
-    def _keep_masks(self, row: int, observation: Any, info: Mapping[str, Any]) -> None:
-        """Keep the masks that one copy gives with its observation or its info."""
-        if self._mask_source is None and keys.ACTION_MASK in info:
-            raise ProblemError(
-                "gave an action_mask in its info; set env.action_mask=info to honour it, or env.action_mask=ignore"
-            )
-        source = observation if self._mask_source == "observation" else info
-        for name, masks in self._masks.items():
-            given = source.get(name)
-            if given is None and name == keys.OPTION_MASK:
-                masks[row] = True
-                continue
-            mask = as_numbers(given)
-            if mask is None or mask.shape != masks[row].shape or ((mask != 0) & (mask != 1)).any():
-                raise ProblemError(f"gave {shown(given)} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
-            masks[row] = mask != 0
 
     def _make_specs(self) -> None:
         n = self.num_envs
@@ -275,7 +249,7 @@ class GymnasiumEnv(PAMDPEnv):
             },
             shape=(n,),
         )
-        for name, masks in self._masks.items():
+        for name, masks in self._masks.rows.items():
             size = masks.shape[1]
             self.observation_spec[name] = Binary(size, shape=(n, size), dtype=torch.bool, device=device)
         low = torch.from_numpy(self._actions.low)
@@ -302,8 +276,9 @@ class GymnasiumEnv(PAMDPEnv):
             self._next_seeds[row] = None
             with self._problem_of(row):
                 observation, info = self.envs[row].reset(seed=seed)
+                self._masks.check_attributes(self.envs[row])
                 observations.append(self.observations.flat(observation))
-                self._keep_masks(row, observation, info)
+                self._masks.keep(row, observation, info)
         self._keep(rows, observations)
         self._terminated[rows] = False
         self._truncated[rows] = False
@@ -329,7 +304,7 @@ class GymnasiumEnv(PAMDPEnv):
             with self._problem_of(row):
                 observation, reward, terminated, truncated, info = self.envs[row].step(action)
                 observations.append(self.observations.flat(observation))
-                self._keep_masks(row, observation, info)
+                self._masks.keep(row, observation, info)
                 succeeded = self._read_success(info)
             rewards[row] = reward
             self._terminated[row] = terminated
@@ -374,7 +349,7 @@ class GymnasiumEnv(PAMDPEnv):
         leaves = {
             keys.OBSERVATION: self._observation,
             _SUCCESS: self._success,
-            **self._masks,
+            **self._masks.rows,
             keys.TERMINATED: self._terminated[:, None],
             keys.TRUNCATED: self._truncated[:, None],
             keys.DONE: (self._terminated | self._truncated)[:, None],

@@ -33,6 +33,9 @@ class Leaf:
         lengths: for each entry of the path, the number of entries beside it if it is one of a `Tuple`, else None.
         out_of_bounds: what becomes of finite numbers of a `Box` outside its bounds: they are refused, moved to the
             bound, or kept as they are.
+
+    Attributes:
+        what: the leaf in words, such as `entry a.b`.
     """
 
     def __init__(
@@ -46,7 +49,7 @@ class Leaf:
         self.path = path
         self._lengths = lengths
         self._out_of_bounds = out_of_bounds
-        self._what = f"entry {'.'.join(map(str, path))}" if path else "value"
+        self.what = f"entry {'.'.join(map(str, path))}" if path else "value"
         if isinstance(space, spaces.Box):
             self._read_bounds(space)
 
@@ -77,11 +80,11 @@ class Leaf:
         for entry, length in zip(self.path, self._lengths, strict=True):
             is_dict = length is None
             if not isinstance(value, Mapping if is_dict else tuple | list | np.ndarray):
-                raise ProblemError(f"gave an observation without its {self._what}")
+                raise ProblemError(f"gave an observation without its {self.what}")
             if not is_dict and len(value) != length:
                 raise ProblemError(f"gave an observation of {len(value)} entries, but its space has {length}")
             if is_dict and entry not in value:
-                raise ProblemError(f"gave an observation without its {self._what}")
+                raise ProblemError(f"gave an observation without its {self.what}")
             entries: Any = value
             value = entries[entry]
         return value
@@ -163,7 +166,7 @@ class Leaf:
         raise self._problem(f"is {values[place]:.10g}{index}, {reason}")
 
     def _problem(self, fault: str) -> ProblemError:
-        return ProblemError(f"gave an observation whose {self._what} {fault}")
+        return ProblemError(f"gave an observation whose {self.what} {fault}")
 
 
 def leaves(

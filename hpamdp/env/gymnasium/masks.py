@@ -1,0 +1,172 @@
+"""Which discrete actions and options a Gymnasium environment forbids, and other places where it may say so."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from hpamdp import keys
+from hpamdp.env.base import ProblemError
+from hpamdp.env.gymnasium.leaves import leaves
+from hpamdp.env.gymnasium.values import as_numbers, shown
+
+MaskSource = Literal["info", "ignore"]
+
+_DEPTH = 4  # of nested dictionaries that are searched
+# What an environment may call its masks, or lists of what it allows or forbids, in lower case without punctuation.
+_VERBS = "(?:get|compute|current)?"
+_ADJECTIVES = "(?:avail|available|legal|valid|allowed|permitted|possible|feasible|invalid|illegal|forbidden)"
+_MEANINGS = {
+    keys.ACTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}actions?(?:masks?)?|actions?masks?|masks?actions?)",
+    keys.OPTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}options?(?:masks?)?|options?masks?|masks?options?)",
+}
+# These may also be something else, so the values decide.
+_VAGUE = ("mask", "masks")
+
+
+class Masks:
+    """The masks of the copies of an environment, and a check that it has none in a place that is not read.
+
+    Args:
+        env: one of the copies.
+        num_envs: how many there are.
+        sizes: of `action_mask` and `option_mask`; 0: there is nothing to choose.
+        source: `info`: masks come with the info of every reset and step; `ignore`: they are ignored; None: they are
+            entries of the observation, a `Dict`, if it has them.
+
+    Attributes:
+        rows: the masks that are honoured, by name, bool `[N, K]` each.
+        in_observation: whether they come with the observation.
+
+    Raises:
+        ValueError: `source` is none of these, or the environment has a mask in a place that is not read.
+    """
+
+    def __init__(self, env: gymnasium.Env, num_envs: int, sizes: Mapping[str, int], source: MaskSource | None) -> None:
+        if source not in (None, "info", "ignore"):
+            raise ValueError(f"action_mask={source}: must be info, ignore or null")
+        space = env.observation_space
+        entries = space.spaces if isinstance(space, spaces.Dict) else {}
+        sizes = {name: size for name, size in sizes.items() if size > 0 and source != "ignore"}
+        self.rows = {
+            name: np.ones((num_envs, size), bool) for name, size in sizes.items() if source == "info" or name in entries
+        }
+        self.in_observation = source is None and bool(self.rows)
+        self._unread = {name: size for name, size in sizes.items() if name not in self.rows}
+        self._refuse([*_in_space(space), *_in_attributes(env, is_new=True)], ValueError)
+
+    def keep(self, row: int, observation: Any, info: Mapping[str, Any]) -> None:
+        """Keep the masks that one copy gives with a reset or a step.
+
+        Args:
+            row: the copy's number.
+            observation: as the environment gives it.
+            info: the same.
+
+        Raises:
+            ProblemError: a mask is not made of 0 and 1 for each choice, or is in a place that is not read.
+        """
+        source = observation if self.in_observation else info
+        for name, masks in self.rows.items():
+            given = source.get(name)
+            if given is None and name == keys.OPTION_MASK:
+                self._refuse([*_in_mapping("info", info)], ProblemError, {name: masks.shape[1]})
+                masks[row] = True
+                continue
+            mask = as_numbers(given)
+            if mask is None or mask.shape != masks[row].shape or ((mask != 0) & (mask != 1)).any():
+                raise ProblemError(f"gave {shown(given)} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
+            masks[row] = mask != 0
+        if self._unread:
+            self._refuse([*_in_mapping("info", info), *_in_mapping("observation", observation)], ProblemError)
+
+    def check_attributes(self, env: gymnasium.Env) -> None:
+        """Check the attributes that a copy has got since it was made.
+
+        Raises:
+            ProblemError: one of them is a mask.
+        """
+        if self._unread:
+            self._refuse([*_in_attributes(env, is_new=False)], ProblemError)
+
+    def _refuse(
+        self, places: list[tuple[str, str, Any]], error: type[ValueError], unread: Mapping[str, int] | None = None
+    ) -> None:
+        """Raise an error about the first of these places, names and values that is a mask which is not read."""
+        unread = self._unread if unread is None else unread
+        for place, entry, value in places:
+            name = _meaning(entry)
+            if name is None or name not in unread or (_is_vague(entry) and not _is_like_mask(value, unread[name])):
+                continue
+            raise error(
+                f"gave an {name} as {place}, which is not read; give it as {name} in a Dict of observations, or in the "
+                "info of every reset and step with env.action_mask=info; env.action_mask=ignore goes on without"
+            )
+
+
+def _in_space(space: spaces.Space) -> Iterator[tuple[str, str, Any]]:
+    """Yield the entries of an observation space that may be masks: place, name and a value."""
+    for leaf in leaves(space):
+        for entry in leaf.path:
+            yield f"{leaf.what} of the observation", str(entry), np.zeros(leaf.space.shape or ())
+
+
+def _in_mapping(place: str, values: Any, depth: int = _DEPTH) -> Iterator[tuple[str, str, Any]]:
+    """Yield the entries of nested dictionaries that may be masks: place, name and value."""
+    if not isinstance(values, Mapping) or depth == 0:
+        return
+    for entry, value in values.items():
+        if isinstance(entry, str) and _meaning(entry) is not None and not _says_nothing(value):
+            yield f"{place}[{entry!r}]", entry, value
+        yield from _in_mapping(f"{place}[{entry!r}]", value, depth - 1)
+
+
+def _in_attributes(env: Any, *, is_new: bool) -> Iterator[tuple[str, str, Any]]:
+    """Yield the attributes and methods of an environment and its wrappers that may be masks: place, name and value.
+
+    Args:
+        env: the outermost wrapper.
+        is_new: whether to look at the attributes of classes, too, which do not change.
+    """
+    layer: Any = env
+    while layer is not None:
+        for attribute in dir(layer) if is_new else [*getattr(layer, "__dict__", ())]:
+            if attribute.startswith("_") or _meaning(attribute) is None:
+                continue
+            value = inspect.getattr_static(layer, attribute, None)
+            if not _says_nothing(value):
+                kind = "method" if callable(value) else "attribute"
+                yield f"the {kind} {type(layer).__name__}.{attribute}", attribute, value
+        layer = getattr(layer, "__dict__", {}).get("env")
+
+
+@cache
+def _meaning(entry: str) -> str | None:
+    """Return which mask an entry may be by its name, if any."""
+    letters = re.sub(r"[^a-z]", "", entry.lower())
+    if letters in _VAGUE:
+        return keys.ACTION_MASK
+    return next((name for name, pattern in _MEANINGS.items() if re.fullmatch(pattern, letters)), None)
+
+
+def _is_vague(entry: str) -> bool:
+    return entry.lower() in _VAGUE
+
+
+def _is_like_mask(value: Any, size: int) -> bool:
+    if callable(value) or isinstance(value, property):
+        return True
+    numbers = as_numbers(value)
+    return numbers is not None and numbers.shape == (size,) and bool(((numbers == 0) | (numbers == 1)).all())
+
+
+def _says_nothing(value: Any) -> bool:
+    """Return whether a value is no mask whatever its name: a flag, a count, a text or none."""
+    return value is None or isinstance(value, str | bool | int | float | np.generic)
