@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import errno
 import importlib
 import itertools
 import os
@@ -28,8 +27,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.config import GROUPS, RUN_FILE, ConfigError, conf_dir, job_overrides, no_such, no_such_option
-from hpamdp.messages import first_line, one_line, reopen_standard_streams, warn
+from hpamdp.messages import first_line, one_line, reopen_standard_streams, say, warn
 from hpamdp.run import sweep
+from hpamdp.run.folder import AUTO, is_about_folder, locked
 
 _MISTAKE, _INTERRUPTED = 2, 130
 # Launchers and sweepers of packages of their own, and the extra of pyproject.toml that brings each.
@@ -241,8 +241,8 @@ def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
         return []
     if where == "checkpoint" and values.get("mode") != "eval":
         return []  # which is refused
-    if arguments.multirun:
-        return []  # a job is known by its words
+    if arguments.multirun or (where == "resume" and source == AUTO):
+        return []  # the run is known by its words
     from hpamdp.run.resume import saved_choices  # takes seconds, which --help need not wait for
 
     given = {override.key_or_group for override in overrides}
@@ -323,21 +323,23 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
         return sweep.run_job(cfg, start)
     # These take seconds, which --help need not wait for.
     from hpamdp.run import train
-    from hpamdp.run.folder import locked
 
     output_dir = Path(job.runtime.output_dir)
     if output_dir.resolve() == Path.cwd():
         _exit_with("hydra.run.dir: the working directory; give a folder of the run's own, or leave hydra.run.dir out")
     try:
         with locked(output_dir):
-            code = train.run(cfg, output_dir, job_overrides())
+            if cfg.resume == AUTO:
+                code = _go_on(cfg, output_dir)
+            else:
+                code = train.run(cfg, output_dir, job_overrides())
     except ConfigError as error:
         # Not raised any further: Hydra would announce it in a line of its own.
         with suppress(OSError):
             output_dir.rmdir()  # Hydra made it; it stays if there is something in it
         _exit_with(str(error))
     except OSError as error:
-        if not _is_about_folder(error, output_dir):
+        if not is_about_folder(error, output_dir):
             raise
         _exit_with(f"{output_dir}: {error.strerror or error}; the run was stopped", 1)
     if code:
@@ -345,11 +347,25 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     return None
 
 
-def _is_about_folder(error: OSError, folder: Path) -> bool:
-    """Return whether the run's folder is gone or cannot be written to."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
-        return True
-    return error.filename is not None and Path(str(error.filename)).is_relative_to(folder)
+def _go_on(cfg: DictConfig, output_dir: Path) -> int:
+    """Do what is left of the run in its folder, or start it there; return the exit code.
+
+    Raises:
+        ConfigError: the folder holds the results of another run.
+    """
+    from hpamdp.run import train
+    from hpamdp.run.continuation import left
+    from hpamdp.run.resume import resolve
+
+    cfg.resume = None
+    words = job_overrides()
+    score, source = left(resolve(cfg, words)[0], output_dir, f"resume=auto: {output_dir}")
+    if score is not None:
+        say(f"{output_dir}: this run is finished, with score {score:.3f}")
+        return 0
+    if source is not None:
+        say(f"Going on from {source}")
+    return train.run(cfg, output_dir, words, source, may_overwrite=True)
 
 
 def _exit_with(mistake: str, code: int = _MISTAKE) -> NoReturn:

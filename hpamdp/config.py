@@ -47,7 +47,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "data": ("env",),
-    "logger": ("output_dir", "config"),
+    "logger": ("output_dir", "config", "earlier"),
     "collector": ("config", "parts", "frames"),
 }
 RUN_FILE = "conf/config.yaml"

@@ -18,6 +18,7 @@ from hpamdp.analysis.style import AGENT, REFERENCES, STYLE, label_ends
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.files import replacing
 from hpamdp.messages import duration, warn
+from hpamdp.run.folder import FIGURES_NAME
 from hpamdp.run.metrics import EVALUATION, FRAMES, WALL_SECONDS, read_rows
 
 
@@ -38,6 +39,8 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
         curves = _learning_curves(rows, summary, env.curves(summary))
         figures = {} if curves is None else {"learning_curves.png": curves}
         figures |= env.draw_figures(evaluation, summary)
+        with replacing(output_dir / FIGURES_NAME) as partial:
+            partial.write_text("".join(f"{name}\n" for name in figures))
         for name, figure in figures.items():
             with replacing(output_dir / name) as partial:
                 figure.savefig(partial)

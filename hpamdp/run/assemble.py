@@ -1,4 +1,4 @@
-"""The parts of a run, built from its config: environment, agent, evaluation, data, logger."""
+"""The parts of a run, built from its config: environment, agent, evaluation, data."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner, Selector
 from hpamdp.run import checkpoint
 from hpamdp.run.evaluate import Evaluation
-from hpamdp.run.loggers import Logger
 from hpamdp.specs import PAMDPSpecs
 
 # Fewer steps or episodes than this need no estimate of their memory, for which an environment is built.
@@ -47,7 +46,6 @@ class Parts:
         agent: selector and learners.
         evaluation: scores the agent on environments of its own.
         data: what others did, to learn from, if there is any.
-        logger: takes the run's numbers beside its own files.
         device: of all of them.
     """
 
@@ -56,7 +54,6 @@ class Parts:
     agent: HierarchicalAgent
     evaluation: Evaluation
     data: Demonstrations | None
-    logger: Logger
     device: torch.device
 
 
@@ -84,9 +81,8 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     if is_new and config.run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(config.run.low.checkpoint, "low.checkpoint"), agent, device)
     evaluation = make_evaluation(config, env)
-    logger = config.logger.build(output_dir=output_dir, config=config.to_dict())
     tracked, policy = acting(env, agent, config)
-    return Parts(tracked, policy, agent, evaluation, data, logger, device)
+    return Parts(tracked, policy, agent, evaluation, data, device)
 
 
 def make_env(config: Config, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:

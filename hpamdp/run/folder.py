@@ -1,23 +1,53 @@
-"""The folder of a run: one process at a time, and no results are overwritten unasked."""
+"""The folder of a run: one process at a time, one run at a time, and no results are overwritten unasked."""
 
 from __future__ import annotations
 
+import errno
+import json
 import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+import yaml
 from filelock import FileLock, Timeout
 
 from hpamdp.config import ConfigError
-from hpamdp.files import remove_link
+from hpamdp.files import remove_link, replacing
 
+# The value of `resume` that goes on in the run's own folder, or starts there.
+AUTO = "auto"
 # Files of a run that others read.
 CHECKPOINT_NAME = "checkpoint.zip"
 POLICY_NAME = "policy.pt"
 SUMMARY_NAME = "summary.json"
+CONFIG_NAME = "config.yaml"
+METRICS_NAME = "metrics.csv"
 # Folders that a run's logger writes to.
 TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
+# Names of the pictures in the folder, which the environment chooses.
+FIGURES_NAME = ".figures"
+# The rest of what a run writes.
+DIVERGED_NAME = "checkpoint.diverged.zip"
+EVALUATION_NAME = "evaluation.npz"
+FILM_NAME = "episodes.gif"
+ERROR_NAME = "error.txt"
+# Each of these marks the folder as that of a run.
+_MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME)
+_OTHERS = (
+    METRICS_NAME,
+    f"{METRICS_NAME}.previous",
+    DIVERGED_NAME,
+    EVALUATION_NAME,
+    FILM_NAME,
+    ERROR_NAME,
+    TENSORBOARD_NAME,
+    WANDB_NAME,
+)
+# Holds an earlier run while a new one starts in its place.
+_ASIDE_NAME = ".replaced"
 
 
 @contextmanager
@@ -56,14 +86,127 @@ def check_no_link(folder: Path) -> None:
         raise ConfigError(f"{folder}: a link to {os.readlink(folder)}; a run writes to no linked folder, so remove it")
 
 
-def check_unused(folder: Path) -> None:
-    """Refuse a folder that holds a run.
+def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
+    """Refuse a folder that holds a run, unless it may be overwritten, or files that no run has written.
 
     Raises:
-        ConfigError: it does.
+        ConfigError: it holds them.
     """
-    if (folder / SUMMARY_NAME).exists() or (folder / CHECKPOINT_NAME).exists():
+    marks = [name for name in _MARKS if (folder / name).exists()]
+    if marks and not may_overwrite:
         raise ConfigError(
             f"{folder}: holds the results of a run; continue it with resume={folder}, take another hydra.run.dir, or "
             "set overwrite=true"
         )
+    is_of_a_run = marks or {"mode", "seed", "env", "low"} <= saved_config(folder).keys() or _aside(folder).exists()
+    if not is_of_a_run:
+        foreign = [path.name for path in written_by_a_run(folder) if path.name != ERROR_NAME]
+        if foreign:
+            raise ConfigError(
+                f"{folder}: holds {', '.join(foreign)}, which no run has written and a run would replace; take another "
+                "hydra.run.dir"
+            )
+
+
+def check_no_training(folder: Path) -> None:
+    """Refuse to write an evaluation into a folder that holds a training.
+
+    Raises:
+        ConfigError: it does.
+    """
+    names = (CHECKPOINT_NAME, POLICY_NAME, METRICS_NAME)
+    if any((folder / name).exists() for name in names) or saved_config(folder).get("mode", "eval") != "eval":
+        raise ConfigError(
+            f"{folder}: holds the record of a training, which an evaluation never changes; take another hydra.run.dir"
+        )
+
+
+def saved_config(folder: Path) -> dict[str, Any]:
+    """Return the config of the run in a folder; an empty one if there is none, or none that can be read."""
+    try:
+        config = yaml.safe_load((folder / CONFIG_NAME).read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return {}
+    return config if isinstance(config, dict) else {}
+
+
+def saved_summary(folder: Path) -> dict[str, Any]:
+    """Return the summary of the run in a folder; an empty one if there is none, or none that can be read."""
+    try:
+        summary = json.loads((folder / SUMMARY_NAME).read_text())
+    except (OSError, ValueError):  # not there, or cut off in the middle
+        return {}
+    return summary if isinstance(summary, dict) else {}
+
+
+def mark_unfinished(folder: Path) -> None:
+    """Let the summary of a run that goes on in its own folder no longer say that the run is finished."""
+    summary = saved_summary(folder)
+    if summary.get("finished"):
+        with replacing(folder / SUMMARY_NAME) as partial:
+            partial.write_text(json.dumps({**summary, "finished": False}, indent=2) + "\n")
+
+
+@contextmanager
+def moved_aside(folder: Path) -> Iterator[None]:
+    """Move an earlier run out of the folder, delete it after the block, and bring it back if the block fails.
+
+    Files that no run writes stay where they are.
+
+    Raises:
+        OSError: the folder cannot be written to; the earlier run stays.
+    """
+    aside = _aside(folder)
+    _delete(aside)
+    earlier = written_by_a_run(folder)
+    if earlier:
+        aside.mkdir()
+    try:
+        for path in earlier:
+            path.rename(aside / path.name)
+    except BaseException:
+        _bring_back(folder)
+        raise
+    try:
+        yield
+    except BaseException:
+        for path in written_by_a_run(folder):
+            _delete(path)
+        _bring_back(folder)
+        raise
+    _delete(aside)
+
+
+def _bring_back(folder: Path) -> None:
+    aside = _aside(folder)
+    for path in aside.iterdir() if aside.is_dir() else ():
+        path.rename(folder / path.name)
+    _delete(aside)
+
+
+def is_about_folder(error: OSError, folder: Path) -> bool:
+    """Return whether the run's folder cannot be made or written to, or is gone."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+        return True
+    return error.filename is not None and Path(str(error.filename)).is_relative_to(folder)
+
+
+def written_by_a_run(folder: Path) -> list[Path]:
+    """Return what a run has written into its folder, with the files first that show that it is one."""
+    names = [*_MARKS, *_OTHERS]
+    with suppress(OSError, UnicodeDecodeError):
+        listed = (folder / FIGURES_NAME).read_text().splitlines()
+        names += [name for name in listed if name and Path(name).name == name]
+    paths = [folder / name for name in (*names, FIGURES_NAME, CONFIG_NAME)]
+    return [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]
+
+
+def _aside(folder: Path) -> Path:
+    return folder / _ASIDE_NAME
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import netrc
 import os
-from collections.abc import Iterable
+import re
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
 from pydantic import Field, ValidationError
 
 from hpamdp.messages import first_line, warn
-from hpamdp.run.folder import TENSORBOARD_NAME
+from hpamdp.run.folder import TENSORBOARD_NAME, WANDB_NAME
+from hpamdp.run.metrics import FRAMES
+
+
+class EarlierRun(NamedTuple):
+    """The run that is continued: its folder and its rows of metrics up to the checkpoint."""
+
+    folder: Path
+    rows: Sequence[Mapping[str, float]]
+
 
 # Seconds that an online wandb run may keep the training waiting, at its start and at its end.
 _WANDB_START, _WANDB_FINISH = 20.0, 60.0
@@ -30,7 +42,11 @@ _WANDB_MODES: dict[str, WandbMode] = {
 
 
 class Logger(Protocol):
-    """Takes a run's numbers and figures somewhere besides `metrics.csv`."""
+    """Takes a run's numbers and figures somewhere besides `metrics.csv`.
+
+    A constructor may have the arguments `output_dir`, `config`, and `earlier` (an `EarlierRun` if a run is continued,
+    else None). The program supplies them.
+    """
 
     def log(self, row: dict[str, float], step: int) -> None:
         """Take one row of metrics after `step` frames; steps never go down."""
@@ -46,6 +62,62 @@ class Logger(Protocol):
 
     def close(self) -> None:
         """Finish; nothing is logged afterwards."""
+
+
+class Guarded:
+    """Passes everything to a logger until the logger raises an error; then warns once and drops the rest.
+
+    Args:
+        name: of the logger, for the warning.
+        start: makes the logger. Its `ValueError` is a user's mistake and passes.
+    """
+
+    def __init__(self, name: str, start: Callable[[], Logger]) -> None:
+        self._name = name
+        self._logger: Logger | None = None
+        try:
+            self._logger = start()
+        except ValueError:
+            raise
+        except Exception as error:
+            self._give_up(error)
+
+    def _pass(self, call: Callable[[Logger], None]) -> None:
+        if self._logger is None:
+            return
+        try:
+            call(self._logger)
+        except Exception as error:
+            self._give_up(error)
+
+    def _give_up(self, error: Exception) -> None:
+        warn(
+            f"logger={self._name}: {type(error).__name__}: {first_line(error)}; the run goes on without this logger, "
+            "and metrics.csv has all numbers"
+        )
+        with suppress(Exception):
+            getattr(self._logger, "abandon", lambda: None)()
+        self._logger = None
+
+    def log(self, row: dict[str, float], step: int) -> None:
+        """Pass one row on."""
+        self._pass(lambda logger: logger.log(row, step))
+
+    def images(self, paths: Iterable[Path]) -> None:
+        """Pass figures on."""
+        self._pass(lambda logger: logger.images(paths))
+
+    def film(self, path: Path) -> None:
+        """Pass a film on."""
+        self._pass(lambda logger: logger.film(path))
+
+    def summary(self, figures: dict[str, Any]) -> None:
+        """Pass the summary on."""
+        self._pass(lambda logger: logger.summary(figures))
+
+    def close(self) -> None:
+        """Close the logger."""
+        self._pass(lambda logger: logger.close())
 
 
 class CSVLogger:
@@ -77,15 +149,26 @@ class CSVLogger:
 class TensorboardLogger:
     """Log to TensorBoard event files.
 
+    A resumed run writes its earlier rows again, in place of the old events. Events may go past the checkpoint that the
+    run continues from, and the last ones may be missing.
+
     Args:
         output_dir: the run's folder; the events go to `tensorboard` in it.
+        earlier: the run that is continued, if any.
     """
 
-    def __init__(self, output_dir: Path) -> None:
+    def __init__(self, output_dir: Path, earlier: EarlierRun | None = None) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(output_dir / TENSORBOARD_NAME))
+        folder = output_dir / TENSORBOARD_NAME
+        rows = [] if earlier is None else earlier.rows
+        if rows:
+            for events in folder.glob("events.out.tfevents.*"):
+                events.unlink()
+        self._writer = SummaryWriter(str(folder))
         self._step = 0
+        for row in rows:
+            self.log(dict(row), int(row[FRAMES]))
 
     def log(self, row: dict[str, float], step: int) -> None:
         """Write each metric as a scalar after `step` frames."""
@@ -133,6 +216,7 @@ class WandbLogger:
             or netrc), offline elsewhere. "online" goes offline with a warning where there is no key or no answer.
         output_dir: the run's folder; offline runs lie in `wandb` in it, ready for `wandb sync`.
         config: the run's settings, to be shown beside its numbers.
+        earlier: the run that is continued, if any; its id is kept.
     """
 
     guarded_settings: ClassVar[tuple[str, ...]] = ("entity", "mode=online")
@@ -147,9 +231,12 @@ class WandbLogger:
         *,
         output_dir: Path,
         config: dict[str, Any] | None = None,
+        earlier: EarlierRun | None = None,
     ) -> None:
         import wandb
 
+        self._teardown = wandb.teardown
+        run_id = None if earlier is None else _wandb_id(earlier.folder)
         output_dir.mkdir(parents=True, exist_ok=True)  # wandb goes to a temporary folder where this one is missing
         _check_wandb_mode()
         try:
@@ -161,7 +248,7 @@ class WandbLogger:
                 login_timeout=_WANDB_START,
                 finish_timeout=_WANDB_FINISH,
             )
-            server = wandb.setup(wandb_settings).settings.base_url
+            server = _wandb_setup(wandb_settings).settings.base_url
         except wandb.errors.UsageError as error:
             raise ValueError(f"project={project}: {first_line(error)}") from error
         except ValidationError as error:  # of what wandb reads from the environment and from its own files
@@ -177,8 +264,12 @@ class WandbLogger:
                 entity=entity,
                 group=group,
                 name=name,
+                id=run_id,
+                resume="allow" if run_id is not None and chosen == "online" else None,
                 dir=str(output_dir),
                 config=config,
+                # A job of a sweep may have failed before it finished its run, which `init` would return otherwise.
+                reinit="finish_previous",
                 settings=wandb_settings,
             )
 
@@ -192,6 +283,20 @@ class WandbLogger:
             self._run = start("offline")
         self._image, self._video = wandb.Image, wandb.Video
         self._step = 0
+        if earlier is not None:
+            self._take_over(earlier.rows, output_dir)
+
+    def _take_over(self, rows: Sequence[Mapping[str, float]], output_dir: Path) -> None:
+        """Log the rows of the run that is continued, so that one offline run holds the whole curve.
+
+        If the run is online, the server may know these rows. wandb drops the steps that the server knows.
+        """
+        for row in rows:
+            self.log(dict(row), int(row[FRAMES]))
+        if rows and self._run.offline:
+            for folder in (output_dir / WANDB_NAME).glob(f"offline-run-*-{self._run.id}"):
+                if folder != Path(self._run.dir).parent:
+                    shutil.rmtree(folder)
 
     @property
     def is_offline(self) -> bool:
@@ -218,6 +323,30 @@ class WandbLogger:
     def close(self) -> None:
         """Wait, for a minute at most, until everything is sent."""
         self._run.finish()
+
+    def abandon(self) -> None:
+        """Forget a service that has died, so that the next run of this process starts its own."""
+        self._teardown()
+
+
+def _wandb_setup(settings: Any) -> Any:
+    """Start wandb's service, or another one if an earlier run's service has died."""
+    import wandb
+
+    try:
+        return wandb.setup(settings)
+    except OSError:
+        with suppress(OSError):
+            wandb.teardown()
+        return wandb.setup(settings)
+
+
+def _wandb_id(folder: Path) -> str | None:
+    """Return the id of the wandb run in a run's folder; None if there is none."""
+    names = sorted(path.name for path in (folder / WANDB_NAME).glob("*run-*"))
+    found = [re.fullmatch(r"(?:offline-)?run-\d{8}_\d{6}-(.+)", name) for name in names]
+    ids = [match.group(1) for match in found if match]
+    return ids[-1] if ids else None
 
 
 def _check_wandb_mode() -> None:

@@ -18,10 +18,11 @@ from hpamdp.files import replacing
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
 from hpamdp.run.closing_table import closing_table
+from hpamdp.run.folder import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
+from hpamdp.run.loggers import CSVLogger, EarlierRun, Guarded, Logger
 from hpamdp.run.metrics import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
 from hpamdp.run.summary import summarise
 
-FILM_NAME = "episodes.gif"
 # Small and short enough to take a second or two.
 _FPS, _FILM_SIZE, _FILMED_STEPS = 20.0, 200, 40
 
@@ -31,7 +32,7 @@ class Recorder:
 
     Args:
         config: of the run.
-        parts: the run's environment, agent, evaluation and logger.
+        parts: the run's environment, agent and evaluation.
         output_dir: where `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures go.
     """
 
@@ -39,7 +40,9 @@ class Recorder:
         self.config = config
         self.parts = parts
         self.output_dir = output_dir
-        self.metrics = MetricsFile(output_dir / "metrics.csv")
+        self.metrics = MetricsFile(output_dir / METRICS_NAME)
+        self._logger: Logger = CSVLogger(output_dir)
+        self._resumed_from: Path | None = None  # the folder of the run that is continued
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
         # The last evaluation; None once the agent has learned since.
@@ -50,7 +53,22 @@ class Recorder:
 
     def resume_from(self, folder: Path, frames: int) -> None:
         """Begin the metrics with the rows of the run in `folder`, up to `frames`."""
-        self.metrics = MetricsFile(self.metrics.path, folder / "metrics.csv", frames)
+        self.metrics = MetricsFile(self.metrics.path, folder / METRICS_NAME, frames)
+        self._resumed_from = folder
+
+    def start(self) -> None:
+        """Start the logger, which takes over the rows of a run that is resumed.
+
+        Raises:
+            ConfigError: the logger refuses its settings.
+        """
+        earlier = None
+        if self._resumed_from is not None:
+            earlier = EarlierRun(self._resumed_from, [row for row in self.metrics.rows() if FRAMES in row])
+        chosen, values = self.config.logger, self.config.to_dict()
+        self._logger = Guarded(
+            chosen.name, lambda: chosen.build(output_dir=self.output_dir, config=values, earlier=earlier)
+        )
 
     def state(self) -> dict[str, Any]:
         """Return what the next row of metrics depends on, for a checkpoint."""
@@ -94,7 +112,7 @@ class Recorder:
             measured = self.parts.evaluation.measure(self._play())
             row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
         self.metrics.append(row)
-        self.parts.logger.log(row, frames)
+        self._logger.log(row, frames)
         self._ended = []
         self._scalars = {}
         return row
@@ -115,15 +133,15 @@ class Recorder:
             self.log(frames, wall_s, is_evaluated=True, is_stopped=True)
         played = self._play()
         arrays: dict[str, Any] = dict(played)
-        with replacing(self.output_dir / "evaluation.npz") as partial:
+        with replacing(self.output_dir / EVALUATION_NAME) as partial:
             np.savez_compressed(partial, **arrays)
         measured = self.parts.evaluation.measure(played)
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random, effort, is_finished=is_finished)
-        with replacing(self.output_dir / "summary.json") as partial:
+        with replacing(self.output_dir / SUMMARY_NAME) as partial:
             partial.write_text(json.dumps(summary, indent=2) + "\n")
-        logger = self.parts.logger
+        logger = self._logger
         logger.images(figures.draw_all(self.output_dir, type(env)))
         filmed = self._film()
         if filmed is not None:

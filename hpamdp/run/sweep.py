@@ -11,23 +11,23 @@ import threading
 import time
 import traceback
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import yaml
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict, read_write
 
-from hpamdp.config import Config, ConfigError, job_overrides
+from hpamdp.config import ConfigError, job_overrides
 from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, say, warn
-from hpamdp.run.folder import check_no_link, locked
+from hpamdp.run.folder import ERROR_NAME, check_no_link, is_about_folder, locked, saved_summary
 from hpamdp.run.stopping import exits_told
-from hpamdp.saved_config import in_todays_form
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
@@ -37,14 +37,55 @@ _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
 
 
 class SweepDir(Callback):
-    """Remembers the sweep's folder, which Hydra passes to callbacks only."""
+    """Remembers the sweep's folder, which Hydra passes to callbacks only, and keeps Hydra from writing into runs."""
 
     path: ClassVar[Path | None] = None
 
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """Refuse files of Hydra in the run's folder."""
+        _check_output_subdir(config)
+
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        """Remember the sweep's folder."""
+        """Remember the sweep's folder, and leave the folders of the jobs to `run_job`."""
+        _check_output_subdir(config)
         SweepDir.path = Path(config.hydra.sweep.dir).absolute()
         remove_link(SweepDir.path / "multirun.yaml")  # which Hydra writes
+        hydra = GlobalHydra.instance().hydra
+        assert hydra is not None
+        hydra.config_loader = JobConfigs(hydra.config_loader.get_search_path())
+
+
+def _check_output_subdir(config: DictConfig) -> None:
+    """Exit if Hydra is to write its own files: it would do so before the run's folder is checked."""
+    given = config.hydra.output_subdir
+    if given is not None:
+        warn(f"hydra.output_subdir={given}: must be null; config.yaml in a run's folder has every value of the run")
+        sys.exit(_MISTAKE)
+
+
+class JobConfigs(ConfigLoaderImpl):
+    """Composes the configs of jobs so that Hydra makes no folder for them.
+
+    Hydra ends the whole sweep if it cannot make the folder of one job. `run_job` makes it instead.
+    """
+
+    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
+        """Return a job's config, whose folder below the sweep's is `hydra.sweep.job_subdir`."""
+        config = super().load_sweep_config(master_config, sweep_overrides)
+        with open_dict(config.hydra.sweep):
+            config.hydra.sweep.job_subdir = config.hydra.sweep._get_node("subdir")._value()
+        config.hydra.sweep.subdir = "."
+        config.hydra.output_subdir = None
+        return config
+
+
+def _job_folder() -> Path:
+    """Return the current job's folder, and let Hydra's own settings name it, too."""
+    hydra: Any = HydraConfig.get()
+    folder = Path(os.path.abspath(Path(hydra.sweep.dir, str(hydra.sweep.job_subdir))))
+    with read_write(hydra):
+        hydra.runtime.output_dir = str(folder)
+    return folder
 
 
 @dataclass
@@ -103,12 +144,12 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     """
     hydra = HydraConfig.get()
     overrides = job_overrides()
-    job = Job(hydra.job.num, " ".join(overrides), hydra.runtime.output_dir)
+    folder = _job_folder()
+    job = Job(hydra.job.num, " ".join(overrides), str(folder))
     records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":
         os.environ.setdefault("TQDM_DISABLE", "1")  # the bars of jobs side by side overwrite each other
         _stop_with_parent()
-    folder = Path(job.folder)
     records.write(job)
     say(f"Job {job.number}: {job.overrides}")
     try:
@@ -117,10 +158,12 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))
         with suppress(OSError):
-            folder.rmdir()  # Hydra made it; it stays if there is something in it
+            folder.rmdir()  # it stays if there is something in it
     except Exception as error:
         job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
-        with suppress(OSError), replacing(folder / "error.txt") as partial:
+        if isinstance(error, OSError) and is_about_folder(error, folder):
+            job.reason = f"its folder cannot be made or written to: {error.strerror or error}"
+        with suppress(OSError), replacing(folder / ERROR_NAME) as partial:
             partial.write_text(traceback.format_exc())
     records.write(job)
     if job.state != _FINISHED:
@@ -132,59 +175,25 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
 
 def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None, str]:
     """Run what is not done yet in a job's folder; return the job's state, its score and why it failed."""
-    from hpamdp.run import checkpoint, train  # takes seconds, which --help need not wait for
+    # These take seconds, which --help need not wait for.
+    from hpamdp.run import train
+    from hpamdp.run.continuation import left
     from hpamdp.run.resume import resolve
 
     wanted, _ = resolve(cfg, overrides)
-    source = folder / checkpoint.FILE_NAME
-    if source.exists() or (folder / "summary.json").exists():
-        _check_same(wanted, folder / "config.yaml")
-    score = _final_score(folder)
-    if score is not None:
-        return _SKIPPED, score, ""
-    (folder / "error.txt").unlink(missing_ok=True)
-    is_resumed = source.exists()
-    if is_resumed:
+    done, source = left(wanted, folder)
+    if done is not None:
+        return _SKIPPED, done, ""
+    (folder / ERROR_NAME).unlink(missing_ok=True)
+    if source is not None:
         say(f"Going on from {source}")
     reasons: list[str] = []
-    from_checkpoint = source if is_resumed else None
-    code = train.run(cfg, folder, overrides, from_checkpoint, may_overwrite=True, tell=reasons.append)
+    code = train.run(cfg, folder, overrides, source, may_overwrite=True, tell=reasons.append)
     if code in (train.DIVERGED, train.FAILED):
         return _FAILED, None, one_line(" ".join(reasons))
     if code:
         return _STOPPED, None, ""
-    return (_RESUMED if is_resumed else _FINISHED), _final_score(folder), ""
-
-
-def _final_score(folder: Path) -> float | None:
-    """Return the score of a run that reached its end; None where there is none. A stopped run has a summary, too."""
-    try:
-        summary = json.loads((folder / "summary.json").read_text())
-    except (OSError, ValueError):  # not there, or cut off in the middle
-        return None
-    return summary["score"] if summary["finished"] else None
-
-
-def _check_same(wanted: Config, file: Path) -> None:
-    """Refuse to continue in a folder with the results of another config."""
-    saved = _flat(in_todays_form(yaml.safe_load(file.read_text()))) if file.is_file() else {}
-    # Written and read as the saved one was.
-    own = _flat(yaml.safe_load(wanted.to_yaml()))
-    keys = [key for key in {**own, **saved} if own.get(key) != saved.get(key)]
-    if keys:
-        there, here = (json.dumps(values.get(keys[0]), default=str) for values in (saved, own))
-        more = f" and {len(keys) - 1} more" if keys[1:] else ""
-        raise ConfigError(
-            f"its folder has the results of another config, with {keys[0]}={there} for {here}{more}; they stay as they "
-            "are: set another hydra.sweep.dir, or move the folder away"
-        )
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
+    return (_FINISHED if source is None else _RESUMED), saved_summary(folder).get("score"), ""
 
 
 @functools.cache  # once a process, which may run several jobs
@@ -225,11 +234,11 @@ def report(start: str, error: BaseException | None = None) -> int:
     failed = [job for job in jobs if job.state in (_REFUSED, _FAILED)]
     _print_tally(jobs)
     for job in failed:
-        told = Path(job.folder, "error.txt")
-        warn(f"{job.overrides}: {job.reason} ({_shown(told if told.exists() else told.parent)})")
+        told = Path(job.folder, ERROR_NAME)
+        warn(f"{job.overrides}: {job.reason} ({_shown(told if os.path.exists(told) else told.parent)})")
     if is_stopped or (error is not None and len(failed) < len(jobs)):
         if not is_stopped:
-            with replacing(sweep_dir / "error.txt") as partial:
+            with replacing(sweep_dir / ERROR_NAME) as partial:
                 partial.write_text("".join(traceback.format_exception(error)))
             reason = one_line("".join(traceback.format_exception_only(error)))
             warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})")

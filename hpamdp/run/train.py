@@ -22,14 +22,24 @@ from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
 from hpamdp.run.collection.base import Collection, WorkerDiedError
-from hpamdp.run.folder import POLICY_NAME, TENSORBOARD_NAME, WANDB_NAME, check_no_link, check_unused
+from hpamdp.run.folder import (
+    CONFIG_NAME,
+    DIVERGED_NAME,
+    POLICY_NAME,
+    TENSORBOARD_NAME,
+    WANDB_NAME,
+    check_no_link,
+    check_no_training,
+    check_unused,
+    mark_unfinished,
+    moved_aside,
+)
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_told, signals_ignored, stop_on_signals
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
 INTERRUPTED, DIVERGED, FAILED = 130, 3, 1  # exit codes
-DIVERGED_NAME = "checkpoint.diverged.zip"
 
 
 class DivergedError(Exception):
@@ -84,11 +94,14 @@ def _run(
     may_overwrite: bool,
     tell: Callable[[str], None],
 ) -> int:
-    is_own = source is not None and source.parent.resolve() == output_dir.resolve()
-    if not (may_overwrite or config.run.overwrite or is_own):
-        check_unused(output_dir)
     for name in (TENSORBOARD_NAME, WANDB_NAME):
         check_no_link(output_dir / name)
+    is_training = config.run.mode != "eval"
+    if not is_training:
+        check_no_training(output_dir)
+    is_own = is_training and source is not None and source.parent.resolve() == output_dir.resolve()
+    if not is_own:
+        check_unused(output_dir, may_overwrite=may_overwrite or config.run.overwrite)
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
     parts = assemble(config, output_dir)
@@ -96,14 +109,11 @@ def _run(
     trainer = Trainer(config, parts, output_dir)
     if source is not None:
         trainer.restore(source)
-        for word in overrides:
-            if word.startswith(("total_frames=", "offline.updates=")) and config.run.mode != "eval":
-                check_more(word, trainer.frames, config.run.num_frames)
-    output_dir.mkdir(parents=True, exist_ok=True)
-    with replacing(output_dir / "config.yaml") as partial:
-        partial.write_text(config.to_yaml())
+        if is_training:
+            check_more(overrides, trainer.frames, config.run.num_frames)
+    trainer.start(is_own=is_own)
     is_interrupted = False
-    if config.run.mode != "eval":
+    if is_training:
         try:
             is_interrupted = trainer.train()
         except DivergedError as error:
@@ -162,6 +172,29 @@ class Trainer:
         self.recorder.resume_from(source.parent, self.frames)
         self.recorder.set_state(saved.states["recorder"])
         self._saved = saved
+
+    def start(self, *, is_own: bool) -> None:
+        """Write the config and start the logger: the first writes, after everything was checked and built.
+
+        Args:
+            is_own: whether the folder holds the run that is continued. Otherwise an earlier run there is deleted.
+
+        Raises:
+            ConfigError: the logger refuses its settings; the folder stays as it was.
+        """
+        if is_own:
+            self.recorder.start()
+            self._write_config()
+            mark_unfinished(self.output_dir)
+            return
+        self.output_dir.mkdir(parents=True, exist_ok=True)
+        with moved_aside(self.output_dir):
+            self._write_config()
+            self.recorder.start()
+
+    def _write_config(self) -> None:
+        with replacing(self.output_dir / CONFIG_NAME) as partial:
+            partial.write_text(self.config.to_yaml())
 
     def train(self) -> bool:
         """Train until `num_frames` or `eval.stop_score` and save the agent; return whether a signal stopped it before.
@@ -313,14 +346,15 @@ class Trainer:
         }
 
 
-def check_more(word: str, frames: int, wanted: int) -> None:
+def check_more(overrides: Sequence[str], frames: int, wanted: int) -> None:
     """Refuse to continue a run for fewer frames than it has.
 
     Raises:
         ConfigError: with how many those are.
     """
-    if frames > wanted:
-        raise ConfigError(f"{word}: the run that is continued has {frames:,} already; set more, or leave it out")
+    for word in overrides:
+        if word.startswith(("total_frames=", "offline.updates=")) and frames > wanted:
+            raise ConfigError(f"{word}: the run that is continued has {frames:,} already; set more, or leave it out")
 
 
 def check_rewards(batch: TensorDictBase) -> None:

@@ -1,0 +1,74 @@
+"""What is left to do in a folder, when the command that started its run is given again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from hpamdp.config import Config, ConfigError
+from hpamdp.run import checkpoint
+from hpamdp.run.folder import SUMMARY_NAME, saved_config, saved_summary
+from hpamdp.saved_config import in_todays_form
+
+# Settings that change neither what is learned nor what is scored.
+_BOOKKEEPING = ("resume", "overwrite", "film", "logger", "checkpoint_every", "checkpoint_minutes", "checkpoint_replay")
+
+
+class Left(NamedTuple):
+    """What a run has left to do: nothing if it has a score, else everything after its checkpoint."""
+
+    score: float | None = None
+    checkpoint: Path | None = None
+
+
+def left(wanted: Config, folder: Path, name: str = "its folder") -> Left:
+    """Return what is left to do of a run in its folder, which may be new.
+
+    Args:
+        wanted: the config of the run.
+        folder: its folder.
+        name: of the folder, for the error.
+
+    Raises:
+        ConfigError: the folder holds the results of another run, and `overwrite` is false.
+    """
+    file = folder / checkpoint.FILE_NAME
+    if not file.exists() and not (folder / SUMMARY_NAME).exists():
+        return Left()
+    saved = saved_config(folder)
+    if not saved and file.exists():
+        saved = checkpoint.progress_of(file)["config"]
+    difference = _difference(wanted, saved)
+    if difference and wanted.run.overwrite:
+        return Left()
+    if difference:
+        raise ConfigError(
+            f"{name} has the results of another config, with {difference}; they stay as they are: set another "
+            "folder, or move this one away"
+        )
+    summary = saved_summary(folder)
+    return Left(summary["score"] if summary.get("finished") else None, file if file.exists() else None)
+
+
+def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
+    """Return in words where two configs differ, bookkeeping aside; nothing if they do not."""
+    # Written and read as the saved one was.
+    here, there = _flat(yaml.safe_load(wanted.to_yaml())), _flat(in_todays_form(saved) if saved else {})
+    keys = [key for key in {**here, **there} if here.get(key) != there.get(key)]
+    keys = [key for key in keys if key.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING]
+    if not keys:
+        return ""
+    more = f" and {len(keys) - 1} more" if keys[1:] else ""
+    values = [json.dumps(each.get(keys[0]), default=str) for each in (there, here)]
+    return f"{keys[0]}={values[0]} for {values[1]}{more}"
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat

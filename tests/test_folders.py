@@ -1,0 +1,294 @@
+"""A folder holds one run, whatever came before in it and whatever its logger does."""
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import compose_config
+from test_metrics import without_login  # noqa: F401  (a fixture)
+
+from hpamdp.config import ConfigError
+from hpamdp.run import checkpoint
+from hpamdp.run.folder import CONFIG_NAME, locked, moved_aside
+from hpamdp.run.loggers import TensorboardLogger
+from hpamdp.run.metrics import read_rows
+from hpamdp.run.recorder import Recorder
+from hpamdp.run.train import Trainer, run
+
+TINY = ["num_envs=8", "steps_per_batch=4", "total_frames=128", "log_every=32", "eval.layouts=4", "eval.every=0"]
+TINY += ["high=ucb", "low=random"]
+
+
+def start(folder: Path, *words: str) -> int:
+    return run(compose_config([*TINY, *words]), folder, [*words])
+
+
+def resume(source: Path, folder: Path, *words: str) -> int:
+    given = [f"resume={source}", *words]
+    return run(compose_config(given), folder, given)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def kill_at(monkeypatch: pytest.MonkeyPatch, frames: int) -> None:
+    """Have the next run end at this many frames as if it had been killed: it saves nothing."""
+    log = Recorder.log
+
+    def killed(self, now, *given, **kept):
+        if now >= frames:
+            raise SystemError("killed")
+        return log(self, now, *given, **kept)
+
+    monkeypatch.setattr(Recorder, "log", killed)
+    monkeypatch.setattr(Trainer, "_save_and_close", lambda self, collection: collection.close())
+
+
+def start_and_kill(folder: Path, frames: int, *words: str) -> None:
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemError):
+        kill_at(patch, frames)
+        start(folder, *words)
+
+
+def test_a_run_that_overwrites_another_and_is_killed_leaves_nothing_of_the_other(tmp_path):
+    start(tmp_path, "logger=tensorboard")
+    for name in ("notes.txt", "own.png", "learning_curves.png", "choices.png"):
+        (tmp_path / name).write_text("")
+    (tmp_path / ".figures").write_text("learning_curves.png\nchoices.png\n../outside.png\n")
+    start_and_kill(tmp_path, 32, "seed=7", "overwrite=true")
+    assert {path.name for path in tmp_path.iterdir()} == {"notes.txt", "own.png", "config.yaml", "metrics.csv"}
+    assert "seed: 7" in (tmp_path / CONFIG_NAME).read_text()
+    assert start(tmp_path, "seed=8", "logger=tensorboard") == 0, "nothing is left that would have to be overwritten"
+
+
+def test_a_run_that_is_refused_destroys_nothing(tmp_path, monkeypatch, without_login):  # noqa: F811
+    start(tmp_path / "run")
+    before = contents(tmp_path / "run")
+    refused = [["low=pdqn", "low.batch_size=0"], ["high=none"], ["high=ucb", "resume=nowhere"], ["logger=wandb"]]
+    monkeypatch.setenv("WANDB_MODE", "sometimes")  # which is found last, when the logger starts
+    for words in refused:
+        with pytest.raises(ConfigError):
+            start(tmp_path / "run", "overwrite=true", *words)
+        assert contents(tmp_path / "run") == before, words
+    for word in (f"resume={tmp_path / 'run'}", "total_frames=256"), (f"resume={tmp_path / 'run'}", "total_frames=64"):
+        with pytest.raises(ConfigError):
+            run(compose_config([*word, "logger=wandb"]), tmp_path / "run", [*word, "logger=wandb"])
+        assert contents(tmp_path / "run") == before
+
+
+def test_a_move_that_fails_halfway_brings_the_earlier_run_back(tmp_path, monkeypatch):
+    for name in ("summary.json", "checkpoint.zip", "config.yaml", "metrics.csv"):
+        (tmp_path / name).write_text(name)
+    before, rename = contents(tmp_path), Path.rename
+
+    def full(self, target):
+        if self.name == "metrics.csv":
+            raise OSError("no space left")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", full)
+    with pytest.raises(OSError, match="no space"), moved_aside(tmp_path):
+        pass
+    assert contents(tmp_path) == before
+
+
+def test_files_that_no_run_has_written_are_never_replaced(tmp_path):
+    (tmp_path / CONFIG_NAME).write_text("title: my site\n")
+    for word in ("overwrite=false", "overwrite=true"):
+        with pytest.raises(ConfigError, match=r"holds config\.yaml, which no run has written"):
+            start(tmp_path, word)
+    assert contents(tmp_path) == {CONFIG_NAME: b"title: my site\n"}
+
+
+def test_a_resumed_run_in_the_folder_of_another_replaces_it_as_a_whole(tmp_path):
+    start(tmp_path / "a")
+    start(tmp_path / "b", "seed=3", "logger=tensorboard")
+    with pytest.raises(ConfigError, match="holds the results of a run"):
+        resume(tmp_path / "a", tmp_path / "b", "total_frames=256")
+    assert resume(tmp_path / "a", tmp_path / "b", "total_frames=256", "overwrite=true") == 0
+    assert "seed: 0" in (tmp_path / "b" / CONFIG_NAME).read_text() and not (tmp_path / "b/tensorboard").exists()
+
+
+def test_a_finished_run_that_goes_on_and_is_killed_is_no_longer_finished(tmp_path, monkeypatch):
+    start(tmp_path)
+    with monkeypatch.context() as patch, pytest.raises(SystemError):
+        kill_at(patch, 200)
+        resume(tmp_path, tmp_path, "total_frames=256")
+    assert not json.loads((tmp_path / "summary.json").read_text())["finished"]
+    assert resume(tmp_path, tmp_path, "total_frames=256") == 0
+    assert json.loads((tmp_path / "summary.json").read_text())["finished"]
+
+
+def test_an_evaluation_never_touches_the_record_of_a_run(tmp_path, command, capsys):
+    start(tmp_path / "run")
+    start_and_kill(tmp_path / "killed", 64)
+    capsys.readouterr()
+    before = contents(tmp_path)
+    for folder in ("run", "killed"):
+        for word in ("overwrite=false", "overwrite=true"):
+            code, _, err = command("mode=eval", "checkpoint=run", f"hydra.run.dir={folder}", word)
+            assert code == 2 and err.count("\n") == 1 and "an evaluation never changes" in err
+        code, _, err = command(
+            "-m", "mode=eval", "checkpoint=run", "overwrite=true", "hydra.sweep.dir=.", f"hydra.sweep.subdir={folder}"
+        )
+        assert code == 2 and err.count("\n") == 1
+    code, _, err = command("mode=eval", "checkpoint=run", "hydra.run.dir=run", "hydra.output_subdir=.hydra")
+    assert code == 2 and err.count("\n") == 1
+    after = contents(tmp_path)
+    assert {name: after[name] for name in before} == before and {*after} - {*before} <= {"multirun.yaml"}
+
+
+def test_an_evaluation_may_replace_another_and_read_a_folder_that_it_cannot_write(tmp_path):
+    start(tmp_path / "run")
+    (tmp_path / "run").chmod(0o555)
+    words = ["mode=eval", f"checkpoint={tmp_path / 'run'}"]
+    try:
+        assert run(compose_config(words), tmp_path / "scored", words) == 0
+        assert run(compose_config([*words, "overwrite=true"]), tmp_path / "scored", words) == 0
+    finally:
+        (tmp_path / "run").chmod(0o755)
+
+
+def test_a_run_is_not_resumed_where_another_process_is_at_work(tmp_path, command):
+    start(tmp_path / "run")
+    with locked(tmp_path / "run"):
+        code, _, err = command("resume=run", "hydra.run.dir=run", "total_frames=256")
+    assert code == 2 and "another process is at work" in err
+    assert "128" in json.dumps(json.loads((tmp_path / "run/summary.json").read_text())["frames"])
+
+
+def curves(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return what TensorBoard shows, without times."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0}).Reload()
+    return {
+        tag: [(event.step, event.value) for event in events.Scalars(tag)]
+        for tag in events.Tags()["scalars"]
+        if tag != "wall_s"
+    }
+
+
+def wandb_curves(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return what `wandb sync` would send of the folder's offline runs, by their ids; the steps in order."""
+    found: dict[str, list] = {}
+    for file in sorted((folder / "wandb").glob("offline-run-*/run-*.wandb")):
+        rows = found.setdefault(file.stem.removeprefix("run-"), [])
+        for record in wandb_records(file):
+            if record.HasField("history"):
+                values = {item.nested_key[0] or item.key: json.loads(item.value_json) for item in record.history.item}
+                rows.append((record.history.step.num, values.get("eval/score"), values.get("frames")))
+    return found
+
+
+def wandb_records(file: Path) -> Iterator:
+    """Return the records of an offline run: a log in LevelDB's format, after a header of 7 bytes."""
+    from wandb.proto import wandb_internal_pb2
+
+    data, place, whole, block = file.read_bytes(), 7, b"", 32768
+    while place + 7 <= len(data):
+        if block - place % block < 7:
+            place += block - place % block
+            continue
+        _, length, kind = struct.unpack("<IHB", data[place : place + 7])
+        piece = data[place + 7 : place + 7 + length]
+        place += 7 + length
+        whole = piece if kind in (1, 2) else whole + piece
+        if kind in (1, 4):
+            record = wandb_internal_pb2.Record()
+            record.ParseFromString(whole)
+            yield record
+
+
+@pytest.mark.parametrize("place", ["killed", "elsewhere"])
+def test_tensorboard_shows_a_resumed_run_as_the_one_that_was_never_stopped(place, tmp_path):
+    words = ["logger=tensorboard", "total_frames=256", "checkpoint_every=96"]
+    start(tmp_path / "whole", *words)
+    start_and_kill(tmp_path / "killed", 192, *words)
+    (tmp_path / "killed").rename(tmp_path / "moved")
+    folder = tmp_path / ("moved" if place == "killed" else place)
+    assert resume(tmp_path / "moved", folder) == 0
+    assert curves(folder) == curves(tmp_path / "whole") and len(curves(folder)["frames"]) == 9
+    assert len(list((folder / "tensorboard").iterdir())) == 1
+
+
+@pytest.mark.parametrize("place", ["killed", "elsewhere"])
+def test_wandb_has_a_resumed_run_as_one_run_with_the_curve_of_the_one_never_stopped(
+    place,
+    tmp_path,
+    without_login,  # noqa: F811
+):
+    words = ["logger=wandb", "logger.mode=offline", "total_frames=256", "checkpoint_every=96"]
+    start(tmp_path / "whole", *words)
+    start_and_kill(tmp_path / "killed", 192, *words)
+    assert resume(tmp_path / "killed", tmp_path / place) == 0
+    (whole,) = wandb_curves(tmp_path / "whole").values()
+    ((run_id, rows),) = wandb_curves(tmp_path / place).items()
+    assert rows == whole and len(rows) >= 9
+    assert list((tmp_path / place / "wandb").glob(f"offline-run-*-{run_id}")) and run_id in {
+        *wandb_curves(tmp_path / "killed")
+    }
+
+
+@pytest.mark.parametrize("where", ["__init__", "log", "summary", "close"])
+def test_a_logger_that_fails_is_switched_off_with_one_warning(where, tmp_path, monkeypatch, capsys):
+    def broken(*_, **__):
+        raise BrokenPipeError("the other end\nis gone")
+
+    monkeypatch.setattr(TensorboardLogger, where, broken)
+    assert start(tmp_path, "logger=tensorboard") == 0
+    warning = "logger=tensorboard: BrokenPipeError: the other end; the run goes on without this logger, and metrics.csv"
+    assert capsys.readouterr().err.count(warning) == 1
+    assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 6
+
+
+def test_the_same_command_after_a_requeue_goes_on_with_its_run(tmp_path, command, capsys):
+    words = [*TINY, "film=false", "checkpoint_every=96", "hydra.run.dir=run", "resume=auto"]
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemError):
+        kill_at(patch, 128)
+        command(*words)
+    assert checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] == 96
+    code, out, _ = command(*words)
+    assert code == 0 and "Going on from" in out
+    start(tmp_path / "whole", "checkpoint_every=96")
+    rows, whole = (read_rows(tmp_path / name / "metrics.csv") for name in ("run", "whole"))
+    assert [row | {"wall_s": 0} for row in rows] == [row | {"wall_s": 0} for row in whole]
+    before = contents(tmp_path / "run")
+    capsys.readouterr()
+    code, out, err = command(*words, "film=true", "checkpoint_minutes=1")  # bookkeeping
+    assert (code, err) == (0, "") and "run: this run is finished, with score " in out
+    assert contents(tmp_path / "run") == before
+    code, _, err = command(*words, "seed=4")
+    assert code == 2 and err.count("\n") == 1
+    assert err.startswith("resume=auto: ") and "has the results of another config, with seed=0 for 4;" in err
+    assert contents(tmp_path / "run") == before
+    assert command(*words, "seed=4", "overwrite=true")[0] == 0
+    assert "seed: 4" in (tmp_path / "run/config.yaml").read_text()
+
+
+def test_jobs_whose_folder_cannot_be_made_are_named_and_the_others_run(tmp_path, command, capsys):
+    folder = tmp_path / "sweep"
+    folder.mkdir()
+    (folder / "seed0").write_text("a file of this name")
+    (folder / "seed2").symlink_to(folder / "nowhere/at/all")
+    capsys.readouterr()
+    words = ["-m", *TINY, "film=false", "seed=0,1,2,3", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=seed${seed}"]
+    for state in ("2 finished", "2 skipped, finished before"):
+        code, out, err = command(*words)
+        named = [line for line in err.splitlines() if "(sweep/" in line]
+        assert code == 1 and len(named) == 2 and all("its folder cannot be made" in line for line in named)
+        assert f"4 jobs: 2 failed; {state}\n" in out and "Traceback" not in err
+    assert (folder / "seed0").read_text() == "a file of this name"
+
+
+def test_a_job_that_was_finished_by_hand_counts_as_finished_in_its_sweep(tmp_path, command):
+    words = ["-m", *TINY, "film=false", "checkpoint_every=96", "seed=0,1", "hydra.sweep.dir=sweep"]
+    with pytest.MonkeyPatch.context() as patch:
+        kill_at(patch, 128)
+        assert command(*words)[0] == 1
+    assert command("resume=sweep/0", "hydra.run.dir=sweep/0", "film=false")[0] == 0
+    code, out, _ = command(*words)
+    assert code == 0 and "2 jobs: 1 skipped, finished before; 1 resumed and finished\n" in out
