@@ -1,8 +1,12 @@
 """What serves any recording: demonstrations, tables and memory-mapped files, and Minari."""
 
 import csv
+import json
+import os
 import re
+import resource
 from dataclasses import replace
+from importlib.util import find_spec
 
 import gymnasium
 import numpy as np
@@ -14,12 +18,14 @@ from tensordict import TensorDict
 
 from hpamdp import keys
 from hpamdp.config import ConfigError
-from hpamdp.data import export, minari
+from hpamdp.data import export, memmap, minari
 from hpamdp.data.demonstrations import TRAJECTORY, Demonstrations, with_option_sums
 from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.run.assemble import make_data, make_env
 from hpamdp.specs import PAMDPSpecs
+
+h5py = pytest.importorskip("h5py") if find_spec("minari") else None  # of the extra `minari`
 
 LAYOUT = minari.MinariLayout(discrete="tool", parameters="force", infos=("heat",))
 
@@ -312,6 +318,114 @@ def test_minari_returns_the_transitions_of_a_problem_without_options(workshop_id
         assert loaded[name].dtype == value.dtype and loaded[name].equal(value), name
     with pytest.raises(DataError, match="test/tools-v0: cannot be read as transitions"):
         minari.load("test/tools-v0", minari.MinariLayout())
+
+
+def exported(tmp_path, monkeypatch, workshop_id):
+    """Return the folder of a Minari data set, and what reads it."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    minari.export(episodes(3, 2), "test/tools-v0", LAYOUT, env_id=workshop_id, env_kwargs={"size": 2})
+    return tmp_path / "test" / "tools-v0" / "data"
+
+
+def with_metadata(folder, **changes):
+    file = folder / "metadata.json"
+    metadata = {**json.loads(file.read_text()), **changes}
+    file.write_text(json.dumps({name: value for name, value in metadata.items() if value is not None}))
+
+
+def with_values(folder, name, make):
+    """Put other values in the place of an entry of the file of episodes."""
+    with h5py.File(folder / "main_data.hdf5", "a") as file:
+        episode = file["episode_1"]
+        old = episode[name][()]
+        del episode[name]
+        make(episode, name, old)
+
+
+def spec_that_runs(folder):
+    spec = gymnasium.envs.registration.EnvSpec("Bomb-v0", entry_point=f"{__name__}:light")
+    with_metadata(folder, env_spec=spec.to_json(), action_space=None)
+
+
+is_lit = False
+
+
+def light(**_):
+    global is_lit
+    is_lit = True
+
+
+SPOILS = {
+    "its metadata have no action_space": spec_that_runs,
+    "its format is arrow, but must be hdf5": lambda folder: with_metadata(folder, data_format="arrow"),
+    "cannot be read as transitions (no JSON)": lambda folder: (folder / "metadata.json").write_text("[" * 9999),
+    "cannot be read as transitions ('list' object": lambda folder: (folder / "metadata.json").write_text("[]"),
+    "is a named pipe": lambda folder: ((folder / "metadata.json").unlink(), os.mkfifo(folder / "metadata.json")),
+    "No such file": lambda folder: (folder / "main_data.hdf5").unlink(),
+    "cannot be read as transitions (Unable to": lambda folder: (folder / "main_data.hdf5").write_bytes(b"\x89HDF" * 99),
+    "episode_1/rewards in its file of episodes is a link": lambda folder: with_values(
+        folder, "rewards", lambda group, name, old: group.__setitem__(name, h5py.ExternalLink("/etc/passwd", "/"))
+    ),
+    "episode_1/rewards in its file of episodes is kept in another file": lambda folder: with_values(
+        folder,
+        "rewards",
+        lambda group, name, old: group.create_dataset(name, (2,), "f4", external=[("/etc/passwd", 0, 8)]),
+    ),
+    "which stand for 40000": lambda folder: with_values(
+        folder, "rewards", lambda group, name, old: group.create_dataset(name, (10**10,), "f4")
+    ),
+    "the transitions, row 3: next.reward is nan, but must be finite": lambda folder: with_values(
+        folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old * np.nan)
+    ),
+    "cannot be read as transitions (": lambda folder: with_values(
+        folder, "rewards", lambda group, name, old: group.create_dataset(name, data=old[:1])
+    ),
+}
+
+
+@pytest.mark.parametrize("said", SPOILS)
+def test_a_minari_data_set_of_somebody_else_runs_nothing_and_is_refused_in_a_line(
+    workshop_id, tmp_path, monkeypatch, said
+):
+    pytest.importorskip("minari")
+    SPOILS[said](exported(tmp_path, monkeypatch, workshop_id))
+    with pytest.raises(DataError) as refused:
+        minari.load("test/tools-v0", LAYOUT)
+    message = str(refused.value)
+    assert message.startswith("test/tools-v0: ") and said in message and "\n" not in message
+    assert not is_lit
+
+
+@pytest.mark.parametrize("size", [0, 1000])
+def test_a_full_disk_stops_every_export_in_a_line_and_leaves_nothing(workshop_id, tmp_path, monkeypatch, size):
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    rows = episodes(*[5] * 99)
+    tables = {"rows": rows.flatten_keys(".")}
+    writes = [
+        lambda: export.write_memmap(rows, tmp_path / "memmap"),
+        lambda: export.write_npz(tables, tmp_path / "rows.npz"),
+        lambda: export.write_csv(tables, tmp_path / "csv"),
+        lambda: minari.export(rows, "test/tools-v0", LAYOUT, env_id=workshop_id, env_kwargs={"size": 2}),
+    ]
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for write in writes:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+        try:
+            with pytest.raises(DataError, match="File too large"):
+                write()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file() or path.name.startswith(".")]
+
+
+def test_what_is_written_as_memory_maps_is_read_back(tmp_path):
+    rows = episodes(3, 2)
+    export.write_memmap(rows, tmp_path / "rows")
+    for read in (memmap.load, TensorDict.load_memmap):
+        found = read(tmp_path / "rows")
+        assert set(found.keys(True, True)) == set(rows.keys(True, True))
+        assert all(found[name].equal(value) for name, value in rows.items(True, True))
 
 
 def test_minari_refuses_options_inside_episodes_and_unknown_environments(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
 import re
 import threading
 from collections.abc import Iterator
@@ -219,6 +220,33 @@ def test_another_file_at_the_target_is_refused_and_kept(server, tmp_path):
     with pytest.raises(DataError, match="truncated, altered or another file"):
         download(address(server), target)
     assert target.read_text() == "mine" and server.num_requests == 0
+
+
+def test_a_download_replaces_a_link_that_leads_nowhere_and_writes_through_none(server, tmp_path):
+    target, checksum = tmp_path / "people.mat", hashlib.sha256(server.body).hexdigest()
+    target.symlink_to(tmp_path / "elsewhere.mat")
+    assert download(address(server), target, checksum=checksum) == target
+    assert target.read_bytes() == server.body and not target.is_symlink()
+    assert [*tmp_path.iterdir()] == [target]
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (os.mkfifo, "is a named pipe, but must be a regular file"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a device, but must be a regular file"),
+        (lambda path: path.mkdir(), "is a folder, but must be a regular file"),
+    ],
+)
+def test_a_place_that_is_no_file_is_told_in_a_line_before_anything_is_fetched(server, tmp_path, capsys, make, said):
+    target = tmp_path / "people.mat"
+    make(target)
+    assert said in error_of(capsys, "download", "--url", address(server), "--to", target)
+    assert said in error_of(capsys, "summary", target, "--any-file")
+    too_long = tmp_path / ("a" * 300)
+    assert "File name too long" in error_of(capsys, "download", "--url", address(server), "--to", too_long)
+    assert "File name too long" in error_of(capsys, "summary", too_long)
+    assert server.num_requests == 0
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp.data.errors import DataError
+from hpamdp.messages import first_line
 
 
 def write_csv(tables: Mapping[str, TensorDict], folder: Path, *, axes: Sequence[str] | None = None) -> None:
@@ -77,12 +79,35 @@ def write_npz(tables: Mapping[str, TensorDict], file: Path) -> None:
 
 
 def write_memmap(batch: TensorDict, folder: Path) -> None:
-    """Write a tensordict as memory-mapped files, which `TensorDict.load_memmap` reads.
+    """Write a tensordict as memory-mapped files, which `hpamdp.data.memmap` and `TensorDict.load_memmap` read.
 
     Raises:
         DataError: the folder exists or cannot be written.
     """
-    write_atomically(folder, batch.memmap)
+
+    def write(unfinished: Path) -> None:
+        try:
+            batch.memmap_like(unfinished)
+        except RuntimeError as error:  # torch's, if the files may not have this size
+            raise OSError(first_line(error)) from error
+        # Not through the map: a full disk would end the interpreter.
+        for name, values in batch.items(True, True):
+            *folders, own = (name,) if isinstance(name, str) else name
+            with unfinished.joinpath(*folders, f"{own}.memmap").open("r+b") as file:
+                file.write(values.contiguous().numpy().tobytes())
+
+    write_atomically(folder, write)
+
+
+def check_room(folder: Path, num_bytes: int) -> None:
+    """Check that the disk of a folder, which is made if it is missing, has room.
+
+    Raises:
+        OSError: it has not, or the folder cannot be written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        os.posix_fallocate(file.fileno(), 0, num_bytes)
 
 
 def write_atomically(target: Path, write: Callable[[Path], object]) -> None:
@@ -91,9 +116,9 @@ def write_atomically(target: Path, write: Callable[[Path], object]) -> None:
     Raises:
         DataError: the target exists or cannot be written. Nothing is left behind.
     """
-    if target.exists():
-        raise DataError(f"{target}: exists; choose another place, or remove it")
     try:
+        if target.exists():
+            raise DataError(f"{target}: exists; choose another place, or remove it")
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
         try:

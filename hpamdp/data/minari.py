@@ -19,11 +19,20 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data.checks import TRAJECTORY
+from hpamdp.data.checks import TRAJECTORY, check_transitions
 from hpamdp.data.errors import DataError
+from hpamdp.data.export import check_room
+from hpamdp.json_lines import MAX_LINE_BYTES, read_json
+from hpamdp.messages import first_line
+from hpamdp.regular_files import read_regular, regular_size
 
 if TYPE_CHECKING:
     import minari
+
+
+_MAX_RATIO = 100  # of the size of a data set to that of its file, which may be compressed
+_FEW_BYTES = 1 << 26
+_BYTES_AN_EPISODE = 40_000  # of the names and descriptions that HDF5 keeps of an episode, at most
 
 
 @dataclass(frozen=True)
@@ -93,15 +102,18 @@ def export(
     ends = batch["next", keys.DONE].squeeze(-1).nonzero().squeeze(-1) + 1
     lengths = ends.diff(prepend=ends.new_zeros(1)).tolist()
     try:
+        # The library of HDF5 prints hundreds of tracebacks on a full disk.
+        num_bytes = sum(values.nbytes for values in batch.values(True, True))
+        check_room(get_dataset_path(), 2 * num_bytes + _BYTES_AN_EPISODE * len(lengths))
         buffers = [EpisodeBuffer(id=i, **_episode(rows, layout)) for i, rows in enumerate(batch.split(lengths))]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # asks for an author and a link
             return library.create_dataset_from_buffers(
                 dataset_id, buffers, env=env, algorithm_name=algorithm_name, description=description
             )
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         shutil.rmtree(get_dataset_path(dataset_id), ignore_errors=True)
-        raise DataError(f"{dataset_id}: Minari refuses the data ({error})") from error
+        raise DataError(f"{dataset_id}: Minari refuses the data ({first_line(error)})") from error
 
 
 def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
@@ -126,17 +138,62 @@ def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
 def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
     """Return a Minari data set that `export` wrote as the transitions `[N]` that it was made of.
 
-    Episodes are numbered anew, from 0.
+    Episodes are numbered anew, from 0. The data set may be somebody else's: nothing that it names is imported, and no
+    file is read but its own.
 
     Raises:
-        DataError: Minari is missing, there is no such data set, or it has another layout.
+        DataError: Minari is missing, there is no such data set, it has another layout, or a value is wrong.
     """
     library = _import_minari()
     try:
+        _check_files(dataset_id)
         episodes = list(library.load_dataset(dataset_id).iterate_episodes())
-        return torch.cat([_transitions(episode, number, layout) for number, episode in enumerate(episodes)])
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise DataError(f"{dataset_id}: cannot be read as transitions ({error})") from error
+        rows = torch.cat([_transitions(episode, number, layout) for number, episode in enumerate(episodes)])
+        check_transitions(rows)
+    except DataError as error:
+        raise DataError(f"{dataset_id}: {error}") from error
+    except Exception as error:  # whatever Minari and its storage raise about files that are none of theirs
+        raise DataError(f"{dataset_id}: cannot be read as transitions ({first_line(error)})") from error
+    return rows
+
+
+def _check_files(dataset_id: str) -> None:
+    """Check what Minari would act on before it reads a data set.
+
+    Without spaces in the metadata, Minari would import and build the environment that they name. A link in the file of
+    episodes can lead to any other file, and a few bytes of it can stand for terabytes.
+    """
+    import h5py
+    from minari.storage import get_dataset_path
+
+    folder = get_dataset_path(dataset_id) / "data"
+    metadata = read_json(read_regular(folder / "metadata.json", MAX_LINE_BYTES))
+    for name in ("observation_space", "action_space"):
+        if not isinstance(metadata.get(name), str):
+            raise DataError(f"its metadata have no {name}")
+    if metadata.get("data_format") != "hdf5":
+        raise DataError(f"its format is {metadata.get('data_format')}, but must be hdf5")
+    file = folder / "main_data.hdf5"
+    size = regular_size(file)
+    with h5py.File(file) as episodes:
+        num_bytes = 0
+
+        def problem_of(name: str, link: Any) -> str | None:
+            nonlocal num_bytes
+            if not isinstance(link, h5py.HardLink):
+                return f"{name[:80]} in its file of episodes is a link"
+            values = episodes[name]
+            if isinstance(values, h5py.Dataset):
+                if values.is_virtual or values.external:
+                    return f"{name[:80]} in its file of episodes is kept in another file"
+                num_bytes += values.nbytes
+            return None
+
+        problem = episodes.visititems_links(problem_of)  # stops at the first
+    if problem is not None:
+        raise DataError(problem)
+    if num_bytes > max(_MAX_RATIO * size, _FEW_BYTES):
+        raise DataError(f"its file of episodes has {size} bytes, which stand for {num_bytes}")
 
 
 def _transitions(episode: minari.EpisodeData, number: int, layout: MinariLayout) -> TensorDict:

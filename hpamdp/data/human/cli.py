@@ -21,7 +21,7 @@ from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SH
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
-from hpamdp.messages import one_line, reopen_standard_streams, warn
+from hpamdp.messages import one_line, reopen_standard_streams, say, warn
 
 _USAGE_ERROR = 2
 _INTERRUPTED = 130
@@ -127,7 +127,7 @@ def _is_played(options: argparse.Namespace) -> bool:
 
 
 def _download(options: argparse.Namespace) -> None:
-    print(download(options.url, options.to))
+    say(str(download(options.url, options.to)))
 
 
 def _check(options: argparse.Namespace) -> None:
@@ -139,34 +139,34 @@ def _check(options: argparse.Namespace) -> None:
     data = _read(options)
     episodes, presses = data
     people = episodes["person"].unique()
-    print(f"{options.file or default_path()}: {checksum}")
-    print(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses; contents fit together")
+    say(f"{options.file or default_path()}: {checksum}")
+    say(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses; contents fit together")
     num_empty = (episodes["presses"] == 0).sum()
     num_single = (episodes["presses"] == 1).sum()
-    print(
+    say(
         f"episodes without a press {num_empty}, with a single one {num_single}, "
         f"completely logged {episodes['complete'].sum()}"
     )
     first_episodes = torch.stack([(episodes["person"] == person).nonzero()[0, 0] for person in people])
     _print_counts("harbour at", episodes["centre"][first_episodes])
     _print_counts("key map", episodes["keymap"][first_episodes])
-    print(f"longest press {presses['duration'].max():.2f} s")
+    say(f"longest press {presses['duration'].max():.2f} s")
     singles = validation.single_presses(data)
     if len(singles.outcome):
         share = validation.agreement(singles)
-        print(f"replayed in our physics: {share:.1%} of {len(singles.outcome)} single presses end as recorded")
+        say(f"replayed in our physics: {share:.1%} of {len(singles.outcome)} single presses end as recorded")
     firsts = validation.first_presses(data)
     if len(firsts.is_inside):
         share = firsts.is_inside.float().mean().item()
-        print(f"first presses go as far as our physics allows: {share:.1%} of {len(firsts.is_inside)}")
+        say(f"first presses go as far as our physics allows: {share:.1%} of {len(firsts.is_inside)}")
     if not _is_played(options):
-        print("To know:", *QUIRKS, sep="\n- ")
+        say("\n- ".join(("To know:", *QUIRKS)))
 
 
 def _print_counts(name: str, values: Tensor) -> None:
     """Print how many people have each of the values `[people]` or `[people, K]`."""
     distinct, counts = values.unique(dim=0, return_counts=True)
-    print(
+    say(
         "; ".join(
             f"{name} {value.int().tolist()}: {count} people" for value, count in zip(distinct, counts, strict=True)
         )
@@ -188,9 +188,9 @@ def _summary(options: argparse.Namespace) -> None:
             "person": by_person,
             "congruent_by_offset": [None if math.isnan(share) else share for share in curve],
         }
-        print(json.dumps(summary, indent=1))
+        say(json.dumps(summary, indent=1))
         return
-    print(f"{'':24}{'episodes':>8}  {'score':>7}  {'success':>7}  {'too fast':>8}  {'out':>6}  {'no fuel':>7}  presses")
+    say(f"{'':24}{'episodes':>8}  {'score':>7}  {'success':>7}  {'too fast':>8}  {'out':>6}  {'no fuel':>7}  presses")
     _print_row("all", overall)
     for option, figures in by_controller.items():
         _print_row(harbour.CONTROLLERS[option], figures)
@@ -198,13 +198,13 @@ def _summary(options: argparse.Namespace) -> None:
         _print_row(f"episodes {60 * block + 1} to {60 * block + 60}", figures)
     best = int(scores_by_person(data).nan_to_num(nan=-torch.inf).argmax())
     _print_row(f"best person ({best})", by_person[best])
-    print("congruent boat chosen, by degrees between the bearing and its nearest direction:")
+    say("congruent boat chosen, by degrees between the bearing and its nearest direction:")
     bins = zip(OFFSET_EDGES[:-1], OFFSET_EDGES[1:], curve, strict=True)
-    print(", ".join(f"{low}-{high}: {share:.3f}" for low, high, share in bins))
+    say(", ".join(f"{low}-{high}: {share:.3f}" for low, high, share in bins))
 
 
 def _print_row(name: str, figures: Figures) -> None:
-    print(
+    say(
         f"{name:24}{figures['episodes']:8}  {figures['score']:7.3f}  {figures['success']:7.1%}  "
         f"{figures['too_fast']:8.1%}  {figures['out_of_bounds']:6.1%}  {figures['out_of_fuel']:7.1%}  "
         f"{figures['presses']:7.2f}"
@@ -224,7 +224,7 @@ def _export(options: argparse.Namespace) -> None:
         _export_tables(data, options)
     else:
         _export_transitions(data, options)
-    print(f"{options.to}: {len(data.episodes)} episodes, {len(data.presses)} presses")
+    say(f"{options.to}: {len(data.episodes)} episodes, {len(data.presses)} presses")
 
 
 def _export_tables(data: HumanData, options: argparse.Namespace) -> None:

@@ -141,7 +141,10 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         return rows
 
     def _is_downloaded(self) -> bool:
-        return self.data_path.exists()
+        try:
+            return self.data_path.exists()
+        except OSError as error:
+            raise DataError(f"{self.data_path}: {error.strerror or error}") from error
 
 
 def _name(**settings: Any) -> str:

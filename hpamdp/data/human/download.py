@@ -28,7 +28,11 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
         DataError: the file cannot be fetched, or it is another one.
     """
     target = default_path() if target is None else target
-    if target.exists():
+    try:
+        is_there = target.exists()
+    except OSError as error:
+        raise DataError(f"{target}: {error.strerror or error}") from error
+    if is_there:
         check_sum(load_bytes(target), checksum, target)
         return target
     pooch.get_logger().setLevel(logging.WARNING)  # no lines about what it fetches
@@ -40,6 +44,7 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
             path=target.parent,
             progressbar=sys.stderr.isatty(),
         )
-    except (OSError, ValueError, EOFError, ftplib.Error) as error:  # the errors of requests are OSErrors
+    # The errors of requests are OSErrors; a LookupError is of an archive that has no such file.
+    except (OSError, ValueError, EOFError, LookupError, ftplib.Error) as error:
         raise DataError(f"{url}: cannot be fetched ({error}); you can also put the file at {target} by hand") from error
     return target
