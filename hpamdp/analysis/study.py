@@ -37,7 +37,7 @@ class Run:
 
     def played(self) -> dict[str, np.ndarray]:
         """Return its final evaluation, one array an attribute, first dimension the episode."""
-        with np.load(self.folder / "evaluation.npz") as file:
+        with np.load(self.folder / "evaluation.npz", allow_pickle=False) as file:
             return dict(file)
 
 
