@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import wandb
 from conftest import compose_config
 from test_metrics import without_login  # noqa: F401  (a fixture)
 
@@ -224,7 +225,9 @@ def test_wandb_has_a_resumed_run_as_one_run_with_the_curve_of_the_one_never_stop
     words = ["logger=wandb", "logger.mode=offline", "total_frames=256", "checkpoint_every=96"]
     start(tmp_path / "whole", *words)
     start_and_kill(tmp_path / "killed", 192, *words)
+    wandb.teardown()  # as at the end of a process
     assert resume(tmp_path / "killed", tmp_path / place) == 0
+    wandb.teardown()  # waits until all is written
     (whole,) = wandb_curves(tmp_path / "whole").values()
     ((run_id, rows),) = wandb_curves(tmp_path / place).items()
     assert rows == whole and len(rows) >= 9
