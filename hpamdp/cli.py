@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import importlib
 import itertools
 import os
@@ -26,10 +27,32 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.config import GROUPS, RUN_FILE, ConfigError, conf_dir, job_overrides, no_such, no_such_option
-from hpamdp.messages import first_line, one_line, reopen_standard_streams, say, warn
+from hpamdp.config import (
+    GROUPS,
+    NESTED,
+    RUN_FILE,
+    ConfigError,
+    beginning_of,
+    conf_dir,
+    job_overrides,
+    no_such,
+    no_such_option,
+)
+from hpamdp.messages import (
+    first_line,
+    lenient_streams,
+    lost_output,
+    one_line,
+    reason_of,
+    reopen_standard_streams,
+    say,
+    warn,
+)
 from hpamdp.run import sweep
 from hpamdp.run.folder import AUTO, is_about_folder, locked
+from hpamdp.search_path import protect_children, put_working_directory_last, unprotect_children
+from hpamdp.shell import program, setting
+from hpamdp.yaml_files import check_before_hydra_reads
 
 _MISTAKE, _INTERRUPTED = 2, 130
 # Launchers and sweepers of packages of their own, and the extra of pyproject.toml that brings each.
@@ -40,8 +63,11 @@ _EXTRAS = {
 # Commands beside that of a run, by the modules whose `main` gets the words that follow, and a parser.
 _COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play"}
 # What Hydra raises for a wrong command line or yaml file.
-_BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, UnicodeDecodeError)
-_GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE, and quotes around special characters"
+_BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
+_GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE"
+# What no change of the settings helps against: a full disk, limits of the process, a medium that is read only.
+_OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EROFS)
+_SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
 
 _HELP = """\
 hpamdp trains and scores two-level agents on parameterised-action MDPs: a selector (high) chooses an option; a learner
@@ -66,10 +92,14 @@ Examples
   {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
       the same, two at a time; needs hpamdp[joblib]
 
-  hpamdp play                      lets you play the problem yourself; hpamdp play --help
-  hpamdp watch FOLDER              films the agent of a run; hpamdp watch --help
-  {program} low=hyar --cfg job     shows every value and option without running
-  {program} --hydra-help           shows Hydra's own flags
+  {program} play
+      lets you play the problem yourself; see {program} play --help
+  {program} watch FOLDER
+      films the agent of a run; see {program} watch --help
+  {program} low=hyar --cfg job
+      shows every value and option without running
+  {program} --hydra-help
+      shows Hydra's own flags
 """
 
 
@@ -79,42 +109,68 @@ def main() -> None:
     Exits with 0, 1 (a bug, with its traceback), 2 (a user's mistake, told in one line) or 130 (interrupted).
     """
     reopen_standard_streams()
+    with lenient_streams():
+        _main()
+
+
+def _main() -> None:
     # Classes of one's own may lie in the working directory, as with `python -m`.
-    if os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
+    put_working_directory_last()
     # Hydra then raises what it would print, in several lines, itself.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # TorchRL logs every replay buffer that it fills.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     try:
+        _check_surroundings()
         if sys.argv[1:2] and sys.argv[1] in _COMMANDS:
             sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
         conf = conf_dir()
         arguments = _parse()
         if arguments.help:
-            print(help_page(conf))
+            say(help_page(conf))
+            _check_shown()
             return
-        _check_groups(arguments.overrides, conf)
-        saved = _saved_choices(arguments, conf)
-        if saved:
-            place = sys.argv.index(arguments.overrides[0])
-            sys.argv[place:place] = saved
-            arguments = _parse()
-        written_out = _folder_written_out(arguments, conf)
-        if written_out is not None:
-            sys.argv[:] = written_out
-            arguments = _parse()
-        sweep_dir = _sweep_dir_of_experiments(arguments, conf)
-        if sweep_dir is not None:
-            sys.argv.insert(sys.argv.index(arguments.overrides[0]), f"hydra.sweep.dir='{sweep_dir}'")
-            arguments = _parse()
         _run_hydra(conf, arguments)
     except OverrideParseException as error:
-        _exit_with(f"{error.override}: {_GRAMMAR}")
+        _exit_with(_not_understood(error.override))
     except ConfigError as error:
         _exit_with(str(error))
+    except _LostOutputError as error:
+        if isinstance(error.__cause__, BrokenPipeError):  # the reader has seen enough
+            sys.exit(1)
+        _exit_with(f"stdout: {getattr(error.__cause__, 'strerror', None) or first_line(error.__cause__)}", 1)
     except KeyboardInterrupt:
         sys.exit(_INTERRUPTED)
+
+
+def _check_surroundings() -> None:
+    """Refuse a working directory that is gone and words that are no text."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise ConfigError(f"the working directory is gone ({error.strerror}); cd to one that is there") from error
+    for word in sys.argv[1:]:
+        if "\0" in word or word != word.encode(errors="ignore").decode():
+            raise ConfigError(f"{word!r}: not written in UTF-8")
+
+
+def _completed(arguments: argparse.Namespace, conf: Path) -> argparse.Namespace:
+    """Add to the command line what it stands for: the choices of a saved run, a sweep's experiments and folder."""
+    _check_groups(arguments.overrides, conf)
+    saved = _saved_choices(arguments, conf)
+    if saved:
+        place = sys.argv.index(arguments.overrides[0])
+        sys.argv[place:place] = saved
+        arguments = _parse()
+    written_out = _folder_written_out(arguments, conf)
+    if written_out is not None:
+        sys.argv[:] = written_out
+        arguments = _parse()
+    sweep_dir = _sweep_dir_of_experiments(arguments, conf)
+    if sweep_dir is not None:
+        sys.argv.insert(sys.argv.index(arguments.overrides[0]), f"hydra.sweep.dir='{sweep_dir}'")
+        arguments = _parse()
+    return arguments
 
 
 def _run_command(name: str, words: list[str]) -> int:
@@ -123,7 +179,7 @@ def _run_command(name: str, words: list[str]) -> int:
     from hpamdp.env.base import ProblemError  # takes seconds, which the other commands need not wait for
     from hpamdp.run.stopping import ProgramExitError, exits_told
 
-    parser = _Parser(prog=f"hpamdp {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = _Parser(prog=f"{program()} {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
     try:
         with exits_told():
             return command.main(words, parser)
@@ -139,6 +195,25 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message}; see {self.prog} --help")
 
+    def print_help(self, file: Any = None) -> None:
+        super().print_help(file)
+        _check_shown()
+
+
+class _LostOutputError(Exception):
+    """Text that the user asked for did not arrive, for the reason that is the cause."""
+
+
+def _check_shown() -> None:
+    """Check that the text which the user asked for has been written.
+
+    Raises:
+        _LostOutputError: some of it has not.
+    """
+    error = lost_output()
+    if error is not None:
+        raise _LostOutputError from error
+
 
 def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
     """Let Hydra run the job, or the jobs of a sweep, and tell mistakes in the command line in one line."""
@@ -150,21 +225,36 @@ def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
         has_started = True
         return _run_job(cfg, start)
 
+    protect_children()
     try:
+        check_before_hydra_reads()
+        arguments = _completed(arguments, conf)
         hydra.main(version_base="1.3", config_path=str(conf), config_name="config")(job)()
     except (Exception, KeyboardInterrupt, SystemExit) as error:
+        if _only_shows(arguments) and isinstance(error, SystemExit):
+            _check_shown()
         if sweep.has_begun(start):
             sys.exit(sweep.report(start, error))
         if isinstance(error, RuntimeError) and "srun" in str(error):  # which submitit looks for
             raise ConfigError(f"hydra/launcher=submitit_slurm: {error}") from error
         # Once a job has started, such errors are not about the command line.
-        if not has_started and isinstance(error, _BEFORE_A_JOB):
-            raise ConfigError(_explain(error, conf, arguments)) from error
+        if not has_started and isinstance(error, _BEFORE_A_JOB) and not isinstance(error, ConfigError):
+            is_mistake = not isinstance(error, OSError) or error.errno not in _OF_THE_MACHINE
+            _exit_with(_explain(error, conf, arguments), _MISTAKE if is_mistake else 1)
         raise
+    finally:
+        unprotect_children()
+    if _only_shows(arguments):
+        _check_shown()
+        return
     if sweep.has_begun(start):
         sys.exit(sweep.report(start))
     if arguments.multirun:
         raise ConfigError(f"{' '.join(arguments.overrides)}: stands for no job; see that no sweep is empty")
+
+
+def _only_shows(arguments: argparse.Namespace) -> bool:
+    return bool(arguments.cfg or arguments.info or arguments.hydra_help or arguments.shell_completion)
 
 
 def help_page(conf: Path) -> str:
@@ -175,7 +265,7 @@ def help_page(conf: Path) -> str:
         r"^(?:# [^\n]*\n)+mode:.*?(?=^hydra:)", (conf / "config.yaml").read_text(), re.DOTALL | re.MULTILINE
     )
     return _HELP.format(
-        program="python run.py" if sys.argv[0].endswith(".py") else "hpamdp",
+        program=program(),
         groups="\n".join(f"  {group:<12}{', '.join(choices)}" for group, choices in groups.items()),
         folder=conf.parent,
         values=textwrap.indent(values.group().rstrip() if values else "", "  "),
@@ -197,11 +287,19 @@ def _parse() -> argparse.Namespace:
         split = re.fullmatch(r"unrecognized arguments: ([^-].*=.*)", message)
         if split:
             raise ConfigError(f"{split.group(1)}: settings on both sides of a flag; write all of them after the flags")
+        dashed = re.fullmatch(r"unrecognized arguments: --([^ =-][^ =]*=[^ ]*)( .*)?", message)
+        if dashed:
+            word = dashed.group(1)
+            raise ConfigError(f"--{word}: settings have no dashes, write {word}; a wandb sweep ${{args_no_hyphens}}")
         raise ConfigError(f"{message}; see --help")
 
     parser = get_args_parser()
     parser.error = refuse  # type: ignore[method-assign]  # Hydra makes the parser, and its own prints two lines
-    arguments = parser.parse_args()
+    try:
+        arguments = parser.parse_args()
+    except SystemExit:  # --version
+        _check_shown()
+        raise
     flags = ("run", "multirun", "cfg", "info", "shell_completion")
     given = [f"--{flag.replace('_', '-')}" for flag in flags if getattr(arguments, flag)]
     if len(given) > 1:
@@ -220,8 +318,11 @@ def _check_groups(words: list[str], conf: Path) -> None:
             raise ConfigError(f"{override.input_line}: {_GRAMMAR}")
         if override.is_delete() and override.key_or_group in GROUPS:
             raise ConfigError(f"{override.key_or_group}: nothing chosen; set {override.key_or_group}=NAME")
+        is_text = override.is_sweep_override() or isinstance(override.value(), str | QuotedString | None)
+        if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
+            raise ConfigError(f"{override.input_line}: must be a folder; write {_as_text(override.input_line or '')}")
         folder = conf / override.key_or_group
-        if not folder.is_dir() or override.is_delete():
+        if not os.path.isdir(folder) or override.is_delete():  # unlike `Path.is_dir` for any text
             continue
         values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
         if not all(_is_choice(value) for value in values):
@@ -251,7 +352,7 @@ def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
     return [
         f"{group}={name}"
         for group, name in choices.items()
-        if group not in given and (has_own_files or (conf / group / f"{name}.yaml").is_file())
+        if group not in given and (has_own_files or os.path.isfile(conf / group / f"{name}.yaml"))
     ]
 
 
@@ -262,7 +363,7 @@ def _folder_written_out(arguments: argparse.Namespace, conf: Path) -> list[str] 
             continue
         name = override.value()
         folder = conf / "experiment" / str(name.text if isinstance(name, QuotedString) else name)
-        if not folder.is_dir():
+        if not os.path.isdir(folder):
             continue
         experiments = ",".join(f"{folder.name}/{file.stem}" for file in sorted(folder.glob("*.yaml")))
         words = [f"experiment={experiments}" if word == override.input_line else word for word in sys.argv]
@@ -318,6 +419,8 @@ def _is_choice(value: object) -> bool:
 
 def _run_job(cfg: DictConfig, start: str) -> float | None:
     """Run one job; return its score if it is one of a sweep."""
+    put_working_directory_last()  # in a worker of a launcher, too
+    unprotect_children()
     job = HydraConfig.get()
     if job.mode == RunMode.MULTIRUN:
         return sweep.run_job(cfg, start)
@@ -325,7 +428,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     from hpamdp.run import train
 
     output_dir = Path(job.runtime.output_dir)
-    if output_dir.resolve() == Path.cwd():
+    if output_dir.resolve() == Path(job.runtime.cwd):
         _exit_with("hydra.run.dir: the working directory; give a folder of the run's own, or leave hydra.run.dir out")
     try:
         with locked(output_dir):
@@ -339,6 +442,8 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
             output_dir.rmdir()  # Hydra made it; it stays if there is something in it
         _exit_with(str(error))
     except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            _exit_with(f"{reason_of(error)}; see ulimit -n; the run was stopped", 1)
         if not is_about_folder(error, output_dir):
             raise
         _exit_with(f"{output_dir}: {error.strerror or error}; the run was stopped", 1)
@@ -376,7 +481,7 @@ def _exit_with(mistake: str, code: int = _MISTAKE) -> NoReturn:
 def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str:
     """Return in one line what is wrong with the command line or the yaml files, given what Hydra says."""
     if isinstance(error, OverrideParseException):
-        return f"{error.override}: {_GRAMMAR}"
+        return _not_understood(error.override)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, name = error.missing_cfg_file.rpartition("/")
         if group in _EXTRAS:
@@ -385,13 +490,27 @@ def _explain(error: Exception, conf: Path, arguments: argparse.Namespace) -> str
             group, _, name = error.missing_cfg_file.partition("/")
         options = {*error.options, *_choices(conf / group)}
         return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted(options))}"
-    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
-        return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
+    if not isinstance(error, HydraException | OmegaConfBaseException):
+        return _first_lines(error, arguments.overrides)
     overrides = OverridesParser.create().parse_overrides(arguments.overrides)
     for override in overrides:
         if override.is_sweep_override() and not arguments.multirun:
-            return f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
-    return _wrong_key(overrides, conf) or _first_lines(error)
+            several = f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
+            return f"{several}; for one text write {_as_text(override.input_line or '')}"
+    return _wrong_key(overrides, conf) or _first_lines(error, arguments.overrides)
+
+
+def _not_understood(word: str) -> str:
+    """Return that a word is not in Hydra's grammar, and how to write it if its value is a text."""
+    if re.match(r"[+~]*[A-Za-z_@][\w.@/]*=.", word):
+        return f"{word}: {_GRAMMAR}, and a text with special characters as {_as_text(word)}"
+    return f"{word}: {_GRAMMAR}"
+
+
+def _as_text(word: str) -> str:
+    """Return `KEY=VALUE` as one types it where the value is a text."""
+    key, _, value = word.partition("=")
+    return setting(key, value)
 
 
 def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
@@ -400,10 +519,16 @@ def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
     return f"{group}={name}: no such choice; there is {', '.join(sorted({*installed, *_EXTRAS[group]}))}"
 
 
-def _first_lines(error: Exception) -> str:
-    """Return the first line of an error, the next one where it announces one, and the first line of its cause."""
+def _first_lines(error: Exception, words: Sequence[str]) -> str:
+    """Return where a yaml file is wrong, or in a line what an error and its cause say."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
     if isinstance(error, UnicodeDecodeError):  # which does not name the file
         return f"a yaml file that was chosen is not written in UTF-8 ({error})"
+    if isinstance(error, OSError):
+        return reason_of(error)
+    if isinstance(error, RecursionError | ValueError) and not isinstance(error, OmegaConfBaseException):
+        return beginning_of(words) + (NESTED if isinstance(error, RecursionError) else first_line(error))
     causes = [error] if error.__cause__ is None else [error, error.__cause__]
     lines = [first_line(cause).rstrip(".") for cause in causes]
     if lines[0].endswith(":"):
@@ -413,7 +538,7 @@ def _first_lines(error: Exception) -> str:
 
 def _wrong_key(overrides: list[Override], conf: Path) -> str | None:
     """Return what is wrong with the first override whose key is not in the config, if there is one."""
-    groups = [o for o in overrides if "/" in o.key_or_group or (conf / o.key_or_group).is_dir()]
+    groups = [o for o in overrides if "/" in o.key_or_group or os.path.isdir(conf / o.key_or_group)]
     others = [o for o in overrides if o not in groups and not o.is_add() and not o.is_force_add()]
     for choices in itertools.product(*map(_written_out, groups)):
         try:

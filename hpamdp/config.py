@@ -13,7 +13,7 @@ import json
 import linecache
 import re
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard, get_type_hints
@@ -52,9 +52,11 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 RUN_FILE = "conf/config.yaml"
 TARGET = "_target_"
+NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
 
 _CAN_BE_NONE = ("high", "data")
 _MOST_COMPLAINTS = 3
+_SHOWN = 200  # letters of a command line in an error
 # Larger numbers leave those that a computation can hold; infinity is refused as well.
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
 # Entries of a group that are values of the run, not options of its class.
@@ -411,13 +413,21 @@ def compose_words(words: list[str]) -> DictConfig:
     Raises:
         ConfigError: the words cannot be composed.
     """
+    folder = str(conf_dir())
     try:
-        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        with hydra.initialize_config_dir(folder, version_base="1.3"):
             cfg = hydra.compose("config", words, return_hydra_config=True)
             HydraConfig.instance().set_config(cfg)  # as for a job; `compose` takes the searched folders from it
             return cfg
-    except (hydra.errors.HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(f"{' '.join(words)}: {first_line(error)}") from error
+    except (hydra.errors.HydraException, OmegaConfBaseException, OSError, ValueError) as error:
+        raise ConfigError(beginning_of(words) + first_line(error)) from error
+    except RecursionError as error:
+        raise ConfigError(beginning_of(words) + NESTED) from error
+
+
+def beginning_of(words: Sequence[str]) -> str:
+    """Return the words of a command line, or as much of them as fits before an error."""
+    return f"{' '.join(words)[:_SHOWN]}: "
 
 
 def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
@@ -592,6 +602,8 @@ def plain(node: Any, where: str = "the config") -> dict[str, Any]:
         container = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     except OmegaConfBaseException as error:
         raise ConfigError(f"{error.full_key or where}: {first_line(error)}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{where}: a value stands for itself, or nests too deep") from error
     assert isinstance(container, dict)
     return {str(name): value for name, value in container.items()}
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
-from contextlib import suppress
-from typing import TextIO
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any, TextIO, cast
 
 
 def one_line(text: object) -> str:
-    """Return a text or an error's message as one line, with every run of whitespace as one space."""
-    return " ".join(str(text).split())
+    """Return a text or an error's message as one line, with a space in place of every line break."""
+    return " ".join(line for line in map(str.strip, str(text).splitlines()) if line)
 
 
 def first_line(text: object) -> str:
@@ -37,27 +37,51 @@ def reopen_standard_streams() -> None:
 
 
 class LenientStream:
-    """A text stream on which writing never fails: a terminal that was closed or a full disk costs the text alone.
+    """A text stream on which writing never fails.
+
+    A terminal that was closed or a full disk costs the text alone. A letter that the stream cannot show is written as
+    its number.
 
     Args:
         stream: where the text goes; None, as `sys.stderr` is if it was closed: nowhere.
+
+    Attributes:
+        error: the last one that cost some text; None if all was written.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream
+        self.error: OSError | ValueError | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
     def write(self, text: str) -> int:
         """Write the text if possible."""
-        if self._stream is not None:
-            with suppress(OSError, ValueError):
-                self._stream.write(text)
+        if self._stream is None:
+            return len(text)
+        try:
+            self._stream.write(text)
+        except UnicodeEncodeError:
+            encoding = self._stream.encoding
+            self.write(text.encode(encoding, "backslashreplace").decode(encoding))
+        except (OSError, ValueError) as error:
+            self.error = error
         return len(text)
+
+    def writelines(self, lines: Iterable[str]) -> None:
+        """Write the lines if possible."""
+        for line in lines:
+            self.write(line)
 
     def flush(self) -> None:
         """Flush the stream if possible."""
-        if self._stream is not None:
-            with suppress(OSError, ValueError):
-                self._stream.flush()
+        if self._stream is None:
+            return
+        try:
+            self._stream.flush()
+        except (OSError, ValueError) as error:
+            self.error = error
 
     def isatty(self) -> bool:
         """Return whether the stream is a terminal."""
@@ -65,6 +89,36 @@ class LenientStream:
             with suppress(OSError, ValueError):
                 return self._stream.isatty()
         return False
+
+
+@contextmanager
+def lenient_streams() -> Iterator[None]:
+    """Let nothing that is printed inside fail, nor the interpreter when it flushes stdout and stderr at its end."""
+    before = sys.stdout, sys.stderr
+    out, err = (stream if stream is None else LenientStream(stream) for stream in before)
+    sys.stdout, sys.stderr = cast(TextIO, out), cast(TextIO, err)
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+        for stream in (out, err):
+            if stream is not None:
+                _finish(stream)
+
+
+def _finish(stream: LenientStream) -> None:
+    """Flush a stream; if that fails, let what is left of its text go nowhere."""
+    stream.error = None
+    stream.flush()
+    if stream.error is not None:
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def lost_output() -> OSError | ValueError | None:
+    """Return the error that cost some of the text on stdout, if there was one."""
+    sys.stdout.flush()
+    return getattr(sys.stdout, "error", None)
 
 
 def say(text: str) -> None:
@@ -78,14 +132,17 @@ def warn(message: str) -> None:
 
 
 def _print(text: str, stream: TextIO | None) -> None:
-    if stream is None:  # which `print` takes for stdout
-        return
-    try:
-        print(text, file=stream, flush=True)
-    except (OSError, ValueError):
-        # Otherwise the interpreter fails once more when it flushes the stream at its end.
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    lenient = LenientStream(stream)
+    lenient.write(f"{text}\n")
+    lenient.flush()
+    if lenient.error is not None:
+        _finish(lenient)  # else the interpreter fails once more at its end
+
+
+def reason_of(error: OSError) -> str:
+    """Return in one line what went wrong with which file."""
+    reason = error.strerror or first_line(error)
+    return reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}"
 
 
 def duration(seconds: float) -> str:

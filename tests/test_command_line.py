@@ -49,7 +49,7 @@ MISTAKES = [
     (["--cfg", "jobs"], "argument --cfg/-c: invalid choice: "),
     (["--multirun", "--cfg", "job"], "--multirun and --cfg do not go together"),
     (["--config-name", "foo"], "Cannot find primary config 'foo'"),
-    (["hydra.run.dir=/proc/nowhere/x"], "[Errno 2] No such file or directory: '/proc/nowhere"),
+    (["hydra.run.dir=/proc/nowhere/x"], "/proc/nowhere: No such file or directory"),
     # A value that cannot be.
     (["seed=-1"], "seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
     (["seed=abc"], 'seed="abc": must be a valid integer (conf/config.yaml)'),

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
 import pickle
 import zipfile
 import zlib
@@ -67,12 +68,13 @@ def find(path: str | Path, where: str) -> Path:
     Raises:
         ConfigError: there is no checkpoint.
     """
-    path = Path(path).expanduser()
-    file = path / FILE_NAME if path.is_dir() else path
-    if where != "resume" and path.is_dir() and not file.is_file() and (path / POLICY_NAME).is_file():
+    path = Path(os.path.expanduser(path))  # `Path` takes "./" away, with which ~ is a name
+    is_folder = os.path.isdir(path)  # unlike `Path.is_dir` for any text
+    file = path / FILE_NAME if is_folder else path
+    if where != "resume" and is_folder and not file.is_file() and (path / POLICY_NAME).is_file():
         file = path / POLICY_NAME
-    if not file.is_file():
-        has_policy = (path / POLICY_NAME).is_file()
+    if not os.path.isfile(file):
+        has_policy = os.path.isfile(path / POLICY_NAME)
         why = "networks alone, which cannot be resumed" if has_policy else "no checkpoint there"
         raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}")
     if not zipfile.is_zipfile(file):

@@ -16,6 +16,7 @@ from filelock import FileLock, Timeout
 
 from hpamdp.config import ConfigError
 from hpamdp.files import remove_link, replacing
+from hpamdp.shell import path_setting
 
 # The value of `resume` that goes on in the run's own folder, or starts there.
 AUTO = "auto"
@@ -95,8 +96,8 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
     marks = [name for name in _MARKS if (folder / name).exists()]
     if marks and not may_overwrite:
         raise ConfigError(
-            f"{folder}: holds the results of a run; continue it with resume={folder}, take another hydra.run.dir, or "
-            "set overwrite=true"
+            f"{folder}: holds the results of a run; continue it with {path_setting('resume', folder)}, "
+            "take another hydra.run.dir, or set overwrite=true"
         )
     is_of_a_run = marks or {"mode", "seed", "env", "low"} <= saved_config(folder).keys() or _aside(folder).exists()
     if not is_of_a_run:
@@ -186,7 +187,7 @@ def _bring_back(folder: Path) -> None:
 
 def is_about_folder(error: OSError, folder: Path) -> bool:
     """Return whether the run's folder cannot be made or written to, or is gone."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS):
         return True
     return error.filename is not None and Path(str(error.filename)).is_relative_to(folder)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import shutil
 import threading
 import webbrowser
@@ -17,8 +16,7 @@ import torch
 from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
 from hpamdp.env.page import EpisodeError, Page
 from hpamdp.files import replacing
-from hpamdp.messages import first_line, say, warn
-from hpamdp.regular_files import read_regular
+from hpamdp.messages import first_line, reason_of, say, warn
 from hpamdp.run.assemble import check_classes, make_env
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.folder import POLICY_NAME, SUMMARY_NAME
@@ -34,7 +32,6 @@ Play a problem yourself, beside agents.
   hpamdp play --export site                        the page as files that need no server
 """
 _LOOPBACK = "127.0.0.1"
-_MAX_SUMMARY_BYTES = 1 << 24
 _ONE_EPISODE = ("eval.layouts=1", "film=false")
 
 
@@ -126,14 +123,14 @@ def _agent(path: Path, player: Player) -> dict[str, Any] | None:
     title = config.low.name if config.high.cls is None else f"{config.high.name} + {config.low.name}"
     summary = (path if path.is_dir() else path.parent) / SUMMARY_NAME
     try:
-        score = json.loads(read_regular(summary, _MAX_SUMMARY_BYTES))["score"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        score = json.loads(summary.read_text())["score"]
+    except (OSError, ValueError, KeyError):
         score = None
     options = json.loads(json.dumps(dict(config.env.options)))
     return {
         "name": name,
         "title": title,
-        "score": score if type(score) in (int, float) and math.isfinite(score) else None,
+        "score": score,
         "env": options,
         "agent": form,
     }
@@ -162,11 +159,13 @@ def serve(page: Page, data: dict[str, Any], options: argparse.Namespace) -> int:
         episodes = EpisodeFile(options.to, page)
     except EpisodeError as error:
         raise ConfigError(f"--to {error}") from error
+    except OSError as error:
+        raise ConfigError(f"--to {reason_of(error)}") from error
     try:
         server = PageServer((options.host, options.port), page, data, episodes)
-    except OSError as error:
+    except (OSError, TypeError) as error:  # the latter for a name that is too long
         raise ConfigError(
-            f"--host {options.host} --port {options.port}: {error.strerror or first_line(error)}"
+            f"--host {options.host} --port {options.port}: {getattr(error, 'strerror', None) or first_line(error)}"
         ) from error
     if options.host != _LOOPBACK:
         warn(f"--host {options.host}: others who reach this address can play and add episodes to {options.to}")

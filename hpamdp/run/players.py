@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +40,7 @@ def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
     Raises:
         ConfigError: several paths.
     """
-    paths = [word for word in words if "=" not in word or Path(word).exists()]
+    paths = [word for word in words if "=" not in word or os.path.exists(word)]
     if len(paths) > 1:
         raise ConfigError(f"{' '.join(paths)}: several agents; give one, and settings as KEY=VALUE")
     return (paths[0] if paths else None), [word for word in words if word not in paths]

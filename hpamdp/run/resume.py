@@ -15,6 +15,7 @@ from hpamdp.messages import warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env
 from hpamdp.saved_config import choices_of, in_todays_form, read_saved
+from hpamdp.shell import setting
 
 # Parts of the config that make the agent what it is.
 _AGENT = ("high", "low", "agent", "experiment", "search")
@@ -45,7 +46,8 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
     saved = checkpoint.progress_of(file)["config"]
     if config.run.resume is not None and config.run.mode != saved["mode"]:
         raise ConfigError(
-            f"resume={source}: a run with mode={saved['mode']}; resume it so, or start one with low.checkpoint={source}"
+            f"resume={source}: a run with mode={saved['mode']}; resume it so, or start one with "
+            f"{setting('low.checkpoint', source)}"
         )
     values = {key: cfg[key] for key in _BEGIN}
     if config.run.mode == "eval":

@@ -28,6 +28,7 @@ from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, say, warn
 from hpamdp.run.folder import ERROR_NAME, check_no_link, is_about_folder, locked, saved_summary
 from hpamdp.run.stopping import exits_told
+from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
@@ -49,7 +50,8 @@ class SweepDir(Callback):
         """Remember the sweep's folder, and leave the folders of the jobs to `run_job`."""
         _check_output_subdir(config)
         SweepDir.path = Path(config.hydra.sweep.dir).absolute()
-        remove_link(SweepDir.path / "multirun.yaml")  # which Hydra writes
+        with suppress(OSError):  # Hydra fails for the same reason
+            remove_link(SweepDir.path / "multirun.yaml")  # which Hydra writes
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
         hydra.config_loader = JobConfigs(hydra.config_loader.get_search_path())
@@ -120,6 +122,8 @@ class Records:
 
     def read(self) -> list[Job]:
         """Return the jobs that have been started, in order."""
+        if not os.path.isdir(self._folder):
+            return []
         jobs = [Job(**json.loads(file.read_text())) for file in self._folder.glob("[0-9]*.json")]
         return sorted(jobs, key=lambda job: job.number)
 
@@ -242,7 +246,7 @@ def report(start: str, error: BaseException | None = None) -> int:
                 partial.write_text("".join(traceback.format_exception(error)))
             reason = one_line("".join(traceback.format_exception_only(error)))
             warn(f"The sweep broke off: {reason} ({_shown(sweep_dir / 'error.txt')})")
-        say(f"To go on: the same command with hydra.sweep.dir={_shown(sweep_dir)}")
+        say(f"To go on: the same command with {path_setting('hydra.sweep.dir', _shown(sweep_dir))}")
         return _INTERRUPTED if is_stopped else 1
     if not failed:
         return 0

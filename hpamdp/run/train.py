@@ -37,6 +37,7 @@ from hpamdp.run.folder import (
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_told, signals_ignored, stop_on_signals
+from hpamdp.shell import path_setting, program
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
 INTERRUPTED, DIVERGED, FAILED = 130, 3, 1  # exit codes
@@ -120,14 +121,19 @@ def _run(
             tell(f"{error} at frame {trainer.frames:,}: training stopped; {trainer.keep_for_inspection()}")
             return DIVERGED
         except WorkerDiedError as error:
-            tell(f"{error} at frame {trainer.frames:,}; to go on: python run.py resume={output_dir}")
+            tell(f"{error} at frame {trainer.frames:,}; to go on: {_resuming(config, output_dir)}")
             return FAILED
     say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, is_finished=not is_interrupted))
     say(f"Everything is in {output_dir}")
     if is_interrupted:
-        mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
-        say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: python run.py {mode}resume={output_dir}")
+        say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: {_resuming(config, output_dir)}")
     return INTERRUPTED if is_interrupted else 0
+
+
+def _resuming(config: Config, output_dir: Path) -> str:
+    """Return the command that goes on with a run."""
+    mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
+    return f"{program()} {mode}{path_setting('resume', output_dir)}"
 
 
 class Trainer:

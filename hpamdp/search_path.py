@@ -1,0 +1,40 @@
+"""Where Python looks for modules: in the working directory last."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+# With it Python does not put the working directory first; from 3.11 on.
+_VARIABLE, _OURS = "PYTHONSAFEPATH", "hpamdp"
+
+
+def put_working_directory_last() -> None:
+    """Let no file of the working directory, such as `torch.py`, take the place of an installed package.
+
+    Classes of the user's own are still found there. If this package itself lies there, as in a clone, the order stays.
+    """
+    try:
+        directory = os.getcwd()
+    except OSError:  # it was deleted
+        return
+    if not _is_clone(directory):
+        sys.path[:] = [entry for entry in sys.path if os.path.realpath(entry) != directory]
+    if directory not in map(os.path.realpath, sys.path):
+        sys.path.append(directory)
+
+
+def protect_children() -> None:
+    """Let Python processes that are started from now on look in the working directory last, too."""
+    if not _is_clone(os.getcwd()):
+        os.environ.setdefault(_VARIABLE, _OURS)
+
+
+def unprotect_children() -> None:
+    """Undo `protect_children`, in this process or in one that it has started."""
+    if os.environ.get(_VARIABLE) == _OURS:
+        del os.environ[_VARIABLE]
+
+
+def _is_clone(directory: str) -> bool:
+    return os.path.dirname(os.path.dirname(os.path.realpath(__file__))) == directory

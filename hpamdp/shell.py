@@ -1,0 +1,57 @@
+"""Commands that a user can paste, quoted for the shell and for Hydra's grammar."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import sys
+from pathlib import Path
+
+# Texts that neither Hydra's grammar nor a shell reads as something else.
+_PLAIN = re.compile(r"(?=.*/|[A-Za-z])[A-Za-z0-9_./-]+")
+_NO_TEXT = ("null", "true", "false", "inf", "nan")
+
+
+def program() -> str:
+    """Return the command that started this program."""
+    started = Path(sys.argv[0])
+    if started.name == "run.py":
+        return f"python {for_shell(sys.argv[0])}"
+    is_module = started.name == "__main__.py" and started.parent.name == "hpamdp"
+    return "python -m hpamdp" if is_module else "hpamdp"
+
+
+def setting(name: str, text: str) -> str:
+    """Return `name=text` as a word for the shell, whatever letters the text has."""
+    is_plain = _PLAIN.fullmatch(text) and text.lower() not in _NO_TEXT
+    return f"{name}={text}" if is_plain else for_shell(f"{name}={_for_hydra(text)}")
+
+
+def path_setting(name: str, path: Path) -> str:
+    """Return `name=path` as a word for the shell; a leading ~ does not stand for the home folder."""
+    return setting(name, f"./{path}" if str(path).startswith("~") else str(path))
+
+
+def for_shell(word: str) -> str:
+    """Return a word in a POSIX shell's quotes, if it needs any, on one line."""
+    if word.isprintable():
+        return shlex.quote(word)
+    # ANSI-C quoting, which bash and zsh read.
+    letters = (letter if letter.isprintable() and letter not in "\\'" else _bytes_of(letter) for letter in word)
+    return f"$'{''.join(letters)}'"
+
+
+def _for_hydra(text: str) -> str:
+    """Return a text in double quotes, where only quotes, `${` and backslashes before these have a meaning."""
+    text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
+    text = re.sub(r'(\\*)"', r'\1\1\\"', text)
+    return f'"{text}{_trailing_backslashes(text)}"'
+
+
+def _trailing_backslashes(text: str) -> str:
+    return text[len(text.rstrip("\\")) :]
+
+
+def _bytes_of(letter: str) -> str:
+    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(letter))

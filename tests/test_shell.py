@@ -1,0 +1,217 @@
+"""The program as it is started from a shell: words that can be pasted, streams, folders and limits of any kind."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import forked
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import QuotedString
+from omegaconf import OmegaConf
+
+from hpamdp import cli
+from hpamdp.messages import say
+from hpamdp.run import train
+from hpamdp.shell import path_setting, setting
+
+FOLDERS = [
+    "sweep",
+    "outputs/2025-01-31/12-00-00-000001",
+    "lr=0.1,seed=1",
+    "my runs/a",
+    "läufe",
+    "a(b)",
+    "low.hidden_dims=[32]",
+    "it's",
+    'a "b"',
+    "$HOME",
+    "${seed}",
+    "\\${seed}",
+    "%d",
+    "back\\slash",
+    "back\\",
+    "~",
+    "~root/x",
+    "{a: 1}",
+    "a,b,",
+    "two  spaces and one at the end ",
+    "!important #1; rm -rf x & | > < * ? `ls`",
+    "1",
+    "1e5",
+    "null",
+    "-x",
+    "a\nb\t'c'\\",
+    "😀",
+]
+
+
+def test_a_setting_that_is_told_reads_as_the_same_text_when_it_is_pasted():
+    words = [path_setting("resume", Path(folder)) for folder in FOLDERS]
+    assert not [word for word in words if "\n" in word] and words[0] == "resume=sweep"
+    pasted = subprocess.run(
+        ["bash", "-c", f"printf '%s\\0' {' '.join(words)}"], capture_output=True, text=True, check=True
+    )
+    overrides = OverridesParser.create().parse_overrides(pasted.stdout.split("\0")[:-1])
+    for folder, override in zip(FOLDERS, overrides, strict=True):
+        value = override.value()
+        read = OmegaConf.create({"resume": value.text if isinstance(value, QuotedString) else value}).resume
+        assert Path(os.path.expanduser(read)) == Path(folder), override.input_line
+
+
+def test_a_text_that_the_grammar_does_not_take_is_told_as_it_is_typed(command):
+    for text in ("my runs/lr=0.1,seed=1", "a(b)", "a,b", "[32]", "{a: b}", "7", "true", "it's"):
+        for name in ("resume", "low.checkpoint"):
+            code, _, err = command(f"{name}={text}")
+            assert code == 2 and err.count("\n") == 1, err
+            assert setting(name, text) in err, text
+
+
+@pytest.mark.parametrize(
+    ("started_as", "told"),
+    [
+        ("/usr/bin/hpamdp", "hpamdp"),
+        ("run.py", "python run.py"),
+        ("my clone/run.py", "python 'my clone/run.py'"),
+        ("/x/hpamdp/__main__.py", "python -m hpamdp"),
+    ],
+)
+def test_the_program_is_named_as_it_was_started(command, monkeypatch, capsys, started_as, told):
+    monkeypatch.setattr(sys, "argv", [started_as, "--help"])
+    cli.main()
+    assert f"Usage: {told} [GROUP=CHOICE" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [started_as, "watch", "--foo"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert capsys.readouterr().err == f"unrecognized arguments: --foo; see {told} watch --help\n"
+
+
+def written_yaml(folder: Path, text: str) -> list[str]:
+    """Write an experiment; return the words that choose it."""
+    file = folder / "mine/experiment/odd.yaml"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"# @package _global_\n{text}")
+    return ["--config-dir", str(folder / "mine"), "experiment=odd", "low=random"]
+
+
+LAUGHS = "".join(f"  l{i}: &l{i} [{', '.join([f'*l{i - 1}' if i else '1'] * 9)}]\n" for i in range(12))
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("defaults:\n  - odd\n", "a yaml file names itself among its defaults"),
+        (f"env:\n  kwargs: {'{a: ' * 3000}1{'}' * 3000}\n", "odd.yaml: nests more than 50 levels deep"),
+        (f"env:\n{LAUGHS}", "odd.yaml: has more than 100,000 values"),
+        ("env: &a\n  x: *a\n", "odd.yaml: *a stands for nothing, or is part of itself"),
+        ("seed: 1\nseed: 2\n", "odd.yaml, line 3: found duplicate key seed"),
+        ("env:\n\tseed: 1\n", "odd.yaml, line 3: "),
+        ("num_envs: ${seed}\nseed: ${num_envs}\n", "seed: "),
+        ('hydra: {run: {dir: "a\\0b"}}\n', "embedded null byte"),
+        ('resume: "a\\0b"\n', "no checkpoint there"),
+        ("hydra: {run: {dir: " + "x" * 300 + "}}\n", "File name too long"),
+    ],
+)
+def test_a_yaml_that_no_one_can_read_is_told_in_one_line(command, tmp_path, text, line):
+    code, _, err = command(*written_yaml(tmp_path, text))
+    assert code == 2 and err.count("\n") == 1 and line in err
+
+
+def test_a_yaml_that_is_a_folder_or_a_pipe_is_no_choice(command, tmp_path):
+    words = written_yaml(tmp_path, "")
+    (tmp_path / "mine/experiment/odd.yaml").unlink()
+    os.mkfifo(tmp_path / "mine/experiment/odd.yaml")
+    assert "experiment=odd: no such choice" in command(*words)[2]
+    (tmp_path / "mine/experiment/odd.yaml").unlink()
+    (tmp_path / "mine/experiment/odd.yaml").mkdir()
+    assert "experiment=odd: no such choice" in command(*words)[2]
+
+
+LONG = "x" * 300
+ODD_WORDS = [
+    [f"resume={LONG}"],
+    ["mode=eval", f"checkpoint={LONG}", "low=random"],
+    [f"experiment={LONG}"],
+    [f"{LONG}=1"],
+    [f"{LONG}/{LONG}=1"],
+    ["-m", f"hydra.sweep.dir={LONG}", "seed=1,2"],
+    ["--config-name", LONG],
+    ["--config-dir", LONG],
+    ["--config-dir", os.devnull],
+    ["watch", LONG],
+    ["watch", f"{LONG}=1"],
+    ["watch", "=1"],
+    ["play", "--agent", LONG],
+    ["watch", f"+low.x={'[' * 3000}"],
+    [f"+low.x={'{a:' * 500}1{'}' * 500}"],
+    [f"seed={'choice(' * 300}"],
+    [f"seed={'9' * 5000}"],
+    ["watch", f"seed={'9' * 5000}"],
+    ["resume=a\0b"],
+    ["resume=\udcff"],
+    ["watch", "\udcff😀"],
+    ["😀=1"],
+    ["\n"],
+]
+
+
+@pytest.mark.parametrize("words", ODD_WORDS, ids=[" ".join(words)[:30] for words in ODD_WORDS])
+def test_an_odd_word_is_told_in_one_line(command, words):
+    code, out, err = command(*words)
+    assert (code, out) == (2, "") and err.count("\n") == 1 and err.strip()
+
+
+def test_a_setting_with_dashes_is_told_without_them(command):
+    code, _, err = command("--seed=1", "low=hppo")
+    assert (code, err) == (2, "--seed=1: settings have no dashes, write seed=1; a wandb sweep ${args_no_hyphens}\n")
+
+
+def ends_with(folder: Path, words: list[str], out: int, encoding: str, err: Path) -> None:
+    """Run the program with this stdout in a process of its own, and end it as the interpreter does."""
+    os.chdir(folder)
+    sys.stdout = open(os.dup(out), "w", encoding=encoding)  # noqa: SIM115
+    sys.stderr = err.open("w")
+    sys.argv = ["run.py", *words]
+    try:
+        cli.main()
+    finally:
+        sys.stdout.close()
+        sys.stderr.close()
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--cfg", "job"], ["--version"], ["watch", "--help"]])
+def test_help_that_cannot_be_written_costs_one_line_at_most(tmp_path, words):
+    err = tmp_path / "err.txt"
+    with open("/dev/full", "w") as full:
+        assert forked(ends_with, tmp_path, words, full.fileno(), "utf-8", err) == 1
+    assert err.read_text() == "stdout: No space left on device\n"
+    reader, writer = os.pipe()
+    os.close(reader)
+    assert forked(ends_with, tmp_path, words, writer, "utf-8", err) == 1 and err.read_text() == ""
+    os.close(writer)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
+def test_letters_that_a_terminal_cannot_show_are_replaced(tmp_path, monkeypatch, encoding):
+    out, err = tmp_path / "out.txt", tmp_path / "err.txt"
+
+    def run(cfg, folder, *_, **__):
+        say(f"Everything is in {folder}")
+        return 0
+
+    monkeypatch.setattr(train, "run", run)
+    with out.open("w") as file:
+        for words in (["hydra.run.dir='läufe/a b Ω'"], ["-m", "seed=1", "hydra.sweep.dir='Ω'"]):
+            assert forked(ends_with, tmp_path, words, file.fileno(), encoding, err) == 0
+        assert forked(ends_with, tmp_path, ["env=Ω"], file.fileno(), encoding, err) == 2
+    text = out.read_text(encoding)
+    assert text.count("\\u03a9") == 2 and "1 jobs: 1 finished" in text and "Traceback" not in err.read_text()
+
+
+def test_a_working_directory_that_is_gone_is_told_in_one_line(command, tmp_path):
+    (tmp_path / "gone").mkdir()
+    os.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    code, _, err = command("--help")
+    assert code == 2 and err.startswith("the working directory is gone") and err.count("\n") == 1
