@@ -2,14 +2,15 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
-from conftest import choices, compose_config
+from conftest import choices, compose_config, make_config
 
 from hpamdp.config import ConfigError
 from hpamdp.run import checkpoint
-from hpamdp.run.play import own_agents
+from hpamdp.run.play import _agent, own_agents
 from hpamdp.run.players import load_player
 from hpamdp.run.resume import resolve
 from hpamdp.run.train import run
@@ -82,3 +83,11 @@ def test_the_words_of_eval_take_the_agent_from_its_folder():
     config, file = resolve(compose_config(words), words)
     assert (config.high.name, config.low.name, config.run.eval.layouts) == ("linucb", "hppo", 7)
     assert file == FOLDER / "linucb_hppo" / "policy.pt"
+
+
+def test_the_summary_of_somebody_else_gives_a_score_or_none(tmp_path):
+    player = SimpleNamespace(agent=SimpleNamespace(portable=dict), config=make_config(["high=none"]))
+    for text in ('{"score": NaN}', '{"score": "<b>"}', "[1]", "{}", "[" * 99_999, '{"score": null}', '{"score": true}'):
+        (tmp_path / "summary.json").write_text(text)
+        agent = _agent(tmp_path, player)
+        assert agent is not None and agent["score"] is None, text[:20]

@@ -130,3 +130,42 @@ def test_the_run_gets_learners_selectors_and_problems_only_through_the_config():
     }
     for concrete in (LOW, HIGH, *rooms):
         assert not importers(concrete, inside="hpamdp.run")
+
+
+# What reads a file by running code in it, unless the named argument has the value that forbids it.
+UNSAFE_READERS = {
+    **dict.fromkeys(("pickle.load", "pickle.loads", "cloudpickle.load", "cloudpickle.loads", "dill.load"), None),
+    **dict.fromkeys(("joblib.load", "shelve.open", "marshal.load", "marshal.loads", "pandas.read_pickle"), None),
+    **dict.fromkeys(("yaml.load", "yaml.full_load", "yaml.unsafe_load", "eval", "exec"), None),
+    "torch.load": ("weights_only", True),
+    "np.load": ("allow_pickle", False),
+    "numpy.load": ("allow_pickle", False),
+    "TensorDict.load_memmap": ("allow_pickle", False),
+}
+
+
+MAY_READ = re.compile(r"(load|loads|load_memmap|read_pickle|eval|exec|shelve\.open)\(")
+
+
+def unsafe_reads(source):
+    """Return the lines of a program that read a file by running code in it."""
+    lines = []
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Name | ast.Attribute):
+            continue
+        name = ast.unparse(node.func)
+        if name in UNSAFE_READERS:
+            given = {word.arg: ast.unparse(word.value) for word in node.keywords}
+            safe = UNSAFE_READERS[name]
+            if safe is None or given.get(safe[0]) != str(safe[1]):
+                lines.append(f"{node.lineno}: {ast.unparse(node)}")
+    return lines
+
+
+def test_nothing_reads_a_file_by_running_code_in_it():
+    unsafe = "np.load(f)\ntorch.load(f, weights_only=False)\nyaml.load(f, Loader)\npickle.loads(b)"
+    assert len(unsafe_reads(unsafe)) == 4
+    for folder in ("hpamdp", "experiments", "examples", "docs"):
+        for file in sorted((ROOT / folder).rglob("*.py")):
+            source = file.read_text()
+            assert not MAY_READ.search(source) or not unsafe_reads(source), file

@@ -1,4 +1,6 @@
 import json
+import os
+import pickle
 
 import numpy as np
 import pytest
@@ -165,6 +167,44 @@ def test_broken_files_leave_their_figures_out_with_a_warning(tmp_path, capsys):
     (tmp_path / "summary.json").write_text('{"references": {"rand')
     assert names(tmp_path) == ["learning_curves.png"]
     assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+class Bomb:
+    """An object that runs code when it is unpickled."""
+
+    is_lit = False
+
+    def __reduce__(self):
+        return exec, ("import test_figures; test_figures.Bomb.is_lit = True",)
+
+
+def spoil_compressed(folder):
+    write_evaluation(folder)
+    file = folder / "evaluation.npz"
+    np.savez_compressed(file, **dict(np.load(file)))
+    damaged = bytearray(file.read_bytes())
+    damaged[60:200] = bytes(140)
+    file.write_bytes(damaged)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda folder: np.savez(folder / "evaluation.npz", start=np.array([Bomb()])), "allow_pickle=False"),
+        (lambda folder: (folder / "evaluation.npz").write_bytes(pickle.dumps(Bomb())), "evaluation.npz cannot be"),
+        (lambda folder: os.mkfifo(folder / "evaluation.npz"), "is a named pipe"),
+        (spoil_compressed, "evaluation.npz cannot be read"),
+        (lambda folder: (folder / "summary.json").write_text("[1]"), "it is no JSON object"),
+        (lambda folder: (folder / "summary.json").write_text("[" * 99_999), "summary.json cannot be read"),
+        (lambda folder: (folder / "summary.json").symlink_to("/dev/zero"), "is a device"),
+    ],
+)
+def test_files_of_somebody_else_run_nothing_and_leave_their_figures_out(tmp_path, capsys, spoil, said):
+    spoil(tmp_path)
+    assert names(tmp_path) == []
+    warning = capsys.readouterr().err
+    assert said in warning and warning.count("\n") == 1
+    assert not Bomb.is_lit
 
 
 def test_labels_stand_apart_near_their_lines_and_in_order():

@@ -1,11 +1,16 @@
 """A folder holds one run, whatever came before in it and whatever its logger does."""
 
+import itertools
 import json
+import os
+import signal
 import struct
-from collections.abc import Iterator
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import wandb
 from conftest import compose_config
 from test_metrics import without_login  # noqa: F401  (a fixture)
 
@@ -224,7 +229,9 @@ def test_wandb_has_a_resumed_run_as_one_run_with_the_curve_of_the_one_never_stop
     words = ["logger=wandb", "logger.mode=offline", "total_frames=256", "checkpoint_every=96"]
     start(tmp_path / "whole", *words)
     start_and_kill(tmp_path / "killed", 192, *words)
+    wandb.teardown()  # as at the end of a process
     assert resume(tmp_path / "killed", tmp_path / place) == 0
+    wandb.teardown()  # waits until all is written
     (whole,) = wandb_curves(tmp_path / "whole").values()
     ((run_id, rows),) = wandb_curves(tmp_path / place).items()
     assert rows == whole and len(rows) >= 9
@@ -292,3 +299,46 @@ def test_a_job_that_was_finished_by_hand_counts_as_finished_in_its_sweep(tmp_pat
     assert command("resume=sweep/0", "hydra.run.dir=sweep/0", "film=false")[0] == 0
     code, out, _ = command(*words)
     assert code == 0 and "2 jobs: 1 skipped, finished before; 1 resumed and finished\n" in out
+
+
+def after_batches(monkeypatch: pytest.MonkeyPatch, number: int, do: Callable[[], object]) -> None:
+    """Do something once this many batches have been learned from."""
+    take, batches = Recorder.take, itertools.count(1)
+
+    def watched(self, batch, scalars):
+        take(self, batch, scalars)
+        if next(batches) == number:
+            do()
+
+    monkeypatch.setattr(Recorder, "take", watched)
+
+
+def kill_wandb() -> None:
+    children = subprocess.run(["ps", "-o", "pid=,comm=", "--ppid", str(os.getpid())], capture_output=True, text=True)
+    (service,) = [line.split()[0] for line in children.stdout.splitlines() if "wandb-core" in line]
+    os.kill(int(service), signal.SIGKILL)
+
+
+def test_a_run_outlives_wandbs_service_and_the_next_run_starts_another(
+    tmp_path,
+    monkeypatch,
+    capsys,
+    without_login,  # noqa: F811
+):
+    with monkeypatch.context() as patch:
+        after_batches(patch, 2, kill_wandb)
+        assert start(tmp_path / "a", "logger=wandb", "logger.mode=offline") == 0
+    assert capsys.readouterr().err.count("the run goes on without this logger") == 1
+    assert len(read_rows(tmp_path / "a/metrics.csv")) == 5
+    assert start(tmp_path / "b", "logger=wandb", "logger.mode=offline") == 0
+    wandb.teardown()
+    ((*_, last),) = wandb_curves(tmp_path / "b").values()
+    assert last[0] == 128 and "goes on without" not in capsys.readouterr().err
+
+
+def test_a_run_outlives_the_folder_of_its_tensorboard_events(tmp_path, monkeypatch, capsys):
+    after_batches(monkeypatch, 2, lambda: (tmp_path / "tensorboard").rename(tmp_path / "moved"))
+    assert start(tmp_path, "logger=tensorboard") == 0
+    err = capsys.readouterr().err
+    assert err.count("the run goes on without this logger") == 1 and "Traceback" not in err
+    assert len(read_rows(tmp_path / "metrics.csv")) == 5

@@ -98,6 +98,25 @@ def test_stopped_runs_are_left_out_and_named(tmp_path, capsys):
     assert capsys.readouterr().err == f"{tmp_path / 'b'}: was stopped, left out\n"
 
 
+def test_linked_folders_count_once_and_what_cannot_be_read_is_named(tmp_path, capsys):
+    for seed, folder in enumerate(["study/a", "elsewhere/b", "elsewhere/deep/c"]):
+        leave_run(tmp_path / folder, seed=seed)
+    study = tmp_path / "study"
+    (study / "seed1").symlink_to(tmp_path / "elsewhere/b")
+    (study / "seed2").symlink_to("../elsewhere/deep")
+    (study / "again").symlink_to(study / "a")
+    (study / "a/loop").symlink_to(study)
+    (study / "gone").symlink_to(tmp_path / "nowhere")
+    leave_run(study / "cut")
+    (study / "cut/summary.json").write_text('{"score": 1.')
+    runs = finished([study, study / "a"])
+    assert sorted(run.summary["seed"] for run in runs) == [0, 1, 2]
+    assert sorted(capsys.readouterr().err.splitlines()) == [
+        f"{study / 'cut'}: summary.json is missing or damaged, left out",
+        f"{study / 'gone'}: a link to nothing, left out",
+    ]
+
+
 def test_groups_keep_the_order_of_appearance():
     rows = [{"a": 2, "b": 0, "x": 1}, {"a": 1, "b": 0, "x": 2}, {"a": 2, "b": 0, "x": 3}]
     assert [(key, [row["x"] for row in of]) for key, of in groups(rows, "a", "b").items()] == [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,12 @@ from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 from hpamdp.analysis.style import AGENT, REFERENCES, STYLE, label_ends
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.files import replacing
-from hpamdp.messages import duration, warn
+from hpamdp.messages import duration, one_line, warn
+from hpamdp.regular_files import read_regular, regular_size
 from hpamdp.run.folder import FIGURES_NAME
 from hpamdp.run.metrics import EVALUATION, FRAMES, WALL_SECONDS, read_rows
+
+_MAX_SUMMARY_BYTES = 1 << 24
 
 
 def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
@@ -49,20 +53,24 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
 
 def _read_summary(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text()) if path.exists() else {}
-    except ValueError as error:
-        warn(f"{path} is no json, its references are left out: {error}")
+        summary = json.loads(read_regular(path, _MAX_SUMMARY_BYTES)) if path.exists() else {}
+        if not isinstance(summary, dict):
+            raise ValueError("it is no JSON object")
+    except (ValueError, OSError, RecursionError) as error:
+        warn(f"{path} cannot be read, its references are left out: {one_line(error)}")
         return {}
+    return summary
 
 
 def _read_evaluation(path: Path) -> dict[str, np.ndarray]:
     if not path.exists():
         return {}
     try:
-        with np.load(path) as arrays:
+        regular_size(path)
+        with np.load(path, allow_pickle=False) as arrays:
             return dict(arrays)
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        warn(f"{path} cannot be read, its figures are left out: {error}")
+    except (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
+        warn(f"{path} cannot be read, its figures are left out: {one_line(error)}")
         return {}
 
 

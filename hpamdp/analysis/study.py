@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import csv
-import json
+import os
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy import stats
 
 from hpamdp.files import replacing
 from hpamdp.messages import warn
+from hpamdp.run.folder import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
 from hpamdp.run.metrics import read_rows
 
 Rows = list[dict[str, Any]]
@@ -37,21 +37,46 @@ class Run:
 
     def played(self) -> dict[str, np.ndarray]:
         """Return its final evaluation, one array an attribute, first dimension the episode."""
-        with np.load(self.folder / "evaluation.npz") as file:
+        with np.load(self.folder / "evaluation.npz", allow_pickle=False) as file:
             return dict(file)
 
 
 def finished(folders: Iterable[Path | str]) -> list[Run]:
-    """Return the finished runs under the folders, in the order of their names; stopped ones are named on stderr."""
-    runs = []
-    for file in (file for folder in folders for file in sorted(Path(folder).glob("**/summary.json"))):
-        summary = json.loads(file.read_text())
-        if summary["finished"]:
-            config = yaml.safe_load((file.parent / "config.yaml").read_text())
-            runs.append(Run(file.parent, summary, config))
+    """Return the finished runs under the folders, in the order of their names; the others are named on stderr.
+
+    Links to folders are followed. A run that is reached in two ways counts once.
+    """
+    runs, seen = [], set[str]()
+    found = [run for folder in folders for run in sorted(_run_folders(Path(folder), seen))]
+    for folder in found:
+        summary, config = saved_summary(folder), saved_config(folder)
+        if not summary or not config:
+            warn(f"{folder}: {CONFIG_NAME if summary else SUMMARY_NAME} is missing or damaged, left out")
+        elif summary.get("finished"):
+            runs.append(Run(folder, summary, config))
         else:
-            warn(f"{file.parent}: was stopped, left out")
+            warn(f"{folder}: was stopped, left out")
     return runs
+
+
+def _run_folders(folder: Path, seen: set[str]) -> Iterator[Path]:
+    """Yield the folders with a summary, but none that was seen before; links to nothing are named on stderr."""
+
+    def name_it(error: OSError) -> None:
+        warn(f"{error.filename}: {error.strerror}, left out")
+
+    for path, folders, files in os.walk(folder, onerror=name_it, followlinks=True):
+        real = os.path.realpath(path)
+        # A link may lead to a folder above itself.
+        folders[:] = () if real in seen else [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME)]
+        if real in seen:
+            continue
+        seen.add(real)
+        for name in files:
+            if name == SUMMARY_NAME:
+                yield Path(path)
+            elif not os.path.exists(os.path.join(path, name)):
+                warn(f"{os.path.join(path, name)}: a link to nothing, left out")
 
 
 def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:

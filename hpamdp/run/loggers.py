@@ -6,6 +6,8 @@ import netrc
 import os
 import re
 import shutil
+import socket
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +18,7 @@ from pydantic import Field, ValidationError
 
 from hpamdp.messages import first_line, warn
 from hpamdp.run.folder import TENSORBOARD_NAME, WANDB_NAME
-from hpamdp.run.metrics import FRAMES
+from hpamdp.run.metrics import FRAMES, WALL_SECONDS
 
 
 class EarlierRun(NamedTuple):
@@ -147,10 +149,11 @@ class CSVLogger:
 
 
 class TensorboardLogger:
-    """Log to TensorBoard event files.
+    """Log to a TensorBoard event file.
 
-    A resumed run writes its earlier rows again, in place of the old events. Events may go past the checkpoint that the
-    run continues from, and the last ones may be missing.
+    The file is complete after each row, and its times are those of training. A resumed run writes its earlier rows
+    again, in place of the old events, which may go past the checkpoint that the run continues from. torch's
+    `SummaryWriter` is not used: it writes in a thread, whose errors are printed with a traceback.
 
     Args:
         output_dir: the run's folder; the events go to `tensorboard` in it.
@@ -158,32 +161,38 @@ class TensorboardLogger:
     """
 
     def __init__(self, output_dir: Path, earlier: EarlierRun | None = None) -> None:
-        from torch.utils.tensorboard import SummaryWriter
+        from tensorboard.compat.proto.event_pb2 import Event
 
         folder = output_dir / TENSORBOARD_NAME
+        folder.mkdir(parents=True, exist_ok=True)
         rows = [] if earlier is None else earlier.rows
         if rows:
             for events in folder.glob("events.out.tfevents.*"):
                 events.unlink()
-        self._writer = SummaryWriter(str(folder))
-        self._step = 0
+        now = time.time()
+        self._file = folder / f"events.out.tfevents.{now:.0f}.{socket.gethostname()}.{os.getpid()}"
+        self._step, self._wall_s = 0, 0.0
+        self._started = now - (rows[-1].get(WALL_SECONDS, 0.0) if rows else 0.0)
+        self._append(Event(wall_time=self._started, file_version="brain.Event:2"))
         for row in rows:
             self.log(dict(row), int(row[FRAMES]))
 
     def log(self, row: dict[str, float], step: int) -> None:
         """Write each metric as a scalar after `step` frames."""
-        self._step = step
-        for name, value in row.items():
-            self._writer.add_scalar(name, value, step)
+        from torch.utils.tensorboard.summary import scalar
+
+        self._step, self._wall_s = step, row.get(WALL_SECONDS, self._wall_s)
+        self._write([scalar(name, value) for name, value in row.items()])
 
     def images(self, paths: Iterable[Path]) -> None:
         """Write figures under their file names."""
         import numpy as np
         from PIL import Image
+        from torch.utils.tensorboard.summary import image
 
         for path in paths:
-            with Image.open(path) as image:
-                self._writer.add_image(path.stem, np.asarray(image.convert("RGB")), self._step, dataformats="HWC")
+            with Image.open(path) as picture:
+                self._write([image(path.stem, np.asarray(picture.convert("RGB")), dataformats="HWC")])
 
     def film(self, path: Path) -> None:
         """Write the GIF as it is, which TensorBoard shows moving."""
@@ -192,19 +201,33 @@ class TensorboardLogger:
 
         with Image.open(path) as image:
             width, height = image.size
-        # SummaryWriter.add_video would encode the pictures once more, and wants moviepy for it.
+        # torch's `video` would encode the pictures once more, and wants moviepy for it.
         encoded = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
-        summary = Summary(value=[Summary.Value(tag=path.stem, image=encoded)])
-        self._writer._get_file_writer().add_summary(summary, self._step)
+        self._write([Summary(value=[Summary.Value(tag=path.stem, image=encoded)])])
 
     def summary(self, figures: dict[str, Any]) -> None:
         """Write the summary as a table in text."""
+        from torch.utils.tensorboard.summary import text
+
         lines = [f"| {name} | {value} |" for name, value in figures.items()]
-        self._writer.add_text("summary", "\n".join(["| | |", "|---|---|", *lines]), self._step)
+        self._write([text("summary", "\n".join(["| | |", "|---|---|", *lines]))])
 
     def close(self) -> None:
-        """Write what is left and close the file."""
-        self._writer.close()
+        """Do nothing: the file is complete."""
+
+    def _write(self, summaries: Iterable[Any]) -> None:
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        values = [value for summary in summaries for value in summary.value]
+        time_of_row = self._started + self._wall_s
+        self._append(Event(wall_time=time_of_row, step=self._step, summary=Summary(value=values)))
+
+    def _append(self, event: Any) -> None:
+        from tensorboard.summary.writer.record_writer import RecordWriter
+
+        with self._file.open("ab") as file:
+            RecordWriter(file).write(event.SerializeToString())
 
 
 class WandbLogger:

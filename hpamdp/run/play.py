@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import threading
 import webbrowser
@@ -17,6 +18,7 @@ from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
 from hpamdp.env.page import EpisodeError, Page
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, reason_of, say, warn
+from hpamdp.regular_files import read_regular
 from hpamdp.run.assemble import check_classes, make_env
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.folder import POLICY_NAME, SUMMARY_NAME
@@ -32,6 +34,7 @@ Play a problem yourself, beside agents.
   hpamdp play --export site                        the page as files that need no server
 """
 _LOOPBACK = "127.0.0.1"
+_MAX_SUMMARY_BYTES = 1 << 24
 _ONE_EPISODE = ("eval.layouts=1", "film=false")
 
 
@@ -123,14 +126,14 @@ def _agent(path: Path, player: Player) -> dict[str, Any] | None:
     title = config.low.name if config.high.cls is None else f"{config.high.name} + {config.low.name}"
     summary = (path if path.is_dir() else path.parent) / SUMMARY_NAME
     try:
-        score = json.loads(summary.read_text())["score"]
-    except (OSError, ValueError, KeyError):
+        score = json.loads(read_regular(summary, _MAX_SUMMARY_BYTES))["score"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         score = None
     options = json.loads(json.dumps(dict(config.env.options)))
     return {
         "name": name,
         "title": title,
-        "score": score,
+        "score": score if type(score) in (int, float) and math.isfinite(score) else None,
         "env": options,
         "agent": form,
     }

@@ -32,7 +32,7 @@ def packed(module: nn.Module) -> bytes:
 
 def unpack(module: nn.Module, state: bytes) -> None:
     """Load a `packed` state into a module on the CPU, whatever device it was packed on."""
-    module.load_state_dict(torch.load(io.BytesIO(state), map_location=_CPU))
+    module.load_state_dict(torch.load(io.BytesIO(state), map_location=_CPU, weights_only=True))
 
 
 class PolicyCopy(TensorDictModuleBase):
