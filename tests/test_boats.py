@@ -274,7 +274,7 @@ def test_selectors_that_end_options_train_with_changes_of_boats(high, tmp_path):
     learned = high == "option_critic"
     ends = ["agent.termination=learned"] if learned else ["agent.termination=steps", "agent.option_length=1"]
     words = [f"high={high}", "low=hppo", "env.switch_cost=0.2", "num_envs=4", "steps_per_batch=4", *ends]
-    config = read(compose_config([*words, "total_frames=32", "eval.layouts=4", "low.minibatch_size=16"]))
+    config = read(compose_config([*words, "eval.layouts=4", "low.minibatch_size=16"]))
     parts = assemble(config, tmp_path)
     means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
     assert (

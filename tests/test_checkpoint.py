@@ -153,7 +153,7 @@ def test_missing_members_foreign_files_and_other_agents_are_refused(trained, par
     with zipfile.ZipFile(tmp_path / "foreign.zip", "w") as archive:
         archive.writestr("word/document.xml", "<a/>")
     refusal(tmp_path / "foreign.zip", parts)
-    hppo = assemble(make_config([*SMALL, "low=hppo"]), tmp_path)
+    hppo = assemble(make_config([*SMALL, "low=hppo", *SHORT["hppo"]]), tmp_path)
     assert "does not fit this agent" in refusal(file, hppo)
 
 

@@ -14,7 +14,15 @@ from hpamdp.run.metrics import MetricsFile
 from hpamdp.run.sweep import Job, Records
 from hpamdp.run.train import run
 
-TINY = ["low=hppo", "num_envs=4", "steps_per_batch=2", "eval.layouts=2", "eval.every=0", "log_every=8"]
+TINY = [
+    "low=hppo",
+    "low.minibatch_size=8",
+    "num_envs=4",
+    "steps_per_batch=2",
+    "eval.layouts=2",
+    "eval.every=0",
+    "log_every=8",
+]
 
 
 def outside_copies(folder, outside):

@@ -44,6 +44,12 @@ SHORT = {
     "pdqn_published": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
+# The same for selectors.
+SHORT_SELECTORS = {
+    "actor": ["high.minibatch_size=16"],
+    "meta_critic": ["high.warmup_decisions=20", "high.updates_per_decision=0.1", "high.batch_size=16"],
+    "option_critic": ["high.warmup_steps=64", "high.updates_per_step=0.05", "high.batch_size=16"],
+}
 # What has nothing to learn.
 FIXED = ("planner", "random")
 SMALL = ["num_envs=16", "steps_per_batch=4", "total_frames=256", "eval.layouts=10", "eval.every=0", "log_every=0"]
@@ -51,7 +57,14 @@ SMALL = ["num_envs=16", "steps_per_batch=4", "total_frames=256", "eval.layouts=1
 
 def words(high: str, low: str) -> list[str]:
     controller = "random" if high == "none" else "choose"
-    return [f"high={high}", f"low={low}", f"env.controller={controller}", *SHORT.get(low, []), *SMALL]
+    return [
+        f"high={high}",
+        f"low={low}",
+        f"env.controller={controller}",
+        *SHORT.get(low, []),
+        *SHORT_SELECTORS.get(high, []),
+        *SMALL,
+    ]
 
 
 def make(high: str, low: str, tmp_path):

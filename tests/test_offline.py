@@ -21,6 +21,7 @@ from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.run.assemble import assemble
+from hpamdp.run.metrics import read_rows
 from hpamdp.run.train import Trainer, run
 from hpamdp.specs import PAMDPSpecs
 
@@ -47,9 +48,10 @@ def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, pat
     given = overrides(path, low)
     assert run(compose_config(given), tmp_path, given) == 0
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary["frames"] == 6
-    text = (tmp_path / "metrics.csv").read_text()
-    assert "train/" not in text.splitlines()[0]
+    assert summary["frames"] == 6 and summary["without_update"] == []
+    rows = read_rows(tmp_path / "metrics.csv")
+    assert not any(name.startswith("train/") for row in rows for name in row)
+    assert [row["frames"] for row in rows if "eval/score" in row] == [0, 3, 6]
 
 
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])
@@ -126,7 +128,7 @@ def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(hi
 def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path, tmp_path):
     words = [f"data.path={path}", "data=human", "data.checksum=null", "low=pdqn", f"high={high}", "eval.layouts=4"]
     words += ["num_envs=8", "steps_per_batch=4", "total_frames=256", "low.batch_size=16", "eval.every=0"]
-    words += ["high.minibatch_size=8"] if high == "actor" else []
+    words += ["low.warmup_frames=64", *(["high.minibatch_size=8"] if high == "actor" else [])]
     assert run(compose_config(words), tmp_path, words) == 0
     header = (tmp_path / "metrics.csv").read_text().splitlines()[0]
     assert any(name.startswith("high/") for name in header.split(","))

@@ -11,6 +11,7 @@ from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.low_level.pets import MEMBER, PETS
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.planning import Found, Prediction, SequenceSearch, discounted_return, elite_weights
+from hpamdp.policies.shared.scales import scale_of
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")
@@ -544,6 +545,11 @@ def test_actions_are_random_only_while_neither_rewards_nor_terminations_differ(v
         for batch, is_trained in (({}, False), (changes, True), ({}, True)):
             learn(learner, random_batch(64, **{**same, **batch}))
             assert bool(learner.policy.is_trained) == is_trained
+
+
+def test_the_scale_of_a_single_step_or_of_equal_ones_is_the_lower_bound():
+    for num in (1, 3):
+        assert scale_of(torch.full((num, 2), 5.0)).tolist() == pytest.approx([0.01, 0.01])
 
 
 def test_while_nothing_is_planned_the_value_is_that_of_the_one_known_reward():

@@ -120,7 +120,6 @@ REFUSED = [
     ("low=hppo low.critic_hidden_dims=[]", "low.critic_hidden_dims=[]: must have at least 1 item (HPPO"),
     ("env=boatdock_released high=none env.test_mode=2", "env.test_mode=2: must be 0, 1 or null (Released"),
     ("logger=wandb logger.project=''", 'logger.project="": must have at least 1 character (WandbLogger'),
-    ("logger=wandb logger.project=a/b#c", "logger: project=a/b#c: Invalid project name 'a/b#c': cannot contain "),
     # Observations of others.
     (
         GYMNASIUM + "env.entry_point=toy_environments:OldGoal env.observation_keys=[2]",
@@ -158,8 +157,16 @@ def test_what_no_run_can_have_is_refused_in_one_line(words, line, tmp_path):
     assert line in str(raised.value) and "\n" not in str(raised.value)
 
 
+def test_a_project_name_that_wandb_refuses_is_told_in_one_line(tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"^logger: project=a/b#c: Invalid project name 'a/b#c': cannot contain "
+    ) as raised:
+        run(config_of("logger=wandb logger.project=a/b#c high=ucb low=random"), tmp_path)
+    assert "\n" not in str(raised.value)
+
+
 def test_the_estimate_of_memory_counts_all_parts_together(monkeypatch, tmp_path):
-    config = read(config_of("low.buffer_size=1000000"))
+    config = read(config_of("low.buffer_size=1000000 low.warmup_frames=32"))
     assemble(config, tmp_path)
     monkeypatch.setattr(assemble_module, "total_memory", lambda device: 100_000_000)
     line = r"^low.buffer_size=1000000: the run takes at least 0\.3 GB of memory, and there are 0\.1 GB$"

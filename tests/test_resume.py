@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import TRAINED, compose_config, forked
-from test_grid import SHORT
+from test_grid import SHORT, SHORT_SELECTORS
 
 from hpamdp.run import checkpoint
 from hpamdp.run.recorder import Recorder
@@ -21,7 +21,6 @@ from hpamdp.run.train import run
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=416", "eval.layouts=4", "eval.every=192", "log_every=64"]
 STOPPED_AFTER = 9  # batches, in the middle of a log interval
 SELECTORS = ("ucb", "linucb", "meta_critic", "actor", "exp3")
-QUICK = {"meta_critic": ["high.warmup_decisions=20", "high.batch_size=16"], "actor": ["high.minibatch_size=32"]}
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -93,7 +92,7 @@ def kill(given: list[str], folder: Path) -> None:
 
 
 def words_of(high: str, low: str) -> list[str]:
-    return [f"high={high}", f"low={low}", *SHORT.get(low, []), *QUICK.get(high, []), *SMALL]
+    return [f"high={high}", f"low={low}", *SHORT.get(low, []), *SHORT_SELECTORS.get(high, []), *SMALL]
 
 
 # `test_every_pair_resumes_to_the_last_bit` has the others.

@@ -14,6 +14,7 @@ from PIL import Image
 
 from hpamdp.config import ConfigError
 from hpamdp.env.boatdock import harbour
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import human_normalised
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
@@ -221,6 +222,12 @@ def test_a_foreign_file_is_no_checkpoint(tmp_path):
     file.write_bytes(b"PK\x03\x04 not a checkpoint")
     with pytest.raises(ConfigError, match="not a checkpoint"):
         checkpoint.find(file, "resume")
+
+
+def test_no_score_is_the_mean_of_episodes_that_have_not_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(BoatDockEnv, "max_steps", 1)
+    with pytest.raises(ConfigError, match=r"env: .*: evaluation episode 0 has not ended after max_steps=1"):
+        start(tmp_path, "low=random")
 
 
 def test_agents_are_scored_on_the_layouts_that_no_training_meets(tmp_path):

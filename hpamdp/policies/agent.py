@@ -348,6 +348,13 @@ class HierarchicalAgent(nn.Module):
             scalars.update({f"{self._prefix_of(i)}/{name}": value for name, value in learned.items()})
         return scalars
 
+    def without_update(self) -> list[str]:
+        """Return the names, as in logs, of the selector and the learners that have made no update yet."""
+        levels: list[tuple[str, Learner | Selector]] = [] if self.selector is None else [("high", self.selector)]
+        if not self.is_frozen:
+            levels += [(self._prefix_of(i), learner) for i, learner in enumerate(self._learners())]
+        return [name for name, level in levels if not level.has_updated()]
+
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by level and name."""
         levels: dict[str, Learner | Selector] = {f"learner{i}": each for i, each in enumerate(self._learners())}

@@ -21,6 +21,14 @@ def is_greedy() -> bool:
     return exploration_type() in (ExplorationType.DETERMINISTIC, ExplorationType.MODE)
 
 
+def have_stepped(parts: Mapping[str, Any]) -> bool:
+    """Return whether an optimizer among the parts has taken a step, or there is none to tell by."""
+    # Plain stochastic gradient descent has no state that tells.
+    kinds = (part for part in parts.values() if isinstance(part, torch.optim.Optimizer))
+    optimizers = [part for part in kinds if not isinstance(part, torch.optim.SGD)]
+    return not optimizers or any(optimizer.state for optimizer in optimizers)
+
+
 def option_ends(batch: TensorDictBase) -> Tensor:
     """Return where an episode or an option ends, bool `[*B, T, 1]`; another option's rows may follow."""
     is_end = batch.get(("next", keys.DONE)) | batch.get(("next", keys.IS_DECISION), False)
@@ -240,6 +248,21 @@ class Selector(TensorDictModuleBase):
         """
         return {}
 
+    def decisions_to_update(self) -> dict[str, int]:
+        """Return how many decisions the first update takes at least, by the settings that ask for them.
+
+        A selector that learns within options counts steps. A run that is too short for it is refused, with the setting
+        that asks for most. Override it if one decision is not enough.
+        """
+        return {}
+
+    def has_updated(self) -> bool:
+        """Return whether the selector has made an update, or has nothing to learn; a run says if it has not.
+
+        By default, the optimizers of `stateful` tell. Override it if the selector learns without one.
+        """
+        return have_stepped(self.stateful())
+
     def portable(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to choose greedily; None if that is not known.
 
@@ -406,6 +429,18 @@ class Learner(nn.Module):
         """
         fresh = {name: value for name, value in self.state_dict().items() if name.rpartition(".")[2] in self.progress}
         self.load_state_dict({name: fresh.get(name, value) for name, value in state.items()})
+
+    def steps_to_update(self) -> dict[str, int]:
+        """Return how many steps of its own the first update takes at least, by the settings that ask for them.
+
+        A run that is too short for it is refused, with the setting that asks for most. Override it if one step is not
+        enough.
+        """
+        return {}
+
+    def has_updated(self) -> bool:
+        """Return whether the learner has made an update, or has nothing to learn, as `Selector.has_updated` does."""
+        return have_stepped(self.stateful())
 
     def portable(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if that is not known.

@@ -80,6 +80,7 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and config.run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(config.run.low.checkpoint, "low.checkpoint"), agent, device)
+    check_length(config, agent)
     evaluation = make_evaluation(config, env)
     tracked, policy = acting(env, agent, config)
     return Parts(tracked, policy, agent, evaluation, data, device)
@@ -178,12 +179,18 @@ def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:
 
 def _ask_learners(config: Config, agent: HierarchicalAgent, given: str, ask: Callable[[Learner], None]) -> None:
     """Ask all learners for something; if one refuses, say so with the setting that was given."""
-    for low, learner in zip(_learners_of(config, agent.specs), agent.learners, strict=False):
-        assert isinstance(learner, Learner)
+    for low, learner in _with_learners(config, agent):
         try:
             ask(learner)
         except ValueError as error:
             raise ConfigError(f"{given}: {low}: {error}") from error
+
+
+def _with_learners(config: Config, agent: HierarchicalAgent) -> Iterator[tuple[Component, Learner]]:
+    """Yield the agent's learners, each with its component."""
+    for low, learner in zip(_learners_of(config, agent.specs), agent.learners, strict=False):
+        assert isinstance(learner, Learner)
+        yield low, learner
 
 
 def _learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:
@@ -448,6 +455,31 @@ def check_modes(config: Config) -> None:
         )
     if mode == "offline" and config.run.low.freeze:
         raise ConfigError("low.freeze=true: mode=offline trains the learners; use low.freeze=false")
+
+
+def check_length(config: Config, agent: HierarchicalAgent) -> None:
+    """Refuse a training that is surely over before the first update of the selector or of a learner.
+
+    Raises:
+        ConfigError: with the setting that asks for most steps, and with how many there will be.
+    """
+    run = config.run
+    if run.mode != "train":
+        return
+    batch = run.num_envs * run.steps_per_batch
+    num = -(-run.total_frames // batch) * batch
+    needs = [] if agent.selector is None else [(config.high, agent.selector.decisions_to_update())]
+    if not run.low.freeze:
+        needs += [(low, learner.steps_to_update()) for low, learner in _with_learners(config, agent)]
+    for component, needed in needs:
+        name = max(needed, key=needed.__getitem__, default="")
+        if name and needed[name] > num:
+            setting = f"{component.group}.{name}"
+            raise ConfigError(
+                f"{setting}={component.options.get(name)} ({component}): the first update comes after "
+                f"{needed[name]:,} steps or decisions, but total_frames={run.total_frames} gives at most {num:,}; "
+                f"set a larger total_frames or another {setting}"
+            )
 
 
 def check_collector(config: Config, env: PAMDPEnv) -> None:

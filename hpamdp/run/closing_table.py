@@ -11,6 +11,8 @@ from hpamdp.env.base import Metric
 from hpamdp.messages import duration
 from hpamdp.run.metrics import FRAMES, WALL_SECONDS
 
+WITHOUT_UPDATE = "without_update"  # names of the levels that have learned nothing
+
 
 def _number(value: float) -> str:
     return f"{round(value, 3) + 0.0:.3f}"  # adding 0 turns -0.0 into 0.0
@@ -23,8 +25,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     """Return a plain aligned table of this agent beside the references.
 
     Args:
-        summary: the agent's figures by their names, `references`, `mode`, `frames` and `wall_s`. Rows that the agent
-            has no figure for are left out, and so are columns without any.
+        summary: the agent's figures by their names, `references`, `mode`, `frames`, `wall_s` and `without_update`.
+            Rows that the agent has no figure for are left out, and so are columns without any.
         metrics: the rows.
     """
     titles = {name: title for name, (title, _, _) in REFERENCES.items()}
@@ -46,6 +48,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     for first, *others in cells:
         aligned = [first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]
         lines.append("   ".join(aligned).rstrip())
+    without = summary.get(WITHOUT_UPDATE, [])
+    lines += [f"no update was made: {', '.join(without)}"] if without else []
     return "\n".join([*lines, *_effort(summary)])
 
 

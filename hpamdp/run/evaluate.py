@@ -64,7 +64,7 @@ class Evaluation:
             - what the environment's `describe` and `results` give.
 
         Raises:
-            ProblemError: the return of an episode is not finite.
+            ProblemError: the return of an episode is not finite, or an episode is longer than `max_steps`.
         """
         device = self.env.device
         td = self._reset()
@@ -96,6 +96,9 @@ class Evaluation:
         if not total.isfinite().all():
             row = int((~total.isfinite()).nonzero()[0])
             raise ProblemError(f"{self.problem.title}: the return of evaluation episode {row} is {total[row].item()}")
+        if not over.all():
+            row, limit = int((~over).nonzero()[0]), self.env.max_steps
+            raise ProblemError(f"{self.problem.title}: evaluation episode {row} has not ended after max_steps={limit}")
         played: dict[str, Tensor] = {"return": total, "steps": steps, "score": total, **self.known}
         if options[0] is not None:
             played["option"] = options[0]

@@ -17,7 +17,7 @@ from hpamdp.config import Config
 from hpamdp.files import replacing
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
-from hpamdp.run.closing_table import closing_table
+from hpamdp.run.closing_table import WITHOUT_UPDATE, closing_table
 from hpamdp.run.folder import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 from hpamdp.run.loggers import CSVLogger, EarlierRun, Guarded, Logger
 from hpamdp.run.metrics import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
@@ -139,6 +139,8 @@ class Recorder:
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random, effort, is_finished=is_finished)
+        if self.config.run.mode != "eval":
+            summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
         with replacing(self.output_dir / SUMMARY_NAME) as partial:
             partial.write_text(json.dumps(summary, indent=2) + "\n")
         logger = self._logger

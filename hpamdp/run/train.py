@@ -294,7 +294,9 @@ class Trainer:
             DivergedError: a reward or a loss is not finite.
         """
         if self.config.run.mode == "offline":
-            num = min(_UPDATES_A_TURN, self.config.run.num_frames - self.frames)
+            run = self.config.run
+            to_next_row = [every - self.frames % every for every in (run.eval_every, run.log_every) if every > 0]
+            num = min(_UPDATES_A_TURN, run.num_frames - self.frames, *to_next_row)
             scalars = self.parts.agent.update(num)
             check_scalars(scalars)
             self.recorder.take(None, scalars)

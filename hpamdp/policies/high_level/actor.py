@@ -110,6 +110,10 @@ class Actor(OnPolicy, Selector):
     def _allowed(self, td: TensorDictBase) -> dict[str, Tensor]:
         return {ALLOWED: td.get(keys.OPTION_MASK).clone()} if self.specs.has_option_mask else {}
 
+    def decisions_to_update(self) -> dict[str, int]:
+        """Return the size of a minibatch."""
+        return {"minibatch_size": self.minibatch_size}
+
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
         rows = self.gather(self._rows(decisions))

@@ -30,7 +30,7 @@ from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFra
 from hpamdp.policies.shared.masks import masked_values
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.portable import portable_ensemble
-from hpamdp.policies.shared.replay import linear_schedule
+from hpamdp.policies.shared.replay import first_multiple, linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -142,6 +142,11 @@ class MetaCritic(Selector):
             return is_worse
         random_share = 1.0 if self.is_uniform else self.epsilon
         return is_worse | (torch.rand(is_worse.shape, device=is_worse.device) < random_share)
+
+    def decisions_to_update(self) -> dict[str, int]:
+        """Return the lengths of the warm-up and of an update's share of decisions."""
+        share = first_multiple(self.updates_per_decision)
+        return {"warmup_decisions": self.warmup_decisions, "updates_per_decision": share}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions and, after the warm-up, make the updates that are due."""

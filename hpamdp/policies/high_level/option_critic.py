@@ -35,7 +35,7 @@ from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import masked_values, random_choice
 from hpamdp.policies.shared.networks import mlp, polyak_update
-from hpamdp.policies.shared.replay import linear_schedule
+from hpamdp.policies.shared.replay import first_multiple, linear_schedule
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -150,6 +150,10 @@ class OptionCritic(Selector):
         random_share = 0.0 if is_greedy() else 1.0 if self.is_uniform else self.epsilon
         beta = self._beta(td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_share)
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
+
+    def decisions_to_update(self) -> dict[str, int]:
+        """Return the lengths of the warm-up and of an update's share of steps; this selector learns from steps."""
+        return {"warmup_steps": self.warmup_steps, "updates_per_step": first_multiple(self.updates_per_step)}
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
         """Store the steps and, after the warm-up, make the updates that are due from stored ones."""

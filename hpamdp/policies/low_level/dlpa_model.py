@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from hpamdp.policies.shared.networks import EnsembleMLP
 from hpamdp.policies.shared.planning import Prediction
+from hpamdp.policies.shared.scales import scale_of
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -70,10 +71,9 @@ class PAMDPModel(nn.Module):
 
     def fit_scales(self, state: Tensor, next_state: Tensor) -> None:
         """Set the scales of inputs and targets from transitions `[B, observation_dim]`."""
-        # The lower bound keeps entries that never change from dividing by 0.
         self.state_mean.copy_(state.mean(0))
-        self.state_scale.copy_(state.std(0).clamp(min=1e-2))
-        self.change_scale.copy_((next_state - state).std(0).clamp(min=1e-2))
+        self.state_scale.copy_(scale_of(state))
+        self.change_scale.copy_(scale_of(next_state - state))
 
     def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Prediction:
         """Predict one step from states `[B, observation_dim]`, discrete actions `[B]`, parameters in [-1, 1]."""

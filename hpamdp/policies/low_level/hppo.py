@@ -156,6 +156,10 @@ class HPPO(OnPolicy, Learner):
         """Return the actor, unless it is to sample: see `hpamdp.policies.shared.portable`."""
         return None if self.policy.samples_when_greedy else portable_actor(self.policy.actor, self.specs)
 
+    def steps_to_update(self) -> dict[str, int]:
+        """Return the size of a minibatch."""
+        return {"minibatch_size": self.minibatch_size}
+
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.
 

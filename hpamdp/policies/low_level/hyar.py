@@ -69,6 +69,7 @@ from hpamdp.policies.shared.networks import (
     with_variations,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
+from hpamdp.policies.shared.scales import scale_of
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
@@ -458,9 +459,7 @@ class HyAR(ReplayLearner):
     def start(self) -> None:
         """Train the codec alone."""
         stored = self.buffer[:]
-        change = stored["next_state"] - stored["state"]
-        # The lower bound keeps entries that never change from dividing by 0.
-        self.codec.change_scale.copy_(change.std(0).clamp(min=1e-2))
+        self.codec.change_scale.copy_(scale_of(stored["next_state"] - stored["state"]))
         for _ in range(self.codec_pretrain_updates):
             self._update_codec(self.augmented(self.buffer.sample(self.batch_size)))
         self._fit_latent_range()

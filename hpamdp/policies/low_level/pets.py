@@ -54,6 +54,7 @@ from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.networks import EnsembleLinear
 from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, SequenceStep, discounted_return
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.scales import scale_of
 from hpamdp.specs import PAMDPSpecs
 
 MEMBER = "member"  # which member an environment follows, int64 [*B]
@@ -310,10 +311,10 @@ class PETSModel(nn.Module):
             terminated: bool `[B]`.
         """
         self.state_mean.copy_(turned.mean(0))
-        self.state_scale.copy_(_scale_of(turned))
+        self.state_scale.copy_(scale_of(turned))
         change = (next_turned - turned)[~terminated]
         if len(change) > 1:
-            self.change_scale.copy_(_scale_of(change))
+            self.change_scale.copy_(scale_of(change))
             self.is_changing.copy_((change.abs().amax(0) > 1e-6).float() * self.is_input)
             self._derive(change / self.change_scale)
             if self.has_linear_part:
@@ -321,10 +322,10 @@ class PETSModel(nn.Module):
         for place, rows in enumerate((reward[~terminated], reward[terminated])):
             if len(rows) > 1:
                 self.reward_mean[place] = rows.mean()
-                self.reward_scale[place] = _scale_of(rows)
+                self.reward_scale[place] = scale_of(rows)
         features = self.features(turned, next_turned)
         self.feature_mean.copy_(features.mean(0))
-        self.feature_scale.copy_(_scale_of(features))
+        self.feature_scale.copy_(scale_of(features))
 
     def _derive(self, change: Tensor) -> None:
         """Find the entries whose scaled changes `[B, observation_dim]` are linear in those of entries before them."""
@@ -372,11 +373,6 @@ def _scaled(rows: Tensor, mean: Tensor, scale: Tensor, mask: Tensor | None = Non
     """Return `(rows - mean) / scale * mask` in one pass."""
     factor = 1.0 / scale if mask is None else mask / scale
     return torch.addcmul(-mean * factor, rows, factor)
-
-
-def _scale_of(rows: Tensor) -> Tensor:
-    # The lower bound keeps entries that never change from dividing by 0.
-    return rows.std(0).clamp(min=1e-2)
 
 
 class PETSPolicy(TensorDictModuleBase):

@@ -432,6 +432,14 @@ class QPAMDP(Learner):
             self.register_buffer(name, torch.zeros((), dtype=torch.long))
         self.to(device)
 
+    def steps_to_update(self) -> dict[str, int]:
+        """Return the length of the warm-up and one step after it."""
+        return {"warmup_frames": max(0, self.warmup_frames - int(self.frames)) + 1}
+
+    def has_updated(self) -> bool:
+        """Return whether Sarsa has made an update, which leaves traces."""
+        return self.sarsa.traces.numel() > 0
+
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Collect the ranges of the features during the warm-up; then learn what the phase learns, and end it if due.
 

@@ -171,6 +171,10 @@ class Bandit(Selector):
             choices[rows] = chosen
         return choices
 
+    def has_updated(self) -> bool:
+        """Return whether any reward is known."""
+        return bool(self.statistics.counts.any())
+
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the rewards of finished decisions, oldest first; return the mean reward of each option."""
         self.num_decisions += len(decisions)

@@ -183,6 +183,10 @@ class LinearBandit(Selector):
         mean = masked_values(mean, None if mask is None else mask.flatten(0, -2))
         return mean.argmax(-1).reshape(observation.shape[:-1])
 
+    def has_updated(self) -> bool:
+        """Return whether any reward is known."""
+        return bool(self.statistics.counts.any())
+
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add finished decisions, oldest first; return the mean reward of each option among them."""
         options = decisions.get(keys.OPTION)

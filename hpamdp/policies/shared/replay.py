@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
@@ -126,6 +127,13 @@ class ReplayLearner(Learner):
         scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
         return {**scalars, "updates": self.updates.item()}
 
+    def steps_to_update(self) -> dict[str, int]:
+        """Return the lengths of the warm-up and of an update's share of steps."""
+        needed = {"warmup_frames": self.warmup_frames}
+        if self.updates_per_frame > 0.0:
+            needed["updates_per_frame"] = first_multiple(self.updates_per_frame)
+        return needed
+
     def updates_due(self, before: int, frames: int) -> int:
         """Return how many updates to make when the number of stored steps has risen from `before` to `frames`."""
         return int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
@@ -233,6 +241,11 @@ def set_learning_rates(
     for name, rate in rates.items():
         for group in optimizers[name].param_groups:
             group["lr"] = rate * fraction
+
+
+def first_multiple(updates_per_step: float) -> int:
+    """Return the number of steps, or of decisions, at which the first update is due."""
+    return math.ceil(1.0 / updates_per_step - 1e-9)
 
 
 def linear_schedule(time: int, over: int, final: float) -> float:

@@ -1,0 +1,68 @@
+"""A run that is too short to learn is refused, and one that has learned nothing says so."""
+
+import json
+
+import pytest
+import torch
+from conftest import compose_config, make_config
+from test_grid import SHORT
+
+from hpamdp.config import ConfigError
+from hpamdp.policies.base import have_stepped
+from hpamdp.run.assemble import assemble
+from hpamdp.run.train import run
+
+TINY = ["num_envs=16", "steps_per_batch=4", "eval.layouts=4", "eval.every=0"]
+
+
+@pytest.mark.parametrize(
+    ("total", "words", "setting", "needed", "most"),
+    [
+        (100, "high=ucb low=hyar num_envs=256", "low.warmup_frames=2000 (low=hyar)", "2,000", "1,024"),
+        (1984, "high=ucb low=hppo", "low.minibatch_size=2048 (low=hppo)", "2,048", "1,984"),
+        (65, "high=ucb low=pets low.updates_per_frame=0.005", "low.updates_per_frame=0.005 (low=pets)", "200", "128"),
+        (64, "high=ucb low=qpamdp low.warmup_frames=64", "low.warmup_frames=64 (low=qpamdp)", "65", "64"),
+        (640, "low=random +low.per_option={congruent:pdqn}", "low.warmup_frames=5000 (low=pdqn)", "5,000", "640"),
+        (640, "low=random high=meta_critic", "high.warmup_decisions=1000 (high=meta_critic)", "1,000", "640"),
+        (640, "low=random high=option_critic", "high.warmup_steps=2000 (high=option_critic)", "2,000", "640"),
+        (640, "low.freeze=true low=random high=actor", "high.minibatch_size=1024 (high=actor)", "1,024", "640"),
+    ],
+)
+def test_a_run_that_ends_before_a_first_update_is_refused(total, words, setting, needed, most, tmp_path):
+    with pytest.raises(ConfigError) as refusal:
+        assemble(make_config([*TINY, f"total_frames={total}", *words.split()]), tmp_path)
+    assert str(refusal.value) == (
+        f"{setting}: the first update comes after {needed} steps or decisions, but total_frames={total} gives at most "
+        f"{most}; set a larger total_frames or another {setting.partition('=')[0]}"
+    )
+    assert not [*tmp_path.iterdir()]
+
+
+def test_the_last_batch_counts_as_a_whole(tmp_path):
+    assemble(make_config([*TINY, "high=ucb", "low=hppo", "total_frames=1985"]), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "without"),
+    [
+        (["high=ucb", "low=hppo", *SHORT["hppo"]], []),
+        (["high=uniform", "low=random"], []),
+        (["high=fixed", "low=pets", *SHORT["pets"], "high.option=congruent"], ["low/incongruent"]),
+        (["high=meta_critic", "high.warmup_decisions=60", "high.updates_per_decision=0.1", "low=random"], ["high"]),
+    ],
+)
+def test_a_run_names_what_has_made_no_update(words, without, tmp_path, capsys):
+    given = [*TINY, "total_frames=128", *words]
+    assert run(compose_config(given), tmp_path, given) == 0
+    assert json.loads((tmp_path / "summary.json").read_text())["without_update"] == without
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("no update was made")]
+    assert lines == ([f"no update was made: {', '.join(without)}"] if without else [])
+
+
+def test_optimizers_tell_whether_they_have_stepped_if_they_can():
+    weight = torch.nn.Parameter(torch.ones(1))
+    adam, plain = torch.optim.Adam([weight]), torch.optim.SGD([weight])
+    assert have_stepped({}) and have_stepped({"plain": plain}) and not have_stepped({"adam": adam, "plain": plain})
+    weight.sum().backward()
+    adam.step()
+    assert have_stepped({"adam": adam, "plain": plain})
