@@ -162,6 +162,7 @@ def masked(row, name=keys.ACTION_MASK):
         (spoilt(keys.OBSERVATION, (3, 1), np.nan), SPECS, r"row 3: observation[1] is nan, but must be finite"),
         (spoilt(("next", keys.OBSERVATION), (0, 0), np.inf), SPECS, "row 0: next.observation[0] is inf, but must be"),
         (spoilt(("next", keys.REWARD), 4, np.nan), SPECS, "row 4: next.reward is nan, but must be finite"),
+        (spoilt(("next", keys.REWARD), slice(None), 2e38), SPECS, "row 1: next.option_return is inf, but must be"),
         (spoilt(keys.PARAMETERS, (2, 3), np.nan), SPECS, "row 2: action.parameters[3] is nan, but must be finite"),
         (
             spoilt(keys.PARAMETERS, (2, 0), 1e6, spoilt(keys.DISCRETE, 2, 0)),
@@ -259,7 +260,7 @@ def test_wrong_decisions_are_told_with_their_row():
     Demonstrations(rows, decisions=given).check(WITH_OPTIONS)
     for name, value, said in (
         (keys.OPTION, 7, "row 1: option is 7, but must be 0 to 1"),
-        (("next", keys.OPTION_RETURN), np.inf, "row 1: next.option_return is inf, but must be finite"),
+        (("next", keys.OPTION_RETURN), np.inf, "row 1: next.option_return is inf, but must be"),
         (("next", keys.OPTION_STEPS), 0, "row 1: next.option_steps is 0, but must be at least 1"),
         (("next", keys.DECISION_OBSERVATION), np.nan, "row 1: next.decision_observation[0] is nan"),
     ):

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -198,6 +199,9 @@ def test_what_is_no_file_of_episodes_is_refused_in_a_line_and_blocks_nobody(tmp_
     path = tmp_path / "a.jsonl"
     make(path)
     page = BoatPage(seed=0)
+    for name in (tmp_path, "", "/", ".."):
+        with pytest.raises(EpisodeError, match="is a folder, but must be a regular file"):
+            EpisodeFile(Path(name), page)
     for read, error in ((played_file.read, DataError), (lambda path: EpisodeFile(path, page), EpisodeError)):
         with pytest.raises(error, match=said) as refused:
             read(path)

@@ -86,6 +86,15 @@ def check_transitions(rows: TensorDict) -> None:
     _check_rules(what, rows, _transition_rules(rows))
 
 
+def check_returns(rows: TensorDict) -> None:
+    """Check that the rewards of each episode of transitions `[N]` add up to a number.
+
+    Raises:
+        DataError: a sum is too large.
+    """
+    _check_rules("the transitions", rows, _finite(rows, ("next", keys.OPTION_RETURN)))
+
+
 def check_decisions(rows: TensorDict) -> None:
     """Check decisions `[K]` that stand for themselves; `Demonstrations` has the contract.
 

@@ -6,7 +6,14 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data.checks import TRAJECTORY, check_actions, check_decisions, check_options, check_transitions
+from hpamdp.data.checks import (
+    TRAJECTORY,
+    check_actions,
+    check_decisions,
+    check_options,
+    check_returns,
+    check_transitions,
+)
 from hpamdp.data.errors import DataError
 from hpamdp.specs import PAMDPSpecs
 
@@ -44,7 +51,9 @@ class Demonstrations:
         self, transitions: TensorDict, device: torch.device | None = None, *, decisions: TensorDict | None = None
     ) -> None:
         check_transitions(transitions)
-        self.batch = _batch(with_option_sums(transitions), device)
+        with_sums = with_option_sums(transitions)
+        check_returns(with_sums)
+        self.batch = _batch(with_sums, device)
         self.decisions = None
         if decisions is not None:
             check_decisions(decisions)

@@ -72,7 +72,7 @@ class EpisodeFile:
         self.page = page
         self.num_added = 0
         self._lock = threading.Lock()
-        lock_path = path.with_name(f".{path.name[:_NAME_LENGTH]}.lock")
+        lock_path = path.parent / f".{path.name[:_NAME_LENGTH]}.lock"
         self._file_lock = FileLock(lock_path)
         self._known: set[str] = set()
         self._read_to = 0  # bytes of the file whose episodes are known
