@@ -11,6 +11,7 @@ import re
 import sys
 import textwrap
 import uuid
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -120,6 +121,8 @@ def _main() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # TorchRL logs every replay buffer that it fills.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    # Hydra warns of a folder that is not there, which `read` refuses.
+    warnings.filterwarnings("ignore", message="provider=hydra.searchpath")
     try:
         _check_surroundings()
         if sys.argv[1:2] and sys.argv[1] in _COMMANDS:

@@ -31,6 +31,7 @@ from pydantic import (
     Field,
     NonNegativeInt,
     PositiveInt,
+    PydanticUserError,
     ValidationError,
     create_model,
 )
@@ -53,6 +54,16 @@ GROUPS: dict[str, tuple[str, ...]] = {
 RUN_FILE = "conf/config.yaml"
 TARGET = "_target_"
 NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
+RECIPE = "recipe"
+# What a class of each group has to be: derived from this one, or with its methods if it is a protocol.
+_KINDS = {
+    "env": "hpamdp.env.base.PAMDPEnv",
+    "high": "hpamdp.policies.base.Selector",
+    "low": "hpamdp.policies.base.Learner",
+    "data": "hpamdp.data.demonstrations.Demonstrations",
+    "logger": "hpamdp.run.loggers.Logger",
+    "collector": "hpamdp.run.collection.base.Collection",
+}
 
 _CAN_BE_NONE = ("high", "data")
 _MOST_COMPLAINTS = 3
@@ -353,7 +364,28 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     own = cfg.copy()
     OmegaConf.set_struct(own, False)
     own.pop("hydra", None)
+    if "hydra" in cfg or HydraConfig.initialized():
+        _check_found(cfg.hydra if "hydra" in cfg else HydraConfig.get(), names)
     return check(plain(own), names)
+
+
+def _check_found(node: Any, names: Mapping[str, str]) -> None:
+    """Refuse what Hydra leaves out in silence if it is not there: a recipe, a folder of yaml files.
+
+    Args:
+        node: the config's `hydra` part.
+        names: the name that was chosen for each group.
+    """
+    for path in node.searchpath:
+        scheme, _, folder = str(path).rpartition("://")
+        if scheme in ("", "file") and not Path(folder).is_dir():
+            raise ConfigError(f"hydra.searchpath={path}: there is no such folder")
+    recipe = names.get(RECIPE)
+    is_said = any(word.startswith(f"{RECIPE}=") for word in _words_of(node))
+    if recipe is None or (recipe == f"{names['env']}_{names['low']}" and not is_said):
+        return
+    if recipe not in names_of(RECIPE):
+        raise ConfigError(f"{RECIPE}={recipe}: {no_such(f'file in conf/{RECIPE}', recipe, names_of(RECIPE))}")
 
 
 def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
@@ -377,6 +409,8 @@ def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
             raise ConfigError(f"low.budget={_as_json(budget)}: must be a mapping ({file})")
         _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
+    for group in GROUPS:
+        _check_kind(group, names[group], given[group].get(TARGET))
     components = {group: component(group, names[group], given[group]) for group in GROUPS}
     low_of = _learners_of_options(run, names["env"])
     if low_of:
@@ -403,6 +437,7 @@ def _learners_of_options(run: RunConfig, env: str) -> dict[str, Component]:
         except ConfigError as error:
             raise ConfigError(f"{where}={name}: there is no {_file('low', name)}") from error
         yaml = plain_groups(cfg, run.model_dump(), ["low"])["low"]
+        _check_kind("low", name, yaml.get(TARGET))
         learners[option] = component("low", name, {**yaml, **given})
     return learners
 
@@ -438,7 +473,11 @@ def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
 
 def job_overrides() -> list[str]:
     """Return the words of the running job's command line, as they were written."""
-    words = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+    return _words_of(HydraConfig.get())
+
+
+def _words_of(node: Any) -> list[str]:
+    words = OmegaConf.to_container(node.overrides.task, resolve=False)
     assert isinstance(words, list)
     return [str(word) for word in words]
 
@@ -537,7 +576,7 @@ def compose(overrides: list[str]) -> DictConfig:
 def names_of(group: str) -> tuple[str, ...]:
     """Return the names of a group's yaml files in all folders that are searched."""
     try:
-        compose([f"{group}=__none__"])
+        compose([f"+{group}@__none__=__none__"])  # added to the group's own choice, which may be optional
     except MissingChoiceError as error:  # Hydra lists the names only here.
         return error.known
     return ()
@@ -576,6 +615,27 @@ def _load_target(group: str, target: Any, file: str) -> type:
         return load_class(str(target))
     except ConfigError as error:
         raise ConfigError(f"{group}.{TARGET}={error} ({file})") from error
+
+
+def _check_kind(group: str, name: str, target: object) -> None:
+    """Refuse a class that is none of the group's kind, or that leaves a method to its subclasses."""
+    if target is None and group in _CAN_BE_NONE:
+        return
+    file = _file(group, name)
+    cls, kind = _load_target(group, target, file), load_class(_KINDS[group])
+    of_kind = f"{kind.__name__} ({kind.__module__})"
+    given = f"{group}={name}: {cls.__name__}"
+    if getattr(kind, "_is_protocol", False):
+        methods = [method for method in vars(kind) if not method.startswith("_")]
+        lacks = [method for method in methods if not callable(getattr(cls, method, None))]
+        if lacks:
+            raise ConfigError(f"{given} is no {of_kind}; it lacks {', '.join(lacks)} ({file})")
+    elif not issubclass(cls, kind):
+        raise ConfigError(f"{given} is no {of_kind}; derive it from {kind.__name__} ({file})")
+    left = [method for method in dir(cls) if getattr(getattr(cls, method, None), "__isabstractmethod__", False)]
+    if left or cls is kind:
+        missing = f", which have {', '.join(left)}" if left else ""
+        raise ConfigError(f"{given} is abstract; choose one of its subclasses{missing} ({file})")
 
 
 def no_such_option(node: Mapping[str, Any], name: str, file: str) -> str:
@@ -617,7 +677,10 @@ def _schema(cls: type, supplied: Iterable[str]) -> type[BaseModel]:
             continue
         default = ... if argument.default is argument.empty else argument.default
         fields[name] = (hints.get(name, Any), default)
-    return create_model(cls.__name__, __config__=_STRICT, **fields)
+    try:
+        return create_model(cls.__name__, __config__=_STRICT, **fields)
+    except PydanticUserError as error:
+        raise ConfigError(f"{cls.__name__}: has an argument that no yaml file can hold: {first_line(error)}") from error
 
 
 def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what: str, where: str) -> Any:

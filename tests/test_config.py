@@ -12,6 +12,7 @@ from pydantic import Field, PositiveInt
 
 from hpamdp import config as config_module
 from hpamdp.config import GROUPS, ConfigError, component, load_class, read
+from hpamdp.policies.low_level.random import Random
 from hpamdp.run.train import run
 from hpamdp.saved_config import read_saved
 
@@ -115,6 +116,69 @@ def test_an_unknown_option_gets_the_likely_one_first_and_then_all():
 def test_all_problems_come_in_one_line():
     line = mistake_in(size=0, rate=2, siz=3)
     assert all(f"low.{name}" in line for name in ("size=0", "rate=2", "siz:")) and line.count("; ") >= 2
+
+
+@pytest.mark.parametrize(
+    ("group", "target", "complaint"),
+    [
+        ("logger", "builtins.int", "logger=csv: int is no Logger (hpamdp.run.loggers); it lacks log, images, film, s"),
+        ("logger", "hpamdp.run.loggers.Logger", "logger=csv: Logger is abstract; choose one of its subclasses (conf/"),
+        ("logger", "json.dumps", "logger._target_=json.dumps: there is no class dumps in json (conf/logger/csv.yaml)"),
+        ("logger", "os.path", "logger._target_=os.path: there is no class path in os (conf/logger/csv.yaml)"),
+        ("collector", "enum.Enum", "collector=single: Enum is no Collection (hpamdp.run.collection.base); derive it "),
+        (
+            "collector",
+            "hpamdp.run.collection.workers.WorkerCollection",
+            "collector=single: WorkerCollection is abstract; choose one of its subclasses, which have _start (conf/",
+        ),
+        ("data", "hpamdp.run.loggers.CSVLogger", "data=none: CSVLogger is no Demonstrations (hpamdp.data.demonstrat"),
+        ("data", "hpamdp.data.demonstrations.Demonstrations", "data=none: Demonstrations is abstract; choose one of "),
+        ("env", "hpamdp.env.base.PAMDPEnv", "env=boatdock: PAMDPEnv is abstract; choose one of its subclasses, which"),
+        ("env", "hpamdp.env.choice.OptionChoiceEnv", "OptionChoiceEnv: has an argument that no yaml file can hold: U"),
+        ("high", "torch.nn.Module", "high=ucb: Module is no Selector (hpamdp.policies.base); derive it from Selector "),
+        ("low", "hpamdp.policies.shared.replay.ReplayLearner", "low=hyar: ReplayLearner is abstract; choose one of "),
+    ],
+)
+def test_a_class_that_is_none_of_the_kind_is_told_in_one_line(group, target, complaint):
+    cfg = compose_config([])
+    cfg[group]._target_ = target
+    with pytest.raises(ConfigError) as error:
+        read(cfg)
+    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
+
+
+class NotToBeSet(Random):
+    """A learner with an argument that is a value of the run."""
+
+    def __init__(self, specs: object, *, freeze: bool) -> None:
+        raise AssertionError(freeze)
+
+
+def test_an_argument_called_as_a_value_of_the_run_in_its_group_is_refused_in_one_line():
+    cfg = compose_config(["low=random"])
+    cfg.low._target_ = f"{__name__}.NotToBeSet"
+    with pytest.raises(
+        ConfigError, match=r"low=random: NotToBeSet has an argument freeze, but low.freeze is a value of"
+    ):
+        read(cfg)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["recipe=goal_pdqm"], "recipe=goal_pdqm: no such file in conf/recipe; did you mean goal_pdqn? It has "),
+        (["recipe=boatdock_hyar"], "recipe=boatdock_hyar: no such file in conf/recipe; did you mean "),
+        (["hydra.searchpath=[/nowhere]"], "hydra.searchpath=/nowhere: there is no such folder"),
+    ],
+)
+def test_what_hydra_leaves_out_in_silence_is_refused_in_one_line(words, complaint):
+    with pytest.raises(ConfigError) as error:
+        make_config(words)
+    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
+
+
+def test_a_recipe_of_another_problem_can_be_chosen():
+    assert make_config(["low=pdqn", "high=ucb", "recipe=goal_pdqn"]).low.options["reward_scale"] == 0.02
 
 
 def test_a_bug_in_a_constructor_is_no_mistake_of_the_users():

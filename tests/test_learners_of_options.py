@@ -35,6 +35,18 @@ def test_the_other_options_keep_the_learner_of_the_run():
     assert read_saved(config.to_dict()) == config
 
 
+def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_of_the_run():
+    words = ["env=goal", "high=ucb", "low=pdqn", "+env.options=default", "total_frames=1234"]
+    own = "+low.per_option={shoot: {name: hppo, clip: 0.3}, kick: qpamdp, dribble: pdqn}"
+    config = make_config([*words, own])
+    recipe = make_config(["env=goal", "high=none", "low=qpamdp"]).low.options
+    assert config.low_of["kick"].options == recipe != make_config(["low=qpamdp"]).low.options
+    assert config.low_of["dribble"].options == config.low.options
+    hppo = make_config(["env=goal", "high=none", "low=hppo", "low.clip=0.3", "total_frames=1234"]).low.options
+    assert config.low_of["shoot"].options == hppo and hppo["anneal_frames"] == 1234
+    assert read_saved(config.to_dict()) == config
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
@@ -45,6 +57,22 @@ def test_the_other_options_keep_the_learner_of_the_run():
             'low.per_option.jump={"lr": 3}: must be the name of a learner, or its name',
         ),
         (["+low.per_option={jump: {name: random, lr: 3}}"], "low.lr: no such option of Random (conf/low/random.yaml)"),
+        (
+            ["+low.per_option={jump: ../low/random}"],
+            'low.per_option.jump="../low/random": must be the name of a learner',
+        ),
+        (
+            ["+low.per_option={jump: {name: random, _target_: os.PathLike}}"],
+            "low.per_option.jump._target_: the class is that of the yaml file; give its name",
+        ),
+        (
+            ["+low.per_option={jump: {name: random, budget: {num_envs: 3}}}"],
+            "low.per_option.jump.budget: a run has one budget; set total_frames, num_envs, steps_per_batch or ",
+        ),
+        (
+            ["+low.per_option={jump: {name: random, checkpoint: a}}"],
+            "low.per_option.jump.checkpoint: a checkpoint fills all learners; set low.checkpoint",
+        ),
         (["+low.per_option={jump: bc}"], "mode=train: low=bc learns from data sets only"),
         (
             ["+low.per_option={jump: random}", "agent.sharing=shared"],

@@ -21,6 +21,7 @@ from hpamdp.saved_config import read_saved
 
 TINY = ["num_envs=2", "steps_per_batch=2", "total_frames=8", "eval.layouts=2", "eval.every=0", "film=false"]
 TOY = ["env=gymnasium", "env.entry_point=toy_environments:Toy", "env.kwargs={length:4}", "env.max_steps=6"]
+AGENTS = Path(__file__).resolve().parent.parent / "agents"
 MOST = max(len(choices(group)) for group in GROUPS)
 
 
@@ -198,6 +199,18 @@ def test_guarded_settings_are_taken_if_they_are_said_again_or_the_file_is_truste
     assert "trust" not in yaml.safe_load(Path("b/config.yaml").read_text())
     assert "has no pictures" in command("watch", str(of_toy), "trust=true")[2]
     assert "has no pictures" in command("watch", str(of_toy), *said)[2]
+
+
+def test_play_takes_a_guarded_setting_of_an_agent_if_it_is_said_again_or_the_file_is_trusted(command, tmp_path):
+    policy = torch.load(AGENTS / "hppo_congruent/policy.pt", weights_only=True)
+    progress = json.loads(policy["progress"])
+    progress["config"]["env"]["recording"] = "gone.jsonl"
+    torch.save(policy | {"progress": json.dumps(progress)}, tmp_path / "policy.pt")
+    play = ["play", f"--agent={tmp_path}", "--export=site"]
+    assert 'env.recording="gone.jsonl": set by' in command(*play)[2]
+    # Then the file is looked for.
+    assert "there is no such file" in command(*play, "trust=true")[2]
+    assert command(*play, "env.recording=null")[0] == 0
 
 
 def test_no_file_gives_itself_trust(of_toy, command, tmp_path):

@@ -23,7 +23,7 @@ from hpamdp.env.decisions import with_decisions
 from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
 from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.specs import PAMDPSpecs
@@ -63,7 +63,6 @@ def assemble(config: Config, output_dir: Path) -> Parts:
     Raises:
         ConfigError: values that do not go together, that a constructor refuses, or for which there is no memory.
     """
-    check_classes(config)
     device = config.run.resolve_device()
     check_run_memory(config, device)
     env = make_env(config, config.run.num_envs, device, config.run.seed)
@@ -243,19 +242,6 @@ def _gamma(agent: HierarchicalAgent) -> float:
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
     is_learned = config.run.agent.termination == "learned"
     return with_decisions(env, gamma, math.inf if is_learned else config.run.agent.option_length)
-
-
-def check_classes(config: Config) -> None:
-    """Refuse a class in the wrong group.
-
-    Raises:
-        ConfigError: with the class that it would have to be derived from.
-    """
-    bases: list[tuple[Component, type]] = [(config.env, PAMDPEnv), (config.high, Selector)]
-    bases += [(low, Learner) for low in config.learners]
-    for component, base in bases:
-        if component.cls is not None and not issubclass(component.cls, base):
-            raise ConfigError(f"{component}: {component.cls.__name__} is no {base.__name__} ({base.__module__})")
 
 
 def check_run_memory(config: Config, device: torch.device) -> None:

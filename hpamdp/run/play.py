@@ -19,11 +19,12 @@ from hpamdp.env.page import EpisodeError, Page
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, reason_of, say, warn
 from hpamdp.regular_files import read_regular
-from hpamdp.run.assemble import check_classes, make_env
+from hpamdp.run.assemble import make_env
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.folder import POLICY_NAME, SUMMARY_NAME
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.run.players import Player, load_player, split_words, whole_number
+from hpamdp.run.resume import saved_choices
 from hpamdp.saved_config import choices_of
 
 _DESCRIPTION = """\
@@ -45,7 +46,12 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         ConfigError: a wrong word, no such agent, or a problem that has no page.
     """
     parser.description = _DESCRIPTION
-    parser.add_argument("settings", nargs="*", metavar="KEY=VALUE", help="of the problem, such as env=NAME")
+    parser.add_argument(
+        "settings",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="of the problem, such as env=NAME; trust=true trusts the files of agents",
+    )
     parser.add_argument(
         "--agent", action="append", metavar="FOLDER", help="an agent to play beside you; none: no agent"
     )
@@ -61,7 +67,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         raise ConfigError(f"{path}: not KEY=VALUE; give an agent as --agent {path}")
     config = read(compose_words(settings))
     page = _page(config, options.seed)
-    agents = own_agents(config) if options.agent is None else given_agents(options.agent)
+    agents = own_agents(config) if options.agent is None else given_agents(options.agent, config, settings)
     try:
         data = page.data(agents, has_server=options.export is None)
     except EpisodeError as error:
@@ -75,7 +81,6 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
 
 def _page(config: Config, seed: int) -> Page:
     torch.set_num_threads(config.run.threads)
-    check_classes(config)
     env = make_env(config, 1, config.run.resolve_device(), 0)
     try:
         page = env.page(seed)
@@ -98,8 +103,13 @@ def own_agents(config: Config) -> list[dict[str, Any]]:
     return [agent for agent in agents if agent is not None]
 
 
-def given_agents(names: Sequence[str]) -> list[dict[str, Any]]:
+def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) -> list[dict[str, Any]]:
     """Return the agents in these folders as a page takes them.
+
+    Args:
+        names: the folders; `none` stands for no agent.
+        config: of the problem that the page shows.
+        settings: the words that made it.
 
     Raises:
         ConfigError: no such agent, or one that a page cannot take.
@@ -108,13 +118,25 @@ def given_agents(names: Sequence[str]) -> list[dict[str, Any]]:
     for name in names:
         if name == "none":
             continue
-        player = load_player(name, _ONE_EPISODE)
+        player = load_player(name, [*_ONE_EPISODE, *_permissions(name, config, settings)])
         agent = _agent(Path(name), player)
         if agent is None:
-            config = player.config
-            raise ConfigError(f"--agent {name}: {config.high} over {config.low} cannot be taken into a page")
+            raise ConfigError(
+                f"--agent {name}: {player.config.high} over {player.config.low} cannot be taken into a page"
+            )
         agents.append(agent)
     return agents
+
+
+def _permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]:
+    """Return the settings of the problem that an agent's own config cannot set unasked, and `trust`."""
+    is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
+    given = [word.partition("=") for word in settings]
+    return [
+        f"{key}={value}"
+        for key, _, value in given
+        if key == "trust" or (is_same_problem and config.env.is_guarded(key.removeprefix("env."), value))
+    ]
 
 
 def _agent(path: Path, player: Player) -> dict[str, Any] | None:

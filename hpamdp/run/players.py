@@ -13,7 +13,7 @@ import torch
 from hpamdp.config import Config, ConfigError, compose_words, read
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import check_choice, check_classes, make_agent, make_env, make_evaluation
+from hpamdp.run.assemble import check_choice, make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.resume import check_saved_options, resolve, saved_choices
 from hpamdp.specs import PAMDPSpecs
@@ -70,7 +70,6 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     config, source = _config(path, list(settings))
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
-    check_classes(config)
     device = config.run.resolve_device()
     env = make_env(config, 1, device, config.run.seed)
     check_choice(config, env)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config import GROUPS, Config, ConfigError, chosen_names, plain, read
+from hpamdp.config import GROUPS, RECIPE, Config, ConfigError, chosen_names, plain, read
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import warn
 from hpamdp.run import checkpoint
@@ -18,7 +18,7 @@ from hpamdp.saved_config import choices_of, in_todays_form, read_saved
 from hpamdp.shell import setting
 
 # Parts of the config that make the agent what it is.
-_AGENT = ("high", "low", "agent", "experiment", "search")
+_AGENT = ("high", "low", "agent", "experiment", "search", RECIPE)
 # How the saved run began does not matter to one that starts from it.
 _BEGIN = ("mode", "resume", "checkpoint", "overwrite", "trust")
 # Groups that an evaluation does not take from the saved run: it collects no steps and logs where the command line says.

@@ -18,6 +18,7 @@ Film an agent at its problem.
 
   hpamdp watch outputs/2025-01-31/12-00-00                 a run's agent
   hpamdp watch agents/linucb_hppo --to a.mp4 --episodes 9  one that comes with the code; .mp4 needs hpamdp[video]
+  hpamdp watch outputs/shared trust=true                   somebody else's, whose environment may run code
   hpamdp watch low=planner high=oracle                     the best plan
   hpamdp watch low=random high=none env=platform           random actions on another problem
 """

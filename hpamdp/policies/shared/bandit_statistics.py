@@ -6,6 +6,7 @@ long as their episodes.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -126,6 +127,7 @@ class Bandit(Selector):
         self.statistics = RewardStatistics(specs.num_options, memory, discount, window)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
 
+    @abstractmethod
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
         """Return `num` exploring choices, int64 `[num]`, for decisions that are due at the same time.
 

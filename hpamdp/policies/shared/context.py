@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from abc import abstractmethod
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -162,6 +163,7 @@ class LinearBandit(Selector):
             "coefficients": theta.tolist(),
         }
 
+    @abstractmethod
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return a score for each option, `[B, num_options]`; exploring choices take the highest.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
@@ -223,6 +224,7 @@ class ReplayLearner(Learner):
     def explore(self, frames: int) -> None:
         """Set the policy's exploration for `frames` steps after the warm-up."""
 
+    @abstractmethod
     def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Make one update from a sample of `sample_batches`; return scalars to log."""
         raise NotImplementedError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -25,6 +26,7 @@ class Collection:
     has_workers: ClassVar[bool] = False  # whether other processes step the environments
     cpu_s: float = 0.0  # spent collecting in other processes
 
+    @abstractmethod
     def next(self) -> TensorDictBase:
         """Collect a batch `[num_envs, steps_per_batch]`.
 
@@ -33,6 +35,7 @@ class Collection:
         """
         raise NotImplementedError
 
+    @abstractmethod
     def state(self) -> dict[str, Any]:
         """Return the state of the collection for a checkpoint.
 
@@ -41,6 +44,7 @@ class Collection:
         """
         raise NotImplementedError
 
+    @abstractmethod
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state`.
 

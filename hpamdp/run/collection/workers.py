@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -67,6 +68,7 @@ class WorkerCollection(Collection):
         self._thread = ThreadPoolExecutor(max_workers=1)
         self._is_idle = True
 
+    @abstractmethod
     def _start(self, shares: Sequence[EnvShard], config: Config) -> Any:
         """Start a worker for each share, and return TorchRL's collector of them."""
         raise NotImplementedError
