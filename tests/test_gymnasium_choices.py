@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
@@ -147,6 +149,21 @@ def test_a_mask_that_allows_nothing_is_told_in_one_line():
     env = make(2, source="info", action_mask="info", mask=np.zeros(2))
     with pytest.raises(ProblemError, match="Masked: environment 0 gave an action_mask that allows nothing"):
         env.reset()
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (5, "is 5, but must be a list of names"),
+        ("slow", "is 'slow', but must be a list of names"),
+        (("slow", 1, "fast"), "is ('slow', 1, 'fast'), but must"),
+        (["slow", "slow", "fast"], "has a name twice: slow, slow, fast"),
+    ],
+)
+def test_names_of_options_that_are_no_list_of_names_are_told_in_one_line(names, said, monkeypatch):
+    monkeypatch.setattr(Masked, "option_names", names)
+    with pytest.raises(ValueError, match=re.escape(f"Masked: option_names {said}")):
+        make(form="dict")
 
 
 @pytest.mark.parametrize("form", ["dict", "flat dict", "tuple"])

@@ -210,7 +210,9 @@ class GymnasiumEnv(PAMDPEnv):
             raise ValueError(f"{self._name}: {one_line(error)}") from error
         except (TypeError, ValueError) as error:
             cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
-            if not _is_about_the_call(cause):
+            # A constructor may pass on what it does not know itself.
+            is_unknown = any(f"unexpected keyword argument '{name}'" in str(cause) for name in kwargs)
+            if not (is_unknown or _is_about_the_call(cause)):
                 raise
             raise ValueError(f"{self._name}: {one_line(cause)}") from error
         if not isinstance(env, gymnasium.Env):
@@ -236,7 +238,13 @@ class GymnasiumEnv(PAMDPEnv):
 
     def _names_of_options(self) -> tuple[str, ...]:
         num_options = self._options.num_options
-        names = tuple(map(str, getattr(self.envs[0].unwrapped, "option_names", ())))
+        given = getattr(self.envs[0].unwrapped, "option_names", ())
+        given = () if given is None else given
+        if not isinstance(given, list | tuple) or not all(isinstance(name, str) for name in given):
+            raise ValueError(f"{self._name}: option_names is {given!r:.80}, but must be a list of names")
+        names = tuple(given)
+        if len({*names}) < len(names):
+            raise ValueError(f"{self._name}: option_names has a name twice: {', '.join(names)}")
         return names if num_options and len(names) == num_options else tuple(f"option{i}" for i in range(num_options))
 
     def _make_specs(self) -> None:
