@@ -93,6 +93,19 @@ def test_selectors_learn_what_every_episode_returned_whatever_becomes_of_its_pre
     torch.testing.assert_close(decisions["next", keys.DECISION_OBSERVATION], fresh)
 
 
+@pytest.mark.parametrize("mode", ["offline", "train"])
+def test_a_learner_whose_option_is_not_in_the_data_makes_no_update_from_it(mode, path, tmp_path, monkeypatch, capsys):
+    demonstrations = HumanDemonstrations(BoatDockEnv(), path=path, rest_to_rest=False, **ALL)
+    demonstrations.batch[keys.OPTION].zero_()
+    monkeypatch.setattr("hpamdp.run.assemble.make_data", lambda *_: demonstrations)
+    given = [*overrides(path, "iql", "fixed"), f"mode={mode}", "high.option=incongruent"]
+    given += ["num_envs=8", "steps_per_batch=4", "total_frames=64", "low.warmup_frames=32"]
+    assert run(compose_config(given), tmp_path, given) == 0
+    printed = capsys.readouterr().out
+    assert "no update was made: low/congruent\n" in printed
+    assert ("6 updates in " if mode == "offline" else "64 frames in ") in printed
+
+
 def test_where_the_boat_is_given_there_are_no_decisions(path):
     env = BoatDockEnv(controller="congruent")
     assert HumanDemonstrations(env, path=path, rest_to_rest=True, **ALL).decisions is None

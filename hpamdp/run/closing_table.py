@@ -65,7 +65,8 @@ def _is_known(value: Any) -> bool:
 def _effort(summary: Mapping[str, Any]) -> list[str]:
     parts = []
     if _is_known(summary.get(FRAMES)):
-        parts.append(f"{summary[FRAMES]:,.0f} frames")
+        unit = "updates" if summary.get("mode") == "offline" else "frames"
+        parts.append(f"{summary[FRAMES]:,.0f} {unit}")
     if _is_known(summary.get(WALL_SECONDS)):
         parts.append(duration(summary[WALL_SECONDS]))
     joint = " of training, evaluated in " if summary.get("mode") == "eval" else " in "

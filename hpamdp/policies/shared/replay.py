@@ -109,11 +109,14 @@ class ReplayLearner(Learner):
         self.descent.lower_precision()
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
-        """Store the transitions in `mask`."""
-        self.store(batch, mask)
+        """Store the transitions in `mask`, if there are any."""
+        if mask.any():
+            self.store(batch, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Make updates from the stored transitions."""
+        """Make updates from the stored transitions; none if a data set has nothing for this learner."""
+        if len(self.buffer) == 0:
+            return {}
         if int(self.frames) == int(self.updates) == 0:
             self.start()
         return self._make_updates(num_updates)
