@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -27,6 +28,7 @@ from hpamdp.config import ConfigError, job_overrides
 from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, say, warn
 from hpamdp.run.folder import ERROR_NAME, check_no_link, is_about_folder, locked, saved_summary
+from hpamdp.run.search import go_on
 from hpamdp.run.stopping import exits_told
 from hpamdp.shell import path_setting
 
@@ -52,9 +54,17 @@ class SweepDir(Callback):
         SweepDir.path = Path(config.hydra.sweep.dir).absolute()
         with suppress(OSError):  # Hydra fails for the same reason
             remove_link(SweepDir.path / "multirun.yaml")  # which Hydra writes
+        try:
+            first_job = go_on(config)
+        except ConfigError as error:
+            warn(str(error))
+            sys.exit(_MISTAKE)
+        if first_job is None:
+            say(f"{SweepDir.path}: this search has all of its trials; set hydra.sweeper.n_trials to add some")
+            sys.exit(0)
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
-        hydra.config_loader = JobConfigs(hydra.config_loader.get_search_path())
+        hydra.config_loader = JobConfigs(hydra.config_loader.get_search_path(), first_job)
 
 
 def _check_output_subdir(config: DictConfig) -> None:
@@ -69,22 +79,36 @@ class JobConfigs(ConfigLoaderImpl):
     """Composes the configs of jobs so that Hydra makes no folder for them.
 
     Hydra ends the whole sweep if it cannot make the folder of one job. `run_job` makes it instead.
+
+    Args:
+        search_path: where the yaml files are.
+        first_job: number of the first job, which a search that goes on does not count from 0.
     """
 
+    def __init__(self, search_path: ConfigSearchPath, first_job: int) -> None:
+        super().__init__(search_path)
+        self._first_job = first_job
+
     def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
-        """Return a job's config, whose folder below the sweep's is `hydra.sweep.job_subdir`."""
+        """Return a job's config, with the folder below the sweep's as `hydra.sweep.job_subdir`."""
         config = super().load_sweep_config(master_config, sweep_overrides)
         with open_dict(config.hydra.sweep):
             config.hydra.sweep.job_subdir = config.hydra.sweep._get_node("subdir")._value()
+            config.hydra.sweep.first_job = self._first_job
         config.hydra.sweep.subdir = "."
         config.hydra.output_subdir = None
         return config
 
 
 def _job_folder() -> Path:
-    """Return the current job's folder, and let Hydra's own settings name it, too."""
+    """Return the current job's folder, and let Hydra's own settings have it and the job's number, too."""
     hydra: Any = HydraConfig.get()
-    folder = Path(os.path.abspath(Path(hydra.sweep.dir, str(hydra.sweep.job_subdir))))
+    whole = hydra._get_root()  # in which the folder's name is resolved
+    number = hydra.job.num + hydra.sweep.first_job
+    for settings in (whole.hydra, hydra):
+        with read_write(settings):
+            settings.job.num = number
+    folder = Path(os.path.abspath(Path(hydra.sweep.dir, str(whole.hydra.sweep.job_subdir))))
     with read_write(hydra):
         hydra.runtime.output_dir = str(folder)
     return folder
@@ -146,9 +170,9 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     Raises:
         SystemExit: the user stopped it.
     """
+    folder = _job_folder()
     hydra = HydraConfig.get()
     overrides = job_overrides()
-    folder = _job_folder()
     job = Job(hydra.job.num, " ".join(overrides), str(folder))
     records = Records(Path(hydra.runtime.cwd, hydra.sweep.dir), start)
     if hydra.runtime.choices["hydra/launcher"] != "basic":
