@@ -3,12 +3,10 @@
 Importing it registers the Gymnasium ids of its problems and loads neither torch nor TorchRL.
 """
 
-import sys
-
-from hpamdp.search_path import put_working_directory_last
+from hpamdp.search_path import is_program, put_working_directory_last
 
 # `python -m` puts the working directory first, and the next import needs other packages.
-if sys.argv[:1] == ["-m"] and any(word.partition(".")[0] == "hpamdp" for word in sys.orig_argv):
+if is_program():
     put_working_directory_last()
 
 from hpamdp.env.registration import register

@@ -14,6 +14,7 @@ import uuid
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -423,6 +424,7 @@ def _is_choice(value: object) -> bool:
 def _run_job(cfg: DictConfig, start: str) -> float | None:
     """Run one job; return its score if it is one of a sweep."""
     put_working_directory_last()  # in a worker of a launcher, too
+    resource_tracker.ensure_running()  # which environments start, while it is protected
     unprotect_children()
     job = HydraConfig.get()
     if job.mode == RunMode.MULTIRUN:

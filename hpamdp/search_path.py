@@ -9,6 +9,14 @@ import sys
 _VARIABLE, _OURS = "PYTHONSAFEPATH", "hpamdp"
 
 
+def is_program() -> bool:
+    """Return whether this package is being imported to run its command line."""
+    started = sys.argv[0] if sys.argv else ""
+    if started == "-m":  # until Python has found the module
+        return any(word.partition(".")[0] == "hpamdp" for word in sys.orig_argv)
+    return os.path.basename(started) == "hpamdp" or os.path.realpath(started) == os.path.join(_root(), "run.py")
+
+
 def put_working_directory_last() -> None:
     """Let no file of the working directory, such as `torch.py`, take the place of an installed package.
 
@@ -37,4 +45,8 @@ def unprotect_children() -> None:
 
 
 def _is_clone(directory: str) -> bool:
-    return os.path.dirname(os.path.dirname(os.path.realpath(__file__))) == directory
+    return directory == _root()
+
+
+def _root() -> str:
+    return os.path.dirname(os.path.dirname(os.path.realpath(__file__)))

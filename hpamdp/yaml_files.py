@@ -32,6 +32,10 @@ class CheckedYamlFiles(FileConfigSource):
         return super().load_config(config_path)
 
 
+# Hydra in a worker of a launcher refuses a class of another name.
+CheckedYamlFiles.__name__ = FileConfigSource.__name__
+
+
 def check_size(file: Path) -> None:
     """Refuse a file that a few aliases make huge, or that nests too deep. Nothing is expanded for that.
 

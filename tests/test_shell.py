@@ -6,7 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import forked
+from conftest import CONF, forked
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
@@ -14,7 +16,9 @@ from omegaconf import OmegaConf
 from hpamdp import cli
 from hpamdp.messages import say
 from hpamdp.run import train
+from hpamdp.search_path import put_working_directory_last
 from hpamdp.shell import path_setting, setting
+from hpamdp.yaml_files import CheckedYamlFiles, check_before_hydra_reads
 
 FOLDERS = [
     "sweep",
@@ -215,3 +219,53 @@ def test_a_working_directory_that_is_gone_is_told_in_one_line(command, tmp_path)
     (tmp_path / "gone").rmdir()
     code, _, err = command("--help")
     assert code == 2 and err.startswith("the working directory is gone") and err.count("\n") == 1
+
+
+@pytest.fixture
+def hostile(tmp_path):
+    """Return a folder with files that have the names of installed packages, and a class of the user's own."""
+    for name in ("torch", "numpy", "json", "random", "yaml", "hydra", "gymnasium", "pickle", "socket", "argparse"):
+        (tmp_path / f"{name}.py").write_text(f"raise SystemExit('this is no {name}')\n")
+    (tmp_path / "mine.py").write_text("from hpamdp.policies.low_level.random import *\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize("start", [[str(CONF.parent / "run.py")], ["-m", "hpamdp"]], ids=["script", "module"])
+def test_no_file_of_the_working_directory_takes_the_place_of_a_package(hostile, start):
+    # The empty entry is the working directory.
+    environment = os.environ | {"PYTHONPATH": f"{CONF.parent}{os.pathsep}"}
+    words = ["low=random", "low._target_=mine.Nobody"]
+    done = subprocess.run(
+        [sys.executable, *start, *words], cwd=hostile, env=environment, capture_output=True, text=True
+    )
+    assert "there is no class Nobody in mine" in done.stderr and done.returncode == 2, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["collector=multi", "collector.num_workers=2"], ["-m", "hydra/launcher=joblib"]])
+def test_no_file_of_the_working_directory_takes_the_place_of_a_package_in_workers(hostile, words):
+    if "-m" in words:
+        pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    environment = os.environ | {"PYTHONPATH": str(CONF.parent)}
+    small = ["low=random", "num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4", "film=false"]
+    command = [sys.executable, "-m", "hpamdp", *words, *small]
+    done = subprocess.run(command, cwd=hostile, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_launchers_worker_that_registers_hydras_reader_again_keeps_ours():
+    check_before_hydra_reads()
+    SourcesRegistry.instance().register(FileConfigSource)
+    assert SourcesRegistry.instance().resolve("file") is CheckedYamlFiles
+
+
+def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_path):
+    root = str(CONF.parent)
+    monkeypatch.setattr(sys, "path", [root, "/packages"])
+    monkeypatch.chdir(root)
+    put_working_directory_last()
+    assert sys.path == [root, "/packages"]
+    monkeypatch.setattr(sys, "path", [str(tmp_path), root, "/packages", ""])
+    monkeypatch.chdir(tmp_path)
+    put_working_directory_last()
+    assert sys.path == [root, "/packages", str(tmp_path)]

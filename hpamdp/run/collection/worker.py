@@ -18,6 +18,7 @@ from torchrl.envs import TransformedEnv
 from hpamdp.config import Config
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import acting, make_agent, make_env
+from hpamdp.search_path import unprotect_children
 from hpamdp.specs import PAMDPSpecs
 
 _CPU = torch.device("cpu")
@@ -85,6 +86,7 @@ class EnvShard:
     def make_env(self) -> TransformedEnv:
         """Build the environments, with their decisions tracked."""
         _end_with_parent()
+        unprotect_children()
         torch.set_num_threads(1)
         agent = self._make_agent()
         if self.low is not None:

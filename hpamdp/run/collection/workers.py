@@ -18,6 +18,7 @@ from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection, WorkerDiedError
 from hpamdp.run.collection.worker import EnvShard, packed
+from hpamdp.search_path import protect_children, unprotect_children
 
 
 class WorkerCollection(Collection):
@@ -161,11 +162,13 @@ class WorkerCollection(Collection):
 
 @contextmanager
 def children_without(*numbers: signal.Signals) -> Iterator[None]:
-    """Block these signals in all processes that are started within the block."""
+    """Block these signals in all processes that are started within the block, and look for modules here last."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    protect_children()
     try:
         yield
     finally:
+        unprotect_children()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
