@@ -232,9 +232,17 @@ class MissingRows(Demonstrations):
         super().__init__(TensorDict(batch_size=[3]))
 
 
+class UnequalRows(Demonstrations):
+    """A data set of somebody's own with more actions than observations."""
+
+    def __init__(self) -> None:
+        super().__init__(episodes(3).set(keys.OBSERVATION, torch.zeros(2, 9)))
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [
+        ("UnequalRows", "its entries differ in length (batch dimension mismatch, "),
         ("OwnRows", "the transitions, row 3: action.parameters[2] is 1e+06, but must be 0 to 430"),
         ("MissingRows", "the transitions lack collector.traj_ids, observation, "),
     ],

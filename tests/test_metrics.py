@@ -89,6 +89,18 @@ def test_a_last_line_that_was_cut_off_is_left_out_and_never_appended_to(tmp_path
     assert [row["a"] for row in file.rows()] == [2.0, 2.5, 3.45]
 
 
+def test_a_file_of_something_else_has_no_rows(tmp_path, capsys):
+    path = tmp_path / "metrics.csv"
+    for data in (bytes(range(256)) * 99 + b"\n", b"\xff\xfea\0\n", b"a,b\n\0,x\n", b"[" * 9999):
+        path.write_bytes(data)
+        assert not any(read_rows(path))
+    path.write_bytes(b'a,b\n"' + b"1" * 200_000 + b"\n")
+    assert read_rows(path) == [] and "its rows are left out: field larger" in capsys.readouterr().err
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    assert read_rows(path) == []
+
+
 def test_a_resumed_file_starts_with_the_rows_up_to_the_frame(tmp_path):
     first = MetricsFile(tmp_path / "first" / "metrics.csv")
     for frames in (100, 200, 300):

@@ -210,6 +210,10 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
         demonstrations.check(PAMDPSpecs.from_env(env))
     except DataError as error:
         raise ConfigError(f"{config.data}: {first_line(error)}") from error
+    except RuntimeError as error:  # of tensordict, from the constructor of somebody's own data set
+        if "batch dimension mismatch" not in str(error):
+            raise
+        raise ConfigError(f"{config.data}: its entries differ in length ({first_line(error)})") from error
     try:
         demonstrations.discount(gamma)
     except DataError as error:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hpamdp.files import replacing
+from hpamdp.messages import warn
 
 FRAMES, WALL_SECONDS = "frames", "wall_s"
 STOPPED = "stopped"  # 1 in the row that was written because the run was stopped
@@ -21,11 +22,15 @@ def read_rows(path: Path) -> list[dict[str, float]]:
     """Read the rows of a `metrics.csv`, each with the columns it has a number for.
 
     A last line without its end was cut off while it was written, and is left out; cells that hold no number too.
-    A missing file has no rows.
+    A missing file has no rows, nor has a file of something else, which a warning names.
     """
-    text = path.read_text() if path.is_file() else ""
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     lines = text[: text.rfind("\n") + 1].splitlines()
-    return [dict(_numbers(cells)) for cells in csv.DictReader(lines)]
+    try:
+        return [dict(_numbers(cells)) for cells in csv.DictReader(lines)]
+    except csv.Error as error:
+        warn(f"{path} cannot be read, its rows are left out: {error}")
+        return []
 
 
 def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:
