@@ -80,10 +80,10 @@ def read_saved(
 
 
 def needs_trust(config: Config) -> bool:
-    """Return whether a run that starts from a run of this config needs `trust=true`."""
-    saved = config.to_dict()
-    today = plain_groups(compose([f"{group}={name}" for group, name in saved[_CHOICES].items()]), saved, GROUPS)
-    return bool(_guarded(config, saved, today, {}))
+    """Return whether a run that continues one of this config may need `trust=true`: a guarded setting is not null."""
+    parts = [getattr(config, group) for group in GROUPS if group != "data"] + [*config.low_of.values()]
+    settings = [(part, name, value) for part in parts for name, value in part.options.items()]
+    return any(value is not None and part.is_guarded(name, value) for part, name, value in settings)
 
 
 def _guarded(

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,7 @@ from hpamdp.config import GROUPS, Config, ConfigError
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.resume import check_saved_options
 from hpamdp.run.train import run
-from hpamdp.saved_config import read_saved
+from hpamdp.saved_config import needs_trust, read_saved
 
 TINY = ["num_envs=2", "steps_per_batch=2", "total_frames=8", "eval.layouts=2", "eval.every=0", "film=false"]
 TOY = ["env=gymnasium", "env.entry_point=toy_environments:Toy", "env.kwargs={length:4}", "env.max_steps=6"]
@@ -217,6 +218,23 @@ def test_no_file_gives_itself_trust(of_toy, command, tmp_path):
     folder = forged(of_toy, tmp_path / "forged", lambda config: config.update(trust=True))
     code, _, err = command("mode=eval", f"checkpoint={folder}")
     assert code == 2 and "trust=true" in err
+
+
+def test_the_page_names_every_setting_that_needs_the_word_of_the_user():
+    page = (AGENTS.parent / "docs/opening-files.md").read_text()
+    table = {
+        word for line in page.splitlines() if line.startswith("|") for word in re.findall(r"`(\w+\.[\w=]+)`", line)
+    }
+    guarded = set()
+    for n in range(MOST):
+        config = make_config([f"{group}={choices(group)[n % len(choices(group))]}" for group in GROUPS])
+        for group in GROUPS:
+            guarded |= {f"{group}.{name}" for name in getattr(getattr(config, group).cls, "guarded_settings", ())}
+    assert guarded == {word for word in table if word.partition(".")[0] in GROUPS}
+
+
+def test_the_command_that_goes_on_with_a_run_has_trust_if_it_needs_it():
+    assert needs_trust(make_config([*TOY, "high=none", "low=random"])) and not needs_trust(make_config([]))
 
 
 def test_files_and_servers_that_a_file_names_are_not_reached_unasked():

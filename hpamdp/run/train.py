@@ -37,6 +37,7 @@ from hpamdp.run.folder import (
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_told, signals_ignored, stop_on_signals
+from hpamdp.saved_config import needs_trust
 from hpamdp.shell import path_setting, program
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due
@@ -133,7 +134,8 @@ def _run(
 def _resuming(config: Config, output_dir: Path) -> str:
     """Return the command that goes on with a run."""
     mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
-    return f"{program()} {mode}{path_setting('resume', output_dir)}"
+    trust = " trust=true" if needs_trust(config) else ""  # the settings came from the user's own command line
+    return f"{program()} {mode}{path_setting('resume', output_dir)}{trust}"
 
 
 class Trainer:
