@@ -211,7 +211,7 @@ class Symmetries(Contexts):
 
     def with_option_observed(self, observation_dim: int, num_options: int) -> Symmetries:
         """Return the maps of observations that end in the one-hot option after `observation_dim` entries."""
-        weight = torch.eye(observation_dim + num_options).repeat(len(self), 1, 1)
+        weight = torch.eye(observation_dim + num_options, dtype=torch.float32).repeat(len(self), 1, 1)
         weight[:, :observation_dim, :observation_dim] = self.weight
         entry = observation_dim if self.num_contexts > 1 else None
         return replace(self, weight=weight, offset=F.pad(self.offset, (0, num_options)), one_hot_entry=entry)
@@ -268,11 +268,11 @@ def make_symmetries(
         source = torch.arange(num_parameters)
     if source.ndim == 2:
         source = source.unsqueeze(1)
-    plain = torch.zeros(num, num_parameters)
+    plain = torch.zeros(num, num_parameters, dtype=torch.float32)
     periodic = torch.zeros(num_parameters, dtype=torch.bool) if is_periodic is None else torch.tensor(is_periodic)
     tables: dict[str, Any] = {
         "weight": weight.float(),
-        "offset": torch.zeros(num, weight.shape[-1]) if offset is None else offset.float(),
+        "offset": torch.zeros(num, weight.shape[-1], dtype=torch.float32) if offset is None else offset.float(),
         "discrete": discrete.long(),
         "source": source.expand(num, num_contexts, -1).long(),
         "sign": plain + 1.0 if sign is None else sign.float(),

@@ -44,7 +44,7 @@ class OptionChoiceEnv(PAMDPEnv):
         self.result_keys = env.result_keys
         self.observation_spec = env.observation_spec.clone()
         self.action_spec = Composite(option=env.full_action_spec[keys.OPTION].clone(), shape=env.batch_size)
-        self.reward_spec = Unbounded(shape=(*env.batch_size, 1), device=env.device)
+        self.reward_spec = Unbounded(shape=(*env.batch_size, 1), device=env.device, dtype=torch.float32)
         self.done_spec = self.make_done_spec()
 
     @property
@@ -89,7 +89,7 @@ class OptionChoiceEnv(PAMDPEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         option = tensordict.get(keys.OPTION)
         td = self._observed(tensordict)
-        total = torch.zeros(*self.batch_size, 1, device=self.device)
+        total = torch.zeros(*self.batch_size, 1, device=self.device, dtype=torch.float32)
         # What the policy carries from step to step, as a step of the environment alone keeps nothing.
         state_keys = getattr(self._low_policy, "state_keys", [])
         # Episodes that a partial reset did not start again are over: they stay as they are and earn 0.

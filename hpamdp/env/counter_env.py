@@ -109,7 +109,10 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         self.num_envs = num_envs
         self.max_steps = max_steps
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
-        low, high = torch.tensor(parameter_low, device=self.device), torch.tensor(parameter_high, device=self.device)
+        low, high = (
+            torch.tensor(parameter_low, device=self.device, dtype=torch.float32),
+            torch.tensor(parameter_high, device=self.device, dtype=torch.float32),
+        )
         self._has_oracle = oracle
         self._make_specs(low, high)
         self._place_parameters(low, high)
@@ -256,18 +259,18 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def _make_specs(self, low: Tensor, high: Tensor) -> None:
         n, device = self.num_envs, self.device
         self.observation_spec = Composite(
-            observation=Unbounded(shape=(n, len(self.observation_names)), device=device),
+            observation=Unbounded(shape=(n, len(self.observation_names)), device=device, dtype=torch.float32),
             outcome=Categorical(len(self.outcomes), shape=(n,), device=device),
             shape=(n,),
         )
         if self._has_oracle:
             self.observation_spec["oracle"] = Composite(
                 discrete=Categorical(len(self.parameter_dims), shape=(n, 1), device=device),
-                parameters=Unbounded(shape=(n, 1), device=device),
+                parameters=Unbounded(shape=(n, 1), device=device, dtype=torch.float32),
                 shape=(n,),
             )
         self.action_spec = self.make_action_spec(low, high)
-        self.reward_spec = Unbounded(shape=(n, 1), device=device)
+        self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=torch.float32)
         self.done_spec = self.make_done_spec()
 
     def _place_parameters(self, low: Tensor, high: Tensor) -> None:

@@ -59,7 +59,7 @@ class DecisionTracker(Transform):
         if self.option_length is not None:
             observation_spec[keys.OPTION_ENDED] = observation_spec[keys.IS_DECISION].clone()
         for name in (keys.OPTION_RETURN, keys.EPISODE_RETURN):
-            observation_spec[name] = Unbounded(shape=shape, device=device)
+            observation_spec[name] = Unbounded(shape=shape, device=device, dtype=torch.float32)
         for name in (keys.OPTION_STEPS, keys.EPISODE_STEPS):
             observation_spec[name] = Unbounded(shape=shape, dtype=torch.long, device=device)
         observation_spec[keys.DECISION_OBSERVATION] = observation_spec[keys.OBSERVATION].clone()
@@ -73,7 +73,7 @@ class DecisionTracker(Transform):
         """Begin an option in every row; TorchRL restores the rows of the environments that were not reset."""
         observation = tensordict_reset.get(keys.OBSERVATION)
         is_decision = torch.ones_like(tensordict_reset.get(keys.DONE))
-        zeros = torch.zeros(is_decision.shape, device=observation.device)
+        zeros = torch.zeros(is_decision.shape, device=observation.device, dtype=torch.float32)
         if self.option_length is not None:
             tensordict_reset.set(keys.OPTION_ENDED, torch.zeros_like(is_decision))
         if self.option_actions is not None:
@@ -112,7 +112,7 @@ class DecisionTracker(Transform):
             is_decision = done | option_ended
             next_tensordict.set(keys.OPTION_ENDED, option_ended)
         next_tensordict.set(keys.IS_DECISION, is_decision)
-        next_tensordict.set(keys.OPTION_RETURN, option_return + self.gamma**option_steps * reward)
+        next_tensordict.set(keys.OPTION_RETURN, option_return + self.gamma ** option_steps.float() * reward)
         next_tensordict.set(keys.OPTION_STEPS, option_steps + 1)
         next_tensordict.set(keys.DECISION_OBSERVATION, decision_observation)
         next_tensordict.set(keys.EPISODE_RETURN, tensordict.get(keys.EPISODE_RETURN) + reward)

@@ -126,7 +126,7 @@ class OptionValues(nn.Module):
             return torch.stack([learner.value(observation, *masks) for learner in self._learners()], -1)
         (learner,) = self._learners()
         values = []
-        for one_hot in torch.eye(self.num_options, device=observation.device):
+        for one_hot in torch.eye(self.num_options, device=observation.device, dtype=torch.float32):
             seen = torch.cat([observation, one_hot.expand(len(observation), -1)], -1)
             values.append(learner.value(seen, *masks))
         return torch.stack(values, -1)

@@ -239,7 +239,7 @@ class Selector(TensorDictModuleBase):
         """
         after = decisions.get("next")
         goes_on = ~after.get(keys.DONE).squeeze(-1)
-        return self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1) * goes_on
+        return self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1).float() * goes_on
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by name: optimisers, replay buffers.

@@ -68,7 +68,7 @@ class Evaluation:
         """
         device = self.env.device
         td = self._reset()
-        total = torch.zeros(td.batch_size, device=device)
+        total = torch.zeros(td.batch_size, device=device, dtype=torch.float32)
         steps = torch.zeros(td.batch_size, dtype=torch.long, device=device)
         changes = torch.zeros_like(steps)
         over, options, path = td.get(keys.DONE).squeeze(-1), [], [self.env.position]

@@ -24,7 +24,7 @@ from hpamdp.data.human.released_file import FRAMES_PER_SECOND, FULL_TANK, HumanD
 from hpamdp.env.boatdock import harbour, physics
 
 TAP = 4.0  # px
-_CENTRE = torch.tensor(harbour.CENTRE)
+_CENTRE = torch.tensor(harbour.CENTRE, dtype=torch.float32)
 
 
 def to_rest_to_rest(data: HumanData) -> HumanData:
@@ -55,7 +55,7 @@ def to_rest_to_rest(data: HumanData) -> HumanData:
     has_next = episode[:-1] == episode[1:]
     kept["next_position"][:-1][has_next] = kept["position"][1:][has_next]
 
-    pressed = torch.zeros(len(data.episodes)).index_add(0, episode, kept["duration"])
+    pressed = torch.zeros(len(data.episodes), dtype=torch.float32).index_add(0, episode, kept["duration"])
     converted = data.episodes.clone()
     converted["tank"] = (FULL_TANK - pressed * FRAMES_PER_SECOND).clamp(min=0.0).round().long()
     converted["presses"] = torch.bincount(episode, minlength=len(data.episodes))

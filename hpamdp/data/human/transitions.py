@@ -59,7 +59,9 @@ def transitions(
     rows = _read(before, rules)
     key = presses["key"].unsqueeze(1)
     rows[keys.DISCRETE] = presses["key"].clone()
-    rows[keys.PARAMETERS] = torch.zeros(len(key), harbour.NUM_KEYS).scatter(1, key, presses["duration"].unsqueeze(1))
+    rows[keys.PARAMETERS] = torch.zeros(len(key), harbour.NUM_KEYS, dtype=torch.float32).scatter(
+        1, key, presses["duration"].unsqueeze(1)
+    )
     if has_choice:
         rows[keys.OPTION] = episodes["controller"]
     rows[keys.IS_DECISION] = (presses["press"] == 0).unsqueeze(-1)
@@ -92,15 +94,15 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
     _check(data, reward, observation)
     rules = Rules(reward=reward, observation=observation)
     episodes = data.episodes
-    start = episodes["start"] - torch.tensor(harbour.CENTRE)
-    goal = episodes["goal"] - torch.tensor(harbour.CENTRE)
+    start = episodes["start"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
+    goal = episodes["goal"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
     # The last logged press; without one, the boat heads for its goal from the start.
     position, heading = start.clone(), torch.nn.functional.normalize(goal - start, dim=1)
-    duration = torch.zeros(len(start))
+    duration = torch.zeros(len(start), dtype=torch.float32)
     last = data.presses[data.presses["is_final"]]
     number = last["episode"]
     controller, keymap = (episodes[name].to(torch.int32) for name in ("controller", "keymap"))
-    position[number] = last["position"] - torch.tensor(harbour.CENTRE)
+    position[number] = last["position"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
     heading[number] = torch.stack(harbour.direction(controller[number], keymap[number], last["key"].int()), 1)
     duration[number] = last["duration"]
     full = torch.full_like(duration, physics.TANK)
@@ -145,7 +147,7 @@ def _check(data: HumanData, reward: str, observation: str) -> None:
     """Check what `transitions` and `decisions` are given."""
     _check_one_of("reward", reward, _REWARDS)
     _check_one_of("observation", observation, _OBSERVATIONS)
-    if not (data.episodes["centre"] == torch.tensor(harbour.CENTRE)).all():
+    if not (data.episodes["centre"] == torch.tensor(harbour.CENTRE, dtype=torch.float32)).all():
         raise DataError("the harbours have different centres; read the file with one_frame=True")
 
 
@@ -156,7 +158,7 @@ def _check_one_of(name: str, value: str, allowed: tuple[str, ...]) -> None:
 
 def _states(presses: TensorDict, episodes: TensorDict, has_choice: bool) -> tuple[BoatState, BoatState]:
     """Return the boats before and after each press, px from the harbour's centre."""
-    centre = torch.tensor(harbour.CENTRE)
+    centre = torch.tensor(harbour.CENTRE, dtype=torch.float32)
     is_first = presses["press"] == 0
     is_final = presses["is_final"]
     duration = presses["duration"]

@@ -320,7 +320,7 @@ class BoatDockEnv(PAMDPEnv):
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return layouts to `reset` with, one for each boat, that no training episode meets, whatever its seed."""
         layout = harbour.fixed_layouts(self.num_envs, seed)
-        centre = torch.tensor(harbour.CENTRE)
+        centre = torch.tensor(harbour.CENTRE, dtype=torch.float32)
         points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
         return TensorDict(points, batch_size=self.batch_size, device=self.device)
 
@@ -434,14 +434,14 @@ class BoatDockEnv(PAMDPEnv):
         n, device = self.num_envs, self.device
         names = episode.OBSERVATION_NAMES if self.rules.observation == "pixels" else episode.SCALED_NAMES
         self.observation_spec = Composite(
-            observation=Unbounded(shape=(n, len(names)), device=device),
+            observation=Unbounded(shape=(n, len(names)), device=device, dtype=torch.float32),
             outcome=Categorical(len(physics.OUTCOMES), shape=(n,), device=device),
-            fuel=Bounded(0.0, 1.0, shape=(n, 1), device=device),
+            fuel=Bounded(0.0, 1.0, shape=(n, 1), device=device, dtype=torch.float32),
             shape=(n,),
         )
-        longest = torch.full((harbour.NUM_KEYS,), physics.MAX_DURATION)
+        longest = torch.full((harbour.NUM_KEYS,), physics.MAX_DURATION, dtype=torch.float32)
         self.action_spec = self.make_action_spec(torch.zeros_like(longest), longest, has_option=self.has_choice)
-        self.reward_spec = Unbounded(shape=(n, 1), device=device)
+        self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=torch.float32)
         self.done_spec = self.make_done_spec()
 
     def _set_seed(self, seed: int | None) -> None:
@@ -451,7 +451,7 @@ class BoatDockEnv(PAMDPEnv):
         if self._fleet is not None:
             self._fleet.set_seed(0 if seed is None else seed, is_evaluation=False)
             return
-        floats = torch.zeros(self.num_envs, device=self.device)
+        floats = torch.zeros(self.num_envs, device=self.device, dtype=torch.float32)
         integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
         columns = [floats] * 9 + [integers] * 4 + [integers - 1]
         self._columns = BoatState(*columns)

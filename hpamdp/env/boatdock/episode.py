@@ -140,7 +140,7 @@ def _press(
         is_other = (option != state.controller) & (state.controller != harbour.NOT_CHOSEN)
         fuel = torch.where(is_other, (fuel - rules.switch_cost).clamp(min=0.0), fuel)
     if max(rules.motor_noise) > 0.0:
-        deviation = torch.full(controller.shape, rules.motor_noise[0], device=controller.device)
+        deviation = torch.full(controller.shape, rules.motor_noise[0], device=controller.device, dtype=torch.float32)
         for boat, noise in enumerate(rules.motor_noise[1:], start=1):
             deviation = torch.where(controller == boat, noise, deviation)
         duration = duration * (deviation * counter_rng.normal(noise_key, first // 2 + MOTOR)).exp()

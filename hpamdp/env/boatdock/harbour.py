@@ -50,8 +50,8 @@ def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, 
     reordered = torch.where(keymap == 1, torch.where(key == 0, 0, 3 - key), torch.where(key == 2, 2, 1 - key))
     congruent = controller == CONGRUENT
     column = torch.where(congruent, key, reordered)
-    sign = torch.where(congruent, 1.0, -1.0)
-    return sign * _COS30 * (column - 1).to(torch.float32), sign * torch.where(column == 1, -1.0, 0.5)
+    sign = torch.where(congruent, 1.0, -1.0).float()
+    return sign * _COS30 * (column - 1).to(torch.float32), sign * torch.where(column == 1, -1.0, 0.5).float()
 
 
 def direction_of(rules: Rules, controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
@@ -60,7 +60,7 @@ def direction_of(rules: Rules, controller: Tensor, keymap: Tensor, key: Tensor) 
         return direction(controller, keymap, key)
     row = controller * NUM_KEYS + key
     every = [each for keys in rules.boats.directions for each in keys]
-    x, y = (torch.full(row.shape, each, device=row.device) for each in every[0])
+    x, y = (torch.full(row.shape, each, device=row.device, dtype=torch.float32) for each in every[0])
     # No gather, as above.
     for number, (key_x, key_y) in enumerate(every[1:], start=1):
         x, y = torch.where(row == number, key_x, x), torch.where(row == number, key_y, y)

@@ -13,7 +13,7 @@ from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGE
 
 def human_spec(num_envs: int, device: torch.device) -> Composite:
     """Return the spec of `human_shares`, as the entry `option`."""
-    shares = Bounded(0.0, 1.0, shape=(num_envs, len(harbour.CONTROLLERS)), device=device)
+    shares = Bounded(0.0, 1.0, shape=(num_envs, len(harbour.CONTROLLERS)), device=device, dtype=torch.float32)
     return Composite(option=shares, shape=(num_envs,))
 
 

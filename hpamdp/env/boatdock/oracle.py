@@ -19,7 +19,7 @@ def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
     return Composite(
         option=Categorical(len(rules.names), shape=(num_envs,), device=device),
         discrete=Categorical(harbour.NUM_KEYS, shape=shape, device=device),
-        parameters=Bounded(0.0, physics.MAX_DURATION, shape=shape, device=device),
+        parameters=Bounded(0.0, physics.MAX_DURATION, shape=shape, device=device, dtype=torch.float32),
         shape=(num_envs,),
     )
 
@@ -49,7 +49,7 @@ class BoatDockOracle:
         self.option = torch.zeros(num_envs, dtype=torch.long, device=device)
         shape = (num_envs, _num_plans(rules), planner.MAX_PRESSES)
         self.keys = torch.zeros(shape, dtype=torch.long, device=device)
-        self.durations = torch.zeros(shape, device=device)
+        self.durations = torch.zeros(shape, device=device, dtype=torch.float32)
 
     def plans(self) -> dict[str, Tensor]:
         """Return the attributes for a checkpoint: a plan is made at the start of its episode."""

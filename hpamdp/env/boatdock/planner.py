@@ -155,7 +155,9 @@ def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Te
     Returns:
         The index of the sequence and the two fractions of each boat's best minima, `[N, S * _MINIMA]` each.
     """
-    fractions = torch.linspace(0.0, 0.5 * math.pi, _GRID, device=course.x.device).sin().square()  # denser at the ends
+    fractions = (
+        torch.linspace(0.0, 0.5 * math.pi, _GRID, device=course.x.device, dtype=torch.float32).sin().square()
+    )  # denser at the ends
     # Without a first leg one row of the grid is enough.
     first, second = torch.meshgrid(fractions if max_presses > 2 else fractions[:1], fractions, indexing="ij")
     grid = _Course(*(field[..., None, None] for field in course))
@@ -169,7 +171,7 @@ def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Te
 
 def _zoom(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> tuple[Tensor, Tensor]:
     """Refine the fractions `first` and `second` of C candidates, `[N, C]`, by shrinking grids; course `[N, C]`."""
-    offset = torch.linspace(-1.0, 1.0, _ZOOM_GRID, device=first.device)
+    offset = torch.linspace(-1.0, 1.0, _ZOOM_GRID, device=first.device, dtype=torch.float32)
     first_offset, second_offset = torch.cartesian_prod(offset, offset).unbind(1)
     course = _Course(*(field[..., None] for field in course))
     width = 0.5 * math.pi / (_GRID - 1)  # the coarse grid's widest spacing
@@ -319,7 +321,7 @@ def better_option(plans: Plan | OptionPlans) -> Tensor:
     An option that begins with a press of 0 s, to change boats then, is as good as the change at once; it loses, since
     whoever asks again before the next press would idle for ever.
     """
-    return (plans.score - _IDLE * (plans.durations[..., 0] == 0.0)).argmax(1)
+    return (plans.score - _IDLE * (plans.durations[..., 0] == 0.0).float()).argmax(1)
 
 
 _IDLE = 1e-3  # of score
@@ -394,9 +396,9 @@ def _plans_of_kind(
     device = position[0].device
     legs = torch.zeros(len(position[0]), MAX_PRESSES, 2, dtype=torch.long, device=device)
     legs[..., 0] = kind
-    durations = torch.zeros(len(position[0]), MAX_PRESSES, device=device)
+    durations = torch.zeros(len(position[0]), MAX_PRESSES, device=device, dtype=torch.float32)
     num_presses = torch.zeros(len(position[0]), dtype=torch.long, device=device)
-    seconds = torch.full((len(position[0]),), torch.inf, device=device)
+    seconds = torch.full((len(position[0]),), torch.inf, device=device, dtype=torch.float32)
     for num in range(1, MAX_PRESSES + 1):
         sequences = _sequences(kinds, kind, num, may_change=switch_cost is not None)
         if not sequences:
@@ -404,7 +406,7 @@ def _plans_of_kind(
         changes = [sum(a[0] != b[0] for a, b in itertools.pairwise(presses)) for presses in sequences]
         cost = torch.tensor(changes, dtype=torch.float32, device=device) * (switch_cost or 0.0)
         course = [[kinds[each][number] for each, number in presses] for presses in sequences]
-        directions = torch.tensor([_padded(each) for each in course], device=device)
+        directions = torch.tensor([_padded(each) for each in course], device=device, dtype=torch.float32)
         chunks = zip(*(column.split(_CHUNK) for column in position), strict=True)
         found = [_search_sequences(directions, cost, chunk, num) for chunk in chunks]
         sequence, pressed = (torch.cat(parts) for parts in zip(*found, strict=True))

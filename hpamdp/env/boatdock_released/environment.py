@@ -159,7 +159,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
             outcome=Categorical(len(released.OUTCOMES), shape=(n,), device=device),
             shape=(n,),
         )
-        bound = torch.ones(len(self.parameter_dims))
+        bound = torch.ones(len(self.parameter_dims), dtype=torch.float32)
         self.action_spec = self.make_action_spec(-bound, bound)
         self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=dtype)
         self.done_spec = self.make_done_spec()
@@ -224,7 +224,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         """Check a user's layout and return the columns of the state that it sets; empty without a layout."""
         if not {"start", "goal", "keymap"} & set(given.keys()):
             return {}
-        low = torch.tensor(released.LOW, device=self.device)
+        low = torch.tensor(released.LOW, device=self.device, dtype=torch.float32)
         points = {}
         for name in ("start", "goal"):
             point = given.get(name, None)

@@ -104,7 +104,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         # A direction runs from +y to +x, so a turn by a, from +x to +y, makes p into p - a; the mirror x -> -x before
         # it makes p into -p.
         turn = 2.0 * torch.arange(_TURNS).repeat(2) / _TURNS
-        sign = torch.ones(2 * _TURNS).index_fill(0, torch.arange(_TURNS, 2 * _TURNS), -1.0)
+        sign = torch.ones(2 * _TURNS, dtype=torch.float32).index_fill(0, torch.arange(_TURNS, 2 * _TURNS), -1.0)
         return make_symmetries(
             weight,
             offset=offset,

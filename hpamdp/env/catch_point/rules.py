@@ -60,7 +60,7 @@ def act(
         late_end: whether an episode without catches ends a step after the last one, as published, in which it earns 0.
     """
     is_catch = discrete == CATCH
-    force = torch.where(is_catch, 0.0, _FORCE)
+    force = torch.where(is_catch, 0.0, _FORCE).to(parameter.dtype)
     angle = math.pi * parameter
     x, y, vx, vy = point_agent.move(state, force * angle.sin(), force * angle.cos())
     squared = point_agent.squared_distance(state, x, y)

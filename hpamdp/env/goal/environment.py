@@ -155,13 +155,15 @@ class GoalEnv(CounterEnv[GoalState]):
         Returns:
             Weights `[4, 17]` and bias `[4]`; None where nothing is published.
         """
-        weights = torch.zeros(len(rules.PARAMETER_LOW), len(rules.OBSERVATION_NAMES), device=self.device)
+        weights = torch.zeros(
+            len(rules.PARAMETER_LOW), len(rules.OBSERVATION_NAMES), device=self.device, dtype=torch.float32
+        )
         place = {name: column for column, name in enumerate(rules.OBSERVATION_NAMES)}
         weights[0, place["ball_x"]] = 0.5
         weights[0, place["keeper_to_ball_x"]] = 0.0625
         weights[1, place["ball_y"]] = 5.0 / 6.0
         weights[1, place["keeper_to_ball_y"]] = 1.0 / 9.0
-        bias = torch.tensor([-0.375, 0.0, 0.857346647646, -0.857346647646], device=self.device)
+        bias = torch.tensor([-0.375, 0.0, 0.857346647646, -0.857346647646], device=self.device, dtype=torch.float32)
         if not self._is_scaled:
             low, high = bias.new_tensor(rules.OBSERVATION_LOW), bias.new_tensor(rules.OBSERVATION_HIGH)
             bias = bias - weights @ ((high + low) / (high - low))
@@ -207,18 +209,21 @@ class GoalEnv(CounterEnv[GoalState]):
             return None
         # y, vertical velocities and orientations change their sign.
         flips = torch.tensor([name.endswith(("_y", "_vy", "_angle", "_projection")) for name in self.observation_names])
-        sign = torch.where(flips, -1.0, 1.0)
+        sign = torch.where(flips, -1.0, 1.0).float()
         offset = torch.zeros_like(sign)
         if self._is_scaled:
-            low, high = torch.tensor(rules.OBSERVATION_LOW), torch.tensor(rules.OBSERVATION_HIGH)
+            low, high = (
+                torch.tensor(rules.OBSERVATION_LOW, dtype=torch.float32),
+                torch.tensor(rules.OBSERVATION_HIGH, dtype=torch.float32),
+            )
             offset = torch.where(flips, -2.0 * (high + low) / (high - low), 0.0)
         discrete, parameters = self._mirrored_actions()
         return make_symmetries(
-            torch.stack([torch.eye(len(sign)), sign.diag()]),
+            torch.stack([torch.eye(len(sign), dtype=torch.float32), sign.diag()]),
             offset=torch.stack([torch.zeros_like(offset), offset]),
             discrete=torch.stack([torch.arange(len(self.parameter_dims)), discrete]),
             source=torch.stack([torch.arange(len(parameters)), parameters]),
-            sign=torch.stack([torch.ones(len(parameters)), self._mirrored_signs()]),
+            sign=torch.stack([torch.ones(len(parameters), dtype=torch.float32), self._mirrored_signs()]),
             num_parameters=len(parameters),
         )
 
@@ -228,7 +233,7 @@ class GoalEnv(CounterEnv[GoalState]):
 
     def _mirrored_signs(self) -> Tensor:
         """Return the signs that the parameters get: only x of a kick keeps its own."""
-        return torch.tensor([1.0] + [-1.0] * (len(self.parameter_low) - 1))
+        return torch.tensor([1.0] + [-1.0] * (len(self.parameter_low) - 1), dtype=torch.float32)
 
     def _aim(self, discrete: Tensor, parameters: Tensor) -> Aim:
         return rules.goal_aim(discrete, parameters, kicks_to_point="kick_to" in self.repaired)

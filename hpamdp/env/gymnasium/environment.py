@@ -252,7 +252,7 @@ class GymnasiumEnv(PAMDPEnv):
         device = self.device
         self.observation_spec = Composite(
             {
-                keys.OBSERVATION: Unbounded(shape=(n, self.observations.dim), device=device),
+                keys.OBSERVATION: Unbounded(shape=(n, self.observations.dim), device=device, dtype=torch.float32),
                 _SUCCESS: Categorical(2, shape=(n,), dtype=torch.bool, device=device),
             },
             shape=(n,),
@@ -263,7 +263,7 @@ class GymnasiumEnv(PAMDPEnv):
         low = torch.from_numpy(self._actions.low)
         high = torch.from_numpy(self._actions.high)
         self.action_spec = self.make_action_spec(low, high, has_option=self._options.num_options > 0)
-        self.reward_spec = Unbounded(shape=(n, 1), device=device)
+        self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=torch.float32)
         self.done_spec = self.make_done_spec()
 
     def _set_seed(self, seed: int | None) -> None:

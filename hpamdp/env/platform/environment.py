@@ -79,8 +79,13 @@ class PlatformEnv(CounterEnv[PlatformState]):
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return constants: run 3, hop 10, leap 400."""
-        bias = 2.0 * torch.tensor(rules.INITIAL_PARAMETERS) / torch.tensor(rules.PARAMETER_HIGH) - 1.0
-        return torch.zeros(len(bias), len(rules.OBSERVATION_NAMES)), bias
+        bias = (
+            2.0
+            * torch.tensor(rules.INITIAL_PARAMETERS, dtype=torch.float32)
+            / torch.tensor(rules.PARAMETER_HIGH, dtype=torch.float32)
+            - 1.0
+        )
+        return torch.zeros(len(bias), len(rules.OBSERVATION_NAMES), dtype=torch.float32), bias
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

@@ -181,8 +181,8 @@ def _patrol(before: Tensor, after: Tensor, x: Tensor, speed: Tensor, gust: Tenso
         gust: px/s that each tick adds to their speeds, `[T, N]`.
     """
     is_second = before > LEFT[1]
-    left = torch.where(is_second, LEFT[1], LEFT[0])
-    right = torch.where(is_second, _SECOND_START, _FIRST_START)
+    left = torch.where(is_second, LEFT[1], LEFT[0]).to(gust.dtype)
+    right = torch.where(is_second, _SECOND_START, _FIRST_START).to(gust.dtype)
     slowest = torch.full_like(gust, -_ENEMY_SPEED)
     fastest = torch.full_like(gust, _ENEMY_SPEED)
     # When the agent reaches the second platform, its enemy takes over: the bounds leave it nothing but its start.

@@ -94,7 +94,7 @@ def observe(state: RoomsState) -> Tensor:
     """Return the observation `[N, 2 + 2 SIZE]`: both coordinates in [-1, 1], and each of them as a one-hot vector."""
     place = torch.stack([state.x, state.y], -1)
     one_hot = (place.unsqueeze(-1) == torch.arange(SIZE, device=place.device)).flatten(-2)
-    return torch.cat([2.0 * place / (SIZE - 1) - 1.0, one_hot.float()], -1)
+    return torch.cat([2.0 * place.float() / (SIZE - 1) - 1.0, one_hot.float()], -1)
 
 
 def best_values(gamma: float, option_length: int) -> Tensor:

@@ -46,8 +46,8 @@ class EpsilonGreedy(Bandit):
         """Return `num` choices; all are random as long as an allowed option is untried."""
         device = self.statistics.counts.device
         time = self.num_decisions + self.pending.sum() + torch.arange(1, num + 1, device=device)
-        epsilon = (self.epsilon_scale / time).clamp(self.epsilon_final, 1.0)
-        is_random = torch.rand(num, device=device) < epsilon
+        epsilon = (self.epsilon_scale / time.float()).clamp(self.epsilon_final, 1.0)
+        is_random = torch.rand(num, device=device, dtype=torch.float32) < epsilon
         mask = None if allowed is None else allowed.expand(num, -1)
         anything = random_choice(torch.Size([num]), self.specs.num_options, mask, device)
         is_untried = self.statistics.is_untried if allowed is None else self.statistics.is_untried & allowed

@@ -141,7 +141,7 @@ class MetaCritic(Selector):
         if is_greedy():
             return is_worse
         random_share = 1.0 if self.is_uniform else self.epsilon
-        return is_worse | (torch.rand(is_worse.shape, device=is_worse.device) < random_share)
+        return is_worse | (torch.rand(is_worse.shape, device=is_worse.device, dtype=torch.float32) < random_share)
 
     def decisions_to_update(self) -> dict[str, int]:
         """Return the lengths of the warm-up and of an update's share of decisions."""
@@ -191,7 +191,7 @@ class MetaCritic(Selector):
             target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
             is_chosen = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)
             # Each member sees a random half of the decisions, which keeps the members apart.
-            is_seen = torch.rand(*q.shape[:2], 1, device=q.device) < 0.5 if len(q) > 1 else 1.0
+            is_seen = torch.rand(*q.shape[:2], 1, device=q.device, dtype=torch.float32) < 0.5 if len(q) > 1 else 1.0
         loss = ((q - target).square() * is_chosen * is_seen).sum(-1).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -108,7 +108,7 @@ class OptionCritic(Selector):
         assert isinstance(last, nn.Linear)
         with torch.no_grad():
             last.weight.mul_(0.01)
-            last.bias.fill_(torch.tensor(initial_termination).logit().item())
+            last.bias.fill_(torch.tensor(initial_termination, dtype=torch.float32).logit().item())
         self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizers = {
@@ -136,7 +136,7 @@ class OptionCritic(Selector):
         best = masked_values(self.critic(td.get(keys.OBSERVATION)), mask).argmax(-1)
         if is_greedy():
             return best
-        is_random = torch.rand(best.shape, device=best.device) < self.epsilon
+        is_random = torch.rand(best.shape, device=best.device, dtype=torch.float32) < self.epsilon
         return torch.where(is_random, random_choice(best.shape, self.specs.num_options, mask, best.device), best)
 
     @torch.no_grad()
@@ -183,7 +183,7 @@ class OptionCritic(Selector):
             "option": batch.get(keys.OPTION),
             "reward": after.get(keys.REWARD).squeeze(-1),
             "next_state": after.get(keys.OBSERVATION),
-            "discount": self.gamma * ~done,
+            "discount": self.gamma * (~done).float(),
             "is_ended": after.get(keys.OPTION_ENDED).squeeze(-1) if keys.OPTION_ENDED in after.keys() else done,
         }
         if self.specs.has_option_mask:

@@ -56,7 +56,7 @@ class Value(Selector):
         else:
             is_best = value == value.amax(-1, keepdim=True)
             best = torch.where(is_best, torch.rand_like(value), -1.0).argmax(-1)  # a random one of equals
-            is_random = torch.rand(best.shape, device=best.device) < self.epsilon
+            is_random = torch.rand(best.shape, device=best.device, dtype=torch.float32) < self.epsilon
             anything = random_choice(best.shape, self.specs.num_options, option_mask, best.device)
             best = torch.where(is_random, anything, best)
         option[is_decision] = best

@@ -160,7 +160,7 @@ class Planner:
         """Sample discrete actions `[N, S, H]` and parameters `[N, S, H, num_parameters]` in [-1, 1]."""
         discrete = plan.probability.flatten(0, 1).multinomial(self.num_samples, replacement=True)
         discrete = discrete.unflatten(0, plan.probability.shape[:2]).transpose(1, 2)
-        noise = torch.randn(*discrete.shape, self.specs.num_parameters, device=discrete.device)
+        noise = torch.randn(*discrete.shape, self.specs.num_parameters, device=discrete.device, dtype=torch.float32)
         unit = plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise
         return discrete, unit.clamp(-1.0, 1.0)
 
@@ -234,14 +234,18 @@ class DLPAPolicy(TensorDictModuleBase):
         mask = None if mask is None else mask.flatten(0, -2)
         allowed = self.specs.allowed(state, mask)
         discrete = random_choice(state.shape[:1], self.specs.num_discrete, allowed, state.device)
-        unit = 2.0 * torch.rand(state.shape[0], self.specs.num_parameters, device=state.device) - 1.0
+        unit = (
+            2.0 * torch.rand(state.shape[0], self.specs.num_parameters, device=state.device, dtype=torch.float32) - 1.0
+        )
         is_planned = self.is_trained.expand(state.shape[0])
         done = td.get(keys.DONE, None)
         if done is not None:
             is_planned = is_planned & ~done.flatten()
         exploring = not is_greedy()
         if exploring:
-            is_planned = is_planned & (torch.rand(state.shape[0], device=state.device) >= self.epsilon)
+            is_planned = is_planned & (
+                torch.rand(state.shape[0], device=state.device, dtype=torch.float32) >= self.epsilon
+            )
         if is_planned.any():
             mask = None if mask is None else mask[is_planned]
             discrete[is_planned], unit[is_planned] = self.first_action(state[is_planned], exploring, mask)
@@ -452,7 +456,7 @@ class DLPA(ReplayLearner):
 
     def losses(self, windows: Mapping[str, Tensor] | TensorDictBase) -> dict[str, Tensor]:
         """Return the parts of the H-step loss, each summed over a window with weight rho^h, averaged over windows."""
-        parts = {name: torch.zeros((), device=self.frames.device) for name in self.loss_weights}
+        parts = {name: torch.zeros((), device=self.frames.device, dtype=torch.float32) for name in self.loss_weights}
         state = windows["state"][:, 0]
         for h in range(self.horizon):
             step = {name: column[:, h] for name, column in windows.items()}
@@ -481,7 +485,7 @@ class DLPA(ReplayLearner):
 
     def _loss(self, windows: Mapping[str, Tensor] | TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         parts = self.losses(windows)
-        loss = torch.zeros((), device=self.frames.device)
+        loss = torch.zeros((), device=self.frames.device, dtype=torch.float32)
         for name, part in parts.items():
             loss = loss + self.loss_weights[name] * part
         return loss, parts

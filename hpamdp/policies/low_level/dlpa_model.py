@@ -37,7 +37,7 @@ class Predictor(nn.Module):
         max_parameters = max(specs.parameter_dims)
         first_dim = specs.observation_dim + specs.num_discrete
         parameters_dim = specs.num_parameters if form == "masking" else max_parameters
-        self.first = nn.Linear(first_dim, hidden_dims[0]) if form == "sequential" else None
+        self.first = nn.Linear(first_dim, hidden_dims[0], dtype=torch.float32) if form == "sequential" else None
         in_dim = hidden_dims[0] if form == "sequential" else first_dim
         self.net = EnsembleMLP(num_members, in_dim + parameters_dim, hidden_dims, out_dim)
         self.register_buffer("mask", specs.parameter_mask.float())
@@ -65,9 +65,9 @@ class PAMDPModel(nn.Module):
         super().__init__()
         self.transition = Predictor(specs, form, 1, hidden_dims, specs.observation_dim)
         self.outcome = Predictor(specs, form, num_members, hidden_dims, 3)
-        self.register_buffer("state_mean", torch.zeros(specs.observation_dim))
-        self.register_buffer("state_scale", torch.ones(specs.observation_dim))
-        self.register_buffer("change_scale", torch.ones(specs.observation_dim))
+        self.register_buffer("state_mean", torch.zeros(specs.observation_dim, dtype=torch.float32))
+        self.register_buffer("state_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
+        self.register_buffer("change_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
 
     def fit_scales(self, state: Tensor, next_state: Tensor) -> None:
         """Set the scales of inputs and targets from transitions `[B, observation_dim]`."""

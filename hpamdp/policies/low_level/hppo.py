@@ -33,6 +33,7 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
+from hpamdp.policies.shared.default_dtype import float32_by_default
 from hpamdp.policies.shared.fractions import Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
@@ -136,7 +137,9 @@ class HPPO(OnPolicy, Learner):
         )
         products = [] if self.actor.products is None else [self.actor.products]
         self.critic = nn.Sequential(
-            *products, encoder(self.actor.num_inputs, critic_hidden_dims), nn.Linear(critic_hidden_dims[-1], 1)
+            *products,
+            encoder(self.actor.num_inputs, critic_hidden_dims),
+            nn.Linear(critic_hidden_dims[-1], 1, dtype=torch.float32),
         )
         self.policy = HPPOPolicy(self.actor, specs, samples_when_greedy=greedy_discrete == "sampled")
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
@@ -176,7 +179,9 @@ class HPPO(OnPolicy, Learner):
         for group in self.optimizer.param_groups:
             group["lr"] = self.lr + progress * (self.lr_final - self.lr)
         # A tensor, since compiled code would be made anew for another number.
-        entropy_weight = torch.tensor(1.0 + progress * (self.entropy_final - 1.0), device=rows.device)
+        entropy_weight = torch.tensor(
+            1.0 + progress * (self.entropy_final - 1.0), device=rows.device, dtype=torch.float32
+        )
         scalars = self.make_passes(rows, lambda minibatch: self.minimise(self._loss, minibatch, entropy_weight))
         self.actor.set_min_scale(self.min_scale * (self.min_scale_final / self.min_scale) ** progress)
         return scalars
@@ -194,9 +199,10 @@ class HPPO(OnPolicy, Learner):
             else:
                 value, next_value, reward = self._of_own_option(batch, mask)
             done, terminated = batch.get(("next", keys.DONE)), batch.get(("next", keys.TERMINATED))
-            advantage, target = generalized_advantage_estimate(
-                self.gamma, self.gae_lambda, value, next_value, reward, done, terminated
-            )
+            with float32_by_default():
+                advantage, target = generalized_advantage_estimate(
+                    self.gamma, self.gae_lambda, value, next_value, reward, done, terminated
+                )
         return advantage.squeeze(-1), target.squeeze(-1)
 
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
@@ -205,7 +211,7 @@ class HPPO(OnPolicy, Learner):
 
     def _of_own_option(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return the values of the states and of the next states and the rewards, `[*B, T, 1]`, 0 outside `mask`."""
-        value = torch.zeros(*mask.shape, 1, device=mask.device)
+        value = torch.zeros(*mask.shape, 1, device=mask.device, dtype=torch.float32)
         next_value = torch.zeros_like(value)
         reward = torch.zeros_like(value)
         value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])

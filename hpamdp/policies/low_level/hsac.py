@@ -176,10 +176,10 @@ class HSAC(ReplayLearner):
         self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_discrete_temperature = nn.Parameter(
-            torch.tensor(math.log(discrete_temperature)), requires_grad=tune_discrete_temperature
+            torch.tensor(math.log(discrete_temperature), dtype=torch.float32), requires_grad=tune_discrete_temperature
         )
         self.log_parameter_temperature = nn.Parameter(
-            torch.tensor(math.log(parameter_temperature)), requires_grad=tune_parameter_temperature
+            torch.tensor(math.log(parameter_temperature), dtype=torch.float32), requires_grad=tune_parameter_temperature
         )
         self.policy = HSACPolicy(self.actor, specs)
         self.to(device)

@@ -94,16 +94,18 @@ class HybridCodec(nn.Module):
         super().__init__()
         self.latent_dim = latent_dim
         condition_dim = specs.observation_dim + embedding_dim
-        self.table = nn.Parameter(torch.empty(specs.num_discrete, embedding_dim).uniform_(-1.0, 1.0))
+        self.table = nn.Parameter(
+            torch.empty(specs.num_discrete, embedding_dim, dtype=torch.float32).uniform_(-1.0, 1.0)
+        )
         self.encoder = mlp(specs.num_parameters + condition_dim, [hidden_dim, hidden_dim], 2 * latent_dim)
         self.decoder = nn.Sequential(mlp(latent_dim + condition_dim, [hidden_dim], hidden_dim), nn.ReLU())
-        self.parameter_head = nn.Linear(hidden_dim, specs.num_parameters)
+        self.parameter_head = nn.Linear(hidden_dim, specs.num_parameters, dtype=torch.float32)
         self.dynamics_head = mlp(hidden_dim, [hidden_dim], specs.observation_dim)
         self.register_buffer("mask", specs.parameter_mask.float())
-        self.register_buffer("change_scale", torch.ones(specs.observation_dim))
+        self.register_buffer("change_scale", torch.ones(specs.observation_dim, dtype=torch.float32))
         # The central range of the encoded z, onto which the actor's [-1, 1] is mapped.
-        self.register_buffer("z_low", -torch.ones(latent_dim))
-        self.register_buffer("z_high", torch.ones(latent_dim))
+        self.register_buffer("z_low", -torch.ones(latent_dim, dtype=torch.float32))
+        self.register_buffer("z_high", torch.ones(latent_dim, dtype=torch.float32))
 
     @property
     def embeddings(self) -> Tensor:
@@ -273,7 +275,7 @@ class HyARPolicy(TensorDictModuleBase):
         self.codec = codec
         self.specs = specs
         self.noise = noise
-        self.register_buffer("epsilon", torch.ones(()))
+        self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
         of_z = even_normal(greedy_samples, codec.latent_dim, greedy_noise)
         self.register_buffer("variations", F.pad(of_z, (codec.table.shape[-1], 0)), persistent=False)
 
@@ -436,7 +438,7 @@ class HyAR(ReplayLearner):
             greedy_noise=greedy_noise,
         )
         # The codec's recent mean squared error of the scaled change of the state.
-        self.register_buffer("dynamics_error", torch.ones(()))
+        self.register_buffer("dynamics_error", torch.ones((), dtype=torch.float32))
         self.to(device)
         self.learning_rates = {"codec": codec_lr, "actor": actor_lr, "critics": critic_lr}
         self.optimizers = {
@@ -588,7 +590,7 @@ class HyAR(ReplayLearner):
             of_tried = None if allowed is None else allowed[:, None, None].expand(*shape, -1)
             discrete = random_choice(torch.Size(shape), self.specs.num_discrete, of_tried, state.device)
             e = self.codec.embeddings[discrete]
-        z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device) - 1.0
+        z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device, dtype=torch.float32) - 1.0
         num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * self.search_samples))
         best, value = in_pieces(partial(best_of_tried, self.critics), num_rows, state, torch.cat([e, z], -1))
         return best, (value - self.critics(state, proposals).amin(0)).clamp(min=0.0)

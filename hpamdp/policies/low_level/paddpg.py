@@ -92,7 +92,7 @@ class PADDPGPolicy(TensorDictModuleBase):
         self.actor = actor
         self.specs = specs
         self.noise = noise
-        self.register_buffer("epsilon", torch.ones(()))
+        self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:

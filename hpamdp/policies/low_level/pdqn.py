@@ -141,7 +141,7 @@ class PDQNPolicy(TensorDictModuleBase):
         self.critics = critics
         self.specs = specs
         self.noise = noise
-        self.register_buffer("epsilon", torch.ones(()))
+        self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
         variations = even_normal(greedy_samples, specs.num_parameters, greedy_noise)
         self.register_buffer("variations", variations, persistent=False)
 
@@ -156,7 +156,7 @@ class PDQNPolicy(TensorDictModuleBase):
         else:
             discrete = masked_values(self.critics(state, unit).amin(0), allowed).argmax(-1)
         if not is_greedy():
-            is_random = torch.rand(discrete.shape, device=discrete.device) < self.epsilon
+            is_random = torch.rand(discrete.shape, device=discrete.device, dtype=torch.float32) < self.epsilon
             noisy = (unit + self.noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
             unit = torch.where(is_random.unsqueeze(-1), 2.0 * torch.rand_like(unit) - 1.0, noisy)
             anything = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
@@ -303,7 +303,7 @@ class PDQN(ReplayLearner):
         next_state = rows["next_state"]
         rows["reward"] = reward
         rows["next_state"] = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
-        rows["discount"] = self.gamma**num_rewards * ~terminated.gather(-1, last)
+        rows["discount"] = self.gamma ** num_rewards.float() * ~terminated.gather(-1, last)
         for name in ("option_ended", "next_option"):
             if name in rows.keys():
                 rows[name] = rows[name].gather(-1, last)
@@ -359,7 +359,7 @@ class PDQN(ReplayLearner):
             them than with the actor's, `[B, num_discrete]`, at least 0.
         """
         shape = len(state), self.search_samples, self.specs.num_parameters
-        tried = 2.0 * torch.rand(shape, device=state.device) - 1.0
+        tried = 2.0 * torch.rand(shape, device=state.device, dtype=torch.float32) - 1.0
         best, place = best_of_tried(self.critics, state, tried)
         found = tried.gather(1, place[:, self.owner].unsqueeze(1)).squeeze(1)
         return found, (best - q).clamp(min=0.0)

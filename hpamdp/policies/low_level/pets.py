@@ -157,23 +157,23 @@ class PETSModel(nn.Module):
         self.transition = MemberNet(num_members, in_dim, transition_dims, dim * (2 if is_probabilistic else 1))
         self.outcome = MemberNet(num_members, in_dim + dim + feature_dim, outcome_dims, 3)
         # What a context means for a turned state is its direction alone: one model serves all of them.
-        is_input = torch.ones(dim)
+        is_input = torch.ones(dim, dtype=torch.float32)
         if self.frame.turns and self.frame.geometry is not None:
             is_input[self.frame.geometry.entries_of_contexts] = 0.0
         buffers = {
-            "state_mean": torch.zeros(dim),
-            "state_scale": torch.ones(dim),
-            "change_scale": torch.ones(dim),
+            "state_mean": torch.zeros(dim, dtype=torch.float32),
+            "state_scale": torch.ones(dim, dtype=torch.float32),
+            "change_scale": torch.ones(dim, dtype=torch.float32),
             "is_predicted": is_input.clone(),
             "is_changing": is_input.clone(),
-            "derivation": torch.eye(dim),
-            "reward_mean": torch.zeros(2),
-            "reward_scale": torch.ones(2),
-            "feature_mean": torch.zeros(feature_dim),
-            "feature_scale": torch.ones(feature_dim),
+            "derivation": torch.eye(dim, dtype=torch.float32),
+            "reward_mean": torch.zeros(2, dtype=torch.float32),
+            "reward_scale": torch.ones(2, dtype=torch.float32),
+            "feature_mean": torch.zeros(feature_dim, dtype=torch.float32),
+            "feature_scale": torch.ones(feature_dim, dtype=torch.float32),
         }
         if self.has_linear_part:
-            buffers["linear_weight"] = torch.zeros(in_dim + len(slots) + 1, dim)
+            buffers["linear_weight"] = torch.zeros(in_dim + len(slots) + 1, dim, dtype=torch.float32)
         for name, value in buffers.items():
             self.register_buffer(name, value)
         self.register_buffer("is_input", is_input, persistent=False)
@@ -429,13 +429,13 @@ class PETSPolicy(TensorDictModuleBase):
         allowed = self._allowed(observation, None if mask is None else mask.flatten(0, -2))
         allowed_now = None if allowed is None else allowed[:, 0]
         discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed_now, device)
-        unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device) - 1.0
+        unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
         is_planned = self.is_trained.expand(num)
         done = td.get(keys.DONE, None)
         if done is not None:
             is_planned = is_planned & ~done.flatten()
         if self.epsilon > 0.0 and not is_greedy():
-            is_planned = is_planned & (torch.rand(num, device=device) >= self.epsilon)
+            is_planned = is_planned & (torch.rand(num, device=device, dtype=torch.float32) >= self.epsilon)
         if is_planned.any():
             allowed = None if allowed is None else allowed[is_planned]
             found = self.plan(state[is_planned], member[is_planned] if self._follows_member else None, allowed)

@@ -97,12 +97,14 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         self.specs = specs
         self.phi = phi
         self.psi = psi
-        self.register_buffer("temperature", torch.tensor(temperature))
+        self.register_buffer("temperature", torch.tensor(temperature, dtype=torch.float32))
         self.register_buffer("samples_discrete", torch.tensor(True))
         self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
-        self.register_buffer("w", torch.zeros(specs.num_discrete, 1))
-        self.register_buffer("theta", torch.full((specs.num_parameters, 1), 0.0 if self.initial.exists else mean))
-        self.register_buffer("sigma", torch.tensor(sigma))
+        self.register_buffer("w", torch.zeros(specs.num_discrete, 1, dtype=torch.float32))
+        self.register_buffer(
+            "theta", torch.full((specs.num_parameters, 1), 0.0 if self.initial.exists else mean, dtype=torch.float32)
+        )
+        self.register_buffer("sigma", torch.tensor(sigma, dtype=torch.float32))
 
     def widen(self) -> None:
         """Append zeros to the weights to match the fitted bases; the policy stays the same."""
@@ -156,8 +158,8 @@ class SarsaLambda(SizedByData):
         self.gamma = gamma
         self.trace_decay = trace_decay
         self.step_bound = step_bound
-        self.register_buffer("step_size", torch.tensor(step_size))
-        self.register_buffer("traces", torch.zeros(0, 1, 1))
+        self.register_buffer("step_size", torch.tensor(step_size, dtype=torch.float32))
+        self.register_buffer("traces", torch.zeros(0, 1, 1, dtype=torch.float32))
 
     def update(self, w: Tensor, rows: TensorDict, temperature: Tensor, step_scale: Tensor) -> tuple[Tensor, Tensor]:
         """Make the updates of a batch: one for each time step and group of `envs_per_update` environments.
@@ -207,7 +209,7 @@ class SarsaLambda(SizedByData):
         """
         phi, next_phi, discrete = row["phi"], row["next_phi"], row["discrete"]
         envs = torch.arange(len(traces), device=w.device)
-        weight = row["mask"] / row["mask"].sum().clamp(min=1)
+        weight = row["mask"].float() / row["mask"].sum().clamp(min=1)
         traces *= self.gamma * self.trace_decay
         traces[envs, discrete] += phi
 
@@ -259,8 +261,8 @@ class NaturalActorCritic(SizedByData):
         self.ridge = ridge
         self.register_buffer("is_fresh", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("is_whole", torch.zeros(0, dtype=torch.bool))
-        self.register_buffer("regressors", torch.zeros(0, 0))
-        self.register_buffer("returns", torch.zeros(0))
+        self.register_buffer("regressors", torch.zeros(0, 0, dtype=torch.float32))
+        self.register_buffer("returns", torch.zeros(0, dtype=torch.float32))
         self.register_buffer("gram", torch.zeros(0, 0, dtype=torch.float64))
         self.register_buffer("moment", torch.zeros(0, dtype=torch.float64))
         self.register_buffer("num_episodes", torch.zeros((), dtype=torch.long))
@@ -315,7 +317,9 @@ class NaturalActorCritic(SizedByData):
             The first `num_weights` coefficients, which are the natural gradient, and the divergence that a step of
             size 1 along them causes, in nats an episode, `[]`.
         """
-        penalty = self.ridge * self.gram.diagonal().mean() * torch.eye(len(self.gram)).to(self.gram)
+        penalty = (
+            self.ridge * self.gram.diagonal().mean() * torch.eye(len(self.gram), dtype=torch.float32).to(self.gram)
+        )
         # With gelsy, the default on the CPU, the last digits differ from run to run, and a resumed run from its own.
         driver = "gelsd" if self.gram.device.type == "cpu" else None
         regression = torch.linalg.lstsq(self.gram + penalty, self.moment.unsqueeze(-1), driver=driver)
@@ -424,10 +428,10 @@ class QPAMDP(Learner):
         self.sarsa = SarsaLambda(gamma, trace_decay, step_size, step_bound, envs_per_update)
         self.enac = NaturalActorCritic(ridge)
         self.register_buffer("mask", specs.parameter_mask.float())
-        self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf))
-        self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf))
-        self.register_buffer("best_return", torch.tensor(-torch.inf))
-        self.register_buffer("window_return", torch.zeros(()))
+        self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf, dtype=torch.float32))
+        self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf, dtype=torch.float32))
+        self.register_buffer("best_return", torch.tensor(-torch.inf, dtype=torch.float32))
+        self.register_buffer("window_return", torch.zeros((), dtype=torch.float32))
         for name in ("frames", "phase", "window_episodes", "windows", "windows_since_best", "updates"):
             self.register_buffer(name, torch.zeros((), dtype=torch.long))
         self.to(device)
@@ -459,7 +463,7 @@ class QPAMDP(Learner):
             phi = self.policy.phi
             step_scale = phi.step_scale() if self.step_scaling else torch.ones_like(phi.coefficients[:, 0])
             self.policy.w, error = self.sarsa.update(self.policy.w, rows, self.policy.temperature, step_scale)
-            cooled = self.policy.temperature * self.temperature_decay**num_episodes
+            cooled = self.policy.temperature * self.temperature_decay ** num_episodes.float()
             self.policy.temperature = cooled.clamp(min=self.temperature_final)
             scalars["td_error"] = error.item()
             is_first = self.updates == 0 and self.windows == 0

@@ -67,9 +67,9 @@ class FourierBasis(SizedByData):
         self.order = order
         self.max_coupled = max_coupled
         self.register_buffer("inputs", torch.zeros(1, dtype=torch.long))
-        self.register_buffer("low", torch.zeros(1))
-        self.register_buffer("width", torch.ones(1))
-        self.register_buffer("coefficients", torch.zeros(1, 1))
+        self.register_buffer("low", torch.zeros(1, dtype=torch.float32))
+        self.register_buffer("width", torch.ones(1, dtype=torch.float32))
+        self.register_buffer("coefficients", torch.zeros(1, 1, dtype=torch.float32))
 
     def fit(self, inputs: Tensor, low: Tensor, high: Tensor) -> None:
         """Set the entries of the observation to use and their ranges.

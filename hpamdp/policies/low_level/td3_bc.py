@@ -67,7 +67,9 @@ class TD3BCPolicy(TensorDictModuleBase):
         self.critics = critics
         self.behaviour = behaviour
         self.specs = specs
-        self.log_threshold = torch.tensor(discrete_threshold).log().item()  # -inf where the threshold is 0
+        self.log_threshold = (
+            torch.tensor(discrete_threshold, dtype=torch.float32).log().item()
+        )  # -inf where the threshold is 0
         self.parameter_noise = parameter_noise
 
     def is_refused(self, state: Tensor, allowed: Tensor | None) -> Tensor:

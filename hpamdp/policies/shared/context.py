@@ -61,8 +61,10 @@ class ContextFeatures(nn.Module):
             self.register_buffer("factors", torch.tensor(list(monomials)))
         else:
             generator = torch.Generator().manual_seed(0)
-            self.register_buffer("directions", torch.randn(len(inputs), degree, generator=generator))
-            self.register_buffer("phases", 2.0 * math.pi * torch.rand(degree, generator=generator))
+            self.register_buffer(
+                "directions", torch.randn(len(inputs), degree, generator=generator, dtype=torch.float32)
+            )
+            self.register_buffer("phases", 2.0 * math.pi * torch.rand(degree, generator=generator, dtype=torch.float32))
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the features of observations `[*B, observation_dim]`, float64."""

@@ -46,22 +46,22 @@ class CanonicalFrame(nn.Module):
         self.turns = geometry is not None and geometry.directions is not None
         pairs = geometry.vectors if geometry is not None else ()
         origins = geometry.origins if geometry is not None and geometry.origins else [(0.0, 0.0)] * len(pairs)
-        directions = torch.zeros(1, specs.num_discrete, 2)
+        directions = torch.zeros(1, specs.num_discrete, 2, dtype=torch.float32)
         kind = torch.arange(specs.num_discrete)
         if geometry is not None and geometry.directions is not None:
             directions = geometry.directions
             kind = torch.tensor(geometry.kinds) if geometry.kinds else kind
         nowhere = directions.norm(dim=-1, keepdim=True) < 1e-6
-        directions = torch.where(nowhere, torch.tensor([1.0, 0.0]), directions)  # along +x already
+        directions = torch.where(nowhere, torch.tensor([1.0, 0.0], dtype=torch.float32), directions)  # along +x already
         x = torch.tensor([pair[0] for pair in pairs], dtype=torch.long)
         y = torch.tensor([pair[1] for pair in pairs], dtype=torch.long)
-        zeros = torch.zeros(specs.observation_dim)
+        zeros = torch.zeros(specs.observation_dim, dtype=torch.float32)
         # A quarter turn: the entry that takes the place of each one, and its sign; 0 for what is no vector.
         partner, partner_sign = torch.arange(specs.observation_dim), zeros.clone()
         partner[x], partner[y] = y, x
         partner_sign[x], partner_sign[y] = 1.0, -1.0
         origin = zeros.clone()
-        origin[x], origin[y] = torch.tensor(origins).reshape(-1, 2).unbind(-1)
+        origin[x], origin[y] = torch.tensor(origins, dtype=torch.float32).reshape(-1, 2).unbind(-1)
         buffers = {
             "directions": directions,
             "kind": kind,

@@ -72,7 +72,7 @@ def expectile_loss(excess: Tensor, expectile: float) -> Tensor:
         excess: of the targets over the predictions, `[B]`.
         expectile: of the targets, from .5, their mean, towards 1, the largest.
     """
-    return (torch.where(excess > 0.0, expectile, 1.0 - expectile) * excess.square()).mean()
+    return (torch.where(excess > 0.0, expectile, 1.0 - expectile).float() * excess.square()).mean()
 
 
 def gradients_of(

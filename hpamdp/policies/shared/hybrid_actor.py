@@ -133,10 +133,10 @@ class HybridActor(nn.Module):
         self.products = VectorProducts(specs) if vector_products else None
         self.num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
         self.encoder = encoder(self.num_inputs, hidden_dims)
-        self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete)
-        self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters)
+        self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete, dtype=torch.float32)
+        self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters, dtype=torch.float32)
         log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
-        self.register_buffer("log_min_scale", torch.tensor(log_min_scale))
+        self.register_buffer("log_min_scale", torch.tensor(log_min_scale, dtype=torch.float32))
         self.log_max_scale = log_max_scale
         fraction = (math.log(initial_scale) - log_min_scale) / (log_max_scale - log_min_scale)
         with torch.no_grad():
@@ -190,7 +190,7 @@ def encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
     """Return ReLU layers with orthogonal initial weights, for heads to stand on."""
     layers: list[nn.Module] = []
     for layer_in, layer_out in pairwise([in_dim, *hidden_dims]):
-        linear = nn.Linear(layer_in, layer_out)
+        linear = nn.Linear(layer_in, layer_out, dtype=torch.float32)
         nn.init.orthogonal_(linear.weight, math.sqrt(2.0))
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.ReLU(inplace=True)]

@@ -31,8 +31,10 @@ class EnsembleLinear(nn.Module):
     def __init__(self, num_members: int, in_dim: int, out_dim: int) -> None:
         super().__init__()
         bound = 1.0 / math.sqrt(in_dim)  # as in nn.Linear
-        self.weight = nn.Parameter(torch.empty(num_members, in_dim, out_dim).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.empty(num_members, 1, out_dim).uniform_(-bound, bound))
+        self.weight = nn.Parameter(
+            torch.empty(num_members, in_dim, out_dim, dtype=torch.float32).uniform_(-bound, bound)
+        )
+        self.bias = nn.Parameter(torch.empty(num_members, 1, out_dim, dtype=torch.float32).uniform_(-bound, bound))
 
     def forward(self, x: Tensor) -> Tensor:
         """Apply each member to its own slice of `x`; if there are fewer slices, apply the first members alone."""
@@ -87,8 +89,8 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     dims = [in_dim, *hidden_dims]
     layers: list[nn.Module] = []
     for size, next_size in pairwise(dims):
-        layers += [nn.Linear(size, next_size), nn.ReLU(inplace=True)]
-    return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim))
+        layers += [nn.Linear(size, next_size, dtype=torch.float32), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim, dtype=torch.float32))
 
 
 def sample_index(logits: Tensor) -> Tensor:
@@ -130,12 +132,12 @@ def even_normal(num: int, dim: int, deviation: float) -> Tensor:
         ValueError: there are too many dimensions.
     """
     if num == 0 or dim == 0:
-        return torch.zeros(num, dim)
+        return torch.zeros(num, dim, dtype=torch.float32)
     if dim > SobolEngine.MAXDIM:
         raise ValueError(
             f"greedy_samples={num}: {dim} parameters are more than {SobolEngine.MAXDIM}; use greedy_samples=0"
         )
-    uniform = SobolEngine(dim, scramble=True, seed=0).draw(num)
+    uniform = SobolEngine(dim, scramble=True, seed=0).draw(num, dtype=torch.float32)
     return deviation * torch.special.ndtri(uniform.clamp(1e-6, 1.0 - 1e-6))
 
 
@@ -186,7 +188,11 @@ class VectorProducts(nn.Module):
                 "vector_products=true: the problem declares no two vectors of the plane; use vector_products=false"
             )
         self.register_buffer("entries", torch.tensor(geometry.vectors), persistent=False)
-        origins = torch.tensor(geometry.origins) if geometry.origins else torch.zeros(self.entries.shape)
+        origins = (
+            torch.tensor(geometry.origins, dtype=torch.float32)
+            if geometry.origins
+            else torch.zeros(self.entries.shape, dtype=torch.float32)
+        )
         self.register_buffer("origins", origins, persistent=False)
         self.register_buffer("pairs", torch.combinations(torch.arange(len(self.entries))).mT, persistent=False)
         self.num_outputs = specs.observation_dim + 2 * self.pairs.shape[-1]
@@ -241,8 +247,8 @@ class InitialLayer(nn.Module):
         self.exists = choice == "domain" and specs.initial_weight is not None
         self.is_squashed = is_squashed
         if self.exists:
-            self.register_buffer("weight", torch.tensor(specs.initial_weight))
-            self.register_buffer("bias", torch.tensor(specs.initial_bias))
+            self.register_buffer("weight", torch.tensor(specs.initial_weight, dtype=torch.float32))
+            self.register_buffer("bias", torch.tensor(specs.initial_bias, dtype=torch.float32))
 
     def forward(self, observation: Tensor) -> Tensor | float:
         """Return what to add for observations `[*B, observation_dim]`: `[*B, num_parameters]`, or 0."""

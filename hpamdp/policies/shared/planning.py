@@ -293,5 +293,5 @@ def _stratified(shape: Sequence[int], device: torch.device) -> Tensor:
 
     The order of the intervals is the same for all N, since sorting takes longer than all else.
     """
-    stratum = torch.rand(shape[1:], device=device).argsort(1)
-    return ((stratum + torch.rand(shape, device=device)) / shape[2]).clamp_(1e-6, 1.0 - 1e-6)
+    stratum = torch.rand(shape[1:], device=device, dtype=torch.float32).argsort(1)
+    return ((stratum + torch.rand(shape, device=device, dtype=torch.float32)) / shape[2]).clamp_(1e-6, 1.0 - 1e-6)

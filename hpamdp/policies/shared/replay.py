@@ -179,7 +179,7 @@ class ReplayLearner(Learner):
                 "unit": self.specs.to_unit(batch[keys.PARAMETERS]),
                 "reward": self.reward_scale * batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
-                "discount": self.gamma * ~batch["next", keys.TERMINATED].squeeze(-1),
+                "discount": self.gamma * (~batch["next", keys.TERMINATED]).squeeze(-1).float(),
             },
             batch_size=batch.shape,
         )
