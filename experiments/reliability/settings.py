@@ -15,6 +15,12 @@ import yaml
 
 CONF = command_line.REPOSITORY / "conf"
 SMALL = ["num_envs=4", "steps_per_batch=2", "total_frames=16", "eval.layouts=4", "eval.every=0"]
+# What lets learners and selectors make an update in so short a run.
+SHORT = {
+    "warmup_frames": 8, "warmup_steps": 8, "warmup_decisions": 8, "minibatch_size": 8, "updates_per_step": 0.5,
+    "updates_per_decision": 0.5, "updates_per_frame": 0.5, "codec_pretrain_updates": 2,
+}  # fmt: skip
+DEFAULTS = {"high": "ucb", "low": "hyar"}
 # What a value of each type can never be.
 WRONG: dict[type, tuple[str, ...]] = {
     int: ("banana", "[1,2]", "-7", "1.5", "nan", "1e12", "null"),
@@ -86,6 +92,17 @@ def generated() -> list[str]:
     return words
 
 
+def short(given: list[str]) -> list[str]:
+    """Return the words that make the warm-ups of the chosen learner and selector short."""
+    chosen = DEFAULTS | dict(word.split("=", 1) for word in given if word.startswith(("high=", "low=")))
+    words = []
+    for group, choice in chosen.items():
+        file = CONF / group / f"{choice}.yaml"
+        options = yaml.safe_load(file.read_text()) if choice.isidentifier() and file.is_file() else {}
+        words += [f"{group}.{option}={value}" for option, value in SHORT.items() if option in options]
+    return words
+
+
 def _is_number(value: Any) -> bool:
     # YAML reads 1e-3 as a word.
     if isinstance(value, str):
@@ -112,7 +129,7 @@ def main() -> None:
         for number, case in enumerate(cases):
             given = case.split(" ")
             keys = {word.partition("=")[0] for word in given}
-            small = [word for word in SMALL if word.partition("=")[0] not in keys]
+            small = [word for word in [*SMALL, *short(given)] if word.partition("=")[0] not in keys]
             ending = command_line.run([*small, *given], Path(temporary) / str(number), 60.0)
             if ending.code == 2 and ending.is_one_line:
                 kind = "one line"
