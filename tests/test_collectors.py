@@ -1,8 +1,10 @@
 """Collection beyond one process: the same batches, the learner's weights, and nothing left running."""
 
+import importlib
 import importlib.util
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -13,10 +15,26 @@ import pytest
 import torch
 from conftest import CONF, OF_EACH_KIND, TRAINED, compose_config, make_config
 
+from hpamdp import keys
 from hpamdp.config import ConfigError
+from hpamdp.env.base import ProblemError
+from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
-from hpamdp.run.collection.worker import EnvShard, PolicyCopy, packed, unpack
+from hpamdp.run.collection.base import CollectionError, WorkerDiedError
+from hpamdp.run.collection.limits import limit_of
+from hpamdp.run.collection.ray import _check_answers
+from hpamdp.run.collection.worker import (
+    EnvShard,
+    PolicyCopy,
+    RemoteError,
+    RemoteShard,
+    ShardCollector,
+    WorkingDir,
+    packed,
+    unpack,
+)
+from hpamdp.run.collection.workers import WorkerCollection
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
@@ -43,7 +61,7 @@ def make(folder, *overrides):
 def share(folder, *overrides, first_env=0, num_envs=8, low=None):
     config = make_config([*SMALL, *overrides])
     specs = assemble(config, folder).agent.specs
-    return EnvShard(config, specs, first_env, num_envs, exploration_seed=0, low=low)
+    return EnvShard(config, specs, first_env, num_envs, env_seed=0, exploration_seed=0, low=low)
 
 
 def leaves(batch):
@@ -129,7 +147,7 @@ def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
     parts = assemble(config, tmp_path)
     collection = config.collector.build(config=config, parts=parts, frames=0)
     torch.manual_seed(1)
-    copy = EnvShard(config, parts.agent.specs, 0, 8, exploration_seed=1, low=None).make_policy()
+    copy = EnvShard(config, parts.agent.specs, 0, 8, env_seed=0, exploration_seed=1, low=None).make_policy()
     for _ in range(2):
         parts.agent.learn(collection.next())
     batch = collection.next()[:, 0].select(*parts.policy.in_keys, strict=False)
@@ -245,6 +263,174 @@ def test_a_missing_ray_is_told_with_its_cure(monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ray" else find(name))
     with pytest.raises(ConfigError, match=r"collector=ray: ray is not installed; pip install hpamdp\[ray\]"):
         run(compose_config([*SMALL, "collector=ray"]), tmp_path)
+
+
+class InProcess:
+    """Has the interface of TorchRL's collector of one worker, but steps the environments in this process."""
+
+    def __init__(self, shard):
+        self.deaths = []  # the names of the methods that will be its last
+        env, policy = shard.make_env(), shard.make_policy()
+        frames = shard.num_envs * shard.config.run.steps_per_batch
+        self.collector = ShardCollector(
+            env, policy, frames_per_batch=frames, total_frames=-1, auto_register_policy_transforms=False
+        )
+
+    def map_fn(self, method, arguments):
+        if method in self.deaths:
+            raise EOFError
+        return [self.collector.cascade_execute(method, *arguments[0])]
+
+    def shutdown(self):
+        pass
+
+
+class Mortal(WorkerCollection):
+    """A collection whose workers live in this process, and die if a test says so."""
+
+    def __init__(self, folder, max_restarts, *overrides):
+        config = make_config([*SMALL, "high=ucb", *overrides])
+        self.parts = assemble(config, folder)
+        self.shards = []
+        super().__init__(config, self.parts, 0, 2, ahead=False, max_restarts=max_restarts)
+
+    def _start(self, shard):
+        self.shards.append(shard)
+        return InProcess(shard)
+
+    def _death(self, worker, error):
+        return "murder" if isinstance(error, EOFError) else None
+
+    def kill(self, number, at="collect"):
+        self._workers[number].deaths.append(at)
+
+
+def test_a_replaced_worker_begins_new_episodes_and_counts_no_half_ones(tmp_path):
+    with closing(Mortal(tmp_path, 9, "steps_per_batch=3")) as collection:
+        sums, starts = torch.zeros(8), 0
+        for i in range(9):
+            if i % 3 == 1:
+                collection.kill(i % 2)
+            before = collection.state()["root"]["observation"]
+            batch = collection.next()
+            assert batch.shape == (8, 3)
+            is_killed = (torch.arange(8) // 4 == i % 2) & (i % 3 == 1)
+            assert ((before == batch["observation"][:, 0]).all(-1) == ~is_killed).all()
+            for step in batch.unbind(-1):
+                is_first = step[keys.EPISODE_STEPS].squeeze(-1) == 0
+                starts += int(is_first.sum())
+                sums = torch.where(is_first, 0.0, sums) + step["next", keys.REWARD].squeeze(-1)
+                torch.testing.assert_close(step["next", keys.EPISODE_RETURN].squeeze(-1), sums)
+        assert starts > 8
+        name = "collector=single: worker {} of 2 died (murder); it was replaced (restart {} of 9)"
+        assert collection.notices() == [name.format(1, 1), name.format(0, 2), name.format(1, 3)]
+        assert collection.notices() == []
+        seeds = {(shard.first_env, shard.env_seed, shard.exploration_seed) for shard in collection.shards}
+        assert len(seeds) == 5 and len({shard.exploration_seed for shard in collection.shards}) == 5
+        assert [shard.env_seed for shard in collection.shards[:2]] == [0, 0]
+
+
+@pytest.mark.parametrize("at", ["policy.generator_state", "_carrier.to_dict"])
+def test_a_worker_that_dies_while_its_state_is_read_is_replaced_as_a_whole(at, tmp_path):
+    with closing(Mortal(tmp_path, 1)) as collection:
+        collection.next()
+        collection.kill(0, at)
+        state = collection.state()
+        assert (state["root"][keys.EPISODE_STEPS][:4] == 0).all()
+        assert torch.equal(state["root"]["observation"][4:], collection.next()["observation"][4:, 0])
+
+
+def test_the_death_after_the_last_restart_ends_the_run_with_the_last_known_state(tmp_path):
+    with closing(Mortal(tmp_path, 1)) as collection:
+        collection.next()
+        state = collection.state()
+        collection.kill(1)
+        collection.next()
+        collection.kill(1, "env.env_state")
+        collection.kill(1)
+        assert collection.state() is state
+        with pytest.raises(WorkerDiedError, match=r"worker 1 of 2 died \(murder\)$"):
+            collection.next()
+        assert collection.state() is state
+
+
+@pytest.mark.parametrize(
+    ("error", "kind", "text"),
+    [
+        (ProblemError("gave\nnothing"), ProblemError, "gave\nnothing"),
+        (RuntimeError("a\nbug"), RemoteError, "RuntimeError: a bug\n\nIn a worker:\nTraceback"),
+        (OSError(28, "No space left on device"), RemoteError, "OSError: "),
+        (MemoryError("too much"), MemoryError, "too much"),
+    ],
+)
+def test_an_error_in_a_workers_environment_is_no_death(error, kind, text, tmp_path, monkeypatch):
+    def failing(self, td):
+        raise error
+
+    with closing(Mortal(tmp_path, 5)) as collection:
+        with monkeypatch.context() as patch, pytest.raises(kind) as raised:
+            patch.setattr(BoatDockEnv, "_step", failing)
+            collection.next()
+        assert str(raised.value).startswith(text) and collection.notices() == []
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(28, "No space left on device"), "shared memory is full (/dev/shm"),
+        (RuntimeError("unable to mmap 64 bytes from file </torch_1>: No space left on device (28)"), "--shm-size"),
+        (OSError(24, "Too many open files"), "ulimit -n is"),
+        (RuntimeError("unable to open shared memory object </t>: Too many open files (24)"), "ulimit -n is"),
+        (RuntimeError("received 0 items of ancdata"), "use fewer workers"),
+        (BlockingIOError(11, "Resource temporarily unavailable"), "ulimit -u is"),
+        (RuntimeError("can't start new thread"), "ulimit -u is"),
+        (RuntimeError("a bug"), None),
+        (ValueError("No space left on device"), None),
+    ],
+)
+def test_a_limit_of_the_machine_is_told_with_its_cure(error, words, tmp_path, monkeypatch):
+    assert limit_of(error) is None if words is None else words in limit_of(error)
+    if words is not None:
+        monkeypatch.setattr(Mortal, "_start", lambda self, shard: (_ for _ in ()).throw(error))
+        with pytest.raises(CollectionError, match=r"^collector=single: ") as raised:
+            Mortal(tmp_path, 0)
+        assert words in str(raised.value) and "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1:1", "ray://127.0.0.1:1", "no.such.host.invalid:6379", "localhost:99999"]
+)
+def test_a_cluster_that_does_not_answer_is_told_in_one_line(address):
+    with pytest.raises(CollectionError, match=f"^collector.address={address}: does not answer") as raised:
+        _check_answers(address)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_shard_elsewhere_finds_the_users_classes_after_all_packages(tmp_path, monkeypatch):
+    monkeypatch.chdir("/")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    sent = pickle.dumps(RemoteShard(WorkingDir(str(tmp_path)), share(tmp_path)).make_env)
+    assert pickle.loads(sent)().batch_size == (8,)
+    assert sys.path[-1] == str(tmp_path) == os.getcwd()
+    (tmp_path / "own_problem.py").write_text("class Own: pass")
+    own = importlib.import_module("own_problem").Own()
+    sent = pickle.dumps(RemoteShard(WorkingDir(str(tmp_path)), own))
+    sys.path.remove(str(tmp_path))
+    del sys.modules["own_problem"]
+    assert type(pickle.loads(sent).shard).__name__ == "Own"
+
+
+def test_a_worker_that_is_killed_is_replaced(workers):
+    collection = workers[1]
+    collection._max_restarts = 1
+    assert collection.next().shape == (8, 4)
+    first, other = collection._workers
+    collection._kill(first)
+    batch = collection.next()
+    assert batch.shape == (8, 4) and (batch[keys.EPISODE_STEPS][:4, 0] == 0).all()
+    assert collection._workers[0] is not first and collection._workers[1] is other
+    (notice,) = collection.notices()
+    assert "worker 0 of 2 died (" in notice and notice.endswith("; it was replaced (restart 1 of 1)")
 
 
 @pytest.mark.slow

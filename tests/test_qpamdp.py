@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, SarsaLambda
+from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, NaturalActorCritic, SarsaLambda
 from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients, num_fourier_features
 from hpamdp.specs import PAMDPSpecs
 
@@ -145,6 +145,24 @@ def test_sarsa_matches_a_computation_by_hand():
     w3 = [w2[0] + 0.05 * (error_0 + 0.25 * error_1), w2[1] + 0.05 * 2.0 * error_1]
     torch.testing.assert_close(got, torch.tensor(w3).unsqueeze(-1))
     assert (sarsa.traces == 0.0).all()
+
+
+def test_an_abandoned_episode_leaves_nothing_to_the_next_one_of_its_environment():
+    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.1, step_bound="each_step")
+    goes_on = [[False], [False]]
+    rows = sarsa_rows([[[1.0]], [[1.0]]], [[[2.0]], [[2.0]]], [[0], [0]], [[1.0], [1.0]], goes_on, goes_on)
+    rows["is_first"] = torch.tensor([[True], [False]])
+    for _ in range(2):
+        sarsa.update(torch.tensor([[1.0], [2.0]]), rows, ONE, ONE)
+    torch.testing.assert_close(sarsa.traces[..., 0], torch.tensor([[1.0, 0.0], [1.25, 0.0]]))
+
+    regression = NaturalActorCritic(ridge=0.0)
+    regression.restart(2, torch.tensor([True, True]))
+    rows["gradient"] = torch.ones(2, 1, 1)
+    for _ in range(2):
+        regression.collect(rows)
+    torch.testing.assert_close(regression.regressors, torch.tensor([[1.0, 1.0], [2.0, 1.0]]))
+    torch.testing.assert_close(regression.returns, torch.tensor([1.0, 2.0]))
 
 
 def test_the_bound_shortens_sarsas_step_to_cancel_the_error():

@@ -24,6 +24,7 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.messages import LenientStream, warn
 from hpamdp.policies.low_level.pdqn import PDQN
 from hpamdp.run import checkpoint
+from hpamdp.run.folder import is_about_folder
 from hpamdp.run.train import DIVERGED_NAME, run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=512", "eval.layouts=4", "eval.every=0", "high=ucb"]
@@ -278,3 +279,19 @@ def test_a_folder_that_is_deleted_while_the_run_goes_on_ends_it_in_one_line(tmp_
     assert exit_code(process) == 1
     (line,) = [line for line in lines_of(printed) if "steps/s" not in line]
     assert str(tmp_path / "run") in line and "No such file" in line
+
+
+@pytest.mark.parametrize(
+    ("error", "is_told"),
+    [
+        (OSError(28, "No space left on device"), True),  # of a write to an open file
+        (OSError(28, "No space left on device", "{folder}/metrics.csv"), True),
+        (OSError(28, "No space left on device", "/dev/shm/sem.mp-1"), False),
+        (OSError(30, "Read-only file system", "/elsewhere"), False),
+        (FileNotFoundError(2, "No such file or directory", "{folder}/metrics.csv"), True),
+    ],
+)
+def test_a_full_disk_is_blamed_on_the_runs_folder_only_if_a_file_there_is_meant(error, is_told, tmp_path):
+    if error.filename is not None:
+        error.filename = error.filename.format(folder=tmp_path)
+    assert is_about_folder(error, tmp_path) is is_told

@@ -186,10 +186,14 @@ def _bring_back(folder: Path) -> None:
 
 
 def is_about_folder(error: OSError, folder: Path) -> bool:
-    """Return whether the run's folder cannot be made or written to, or is gone."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS):
-        return True
-    return error.filename is not None and Path(str(error.filename)).is_relative_to(folder)
+    """Return whether the run's folder cannot be made or written to, or is gone.
+
+    An error of a write to an open file names no file. What processes share is no file of the run, and its errors are
+    told by the collection.
+    """
+    if error.filename is not None:
+        return Path(str(error.filename)).is_relative_to(folder)
+    return error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def written_by_a_run(folder: Path) -> list[Path]:

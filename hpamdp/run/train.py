@@ -21,7 +21,7 @@ from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
-from hpamdp.run.collection.base import Collection, WorkerDiedError
+from hpamdp.run.collection.base import Collection, CollectionError
 from hpamdp.run.folder import (
     CONFIG_NAME,
     DIVERGED_NAME,
@@ -60,8 +60,8 @@ def run(
     """Train or score an agent, write everything under `output_dir`, return the exit code.
 
     0: the run reached its end. 130: it was stopped by a signal, and saved. 3: a reward, a loss or a weight was not
-    finite; the last good checkpoint is kept. 1: a worker process died, or somebody else's code called `sys.exit`; what
-    was learned is saved.
+    finite; the last good checkpoint is kept. 1: a worker process died or could not start, or somebody else's code
+    called `sys.exit`; what was learned is saved.
 
     Args:
         cfg: the composed config.
@@ -121,8 +121,10 @@ def _run(
         except DivergedError as error:
             tell(f"{error} at frame {trainer.frames:,}: training stopped; {trainer.keep_for_inspection()}")
             return DIVERGED
-        except WorkerDiedError as error:
-            tell(f"{error} at frame {trainer.frames:,}; to go on: {_resuming(config, output_dir)}")
+        except CollectionError as error:
+            has_learned = (output_dir / checkpoint.FILE_NAME).is_file()
+            saved = f"to go on: {_resuming(config, output_dir)}" if has_learned else "nothing was learned"
+            tell(f"{error} at frame {trainer.frames:,}; {saved}")
             return FAILED
     say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, is_finished=not is_interrupted))
     say(f"Everything is in {output_dir}")
@@ -274,7 +276,10 @@ class Trainer:
                 if self.parts.data is not None:
                     self.parts.agent.add_demonstrations(self.parts.data.batch, self.parts.data.decisions)
             while not self._is_over() and request.signal is None:
-                num = self._learn(collection)
+                try:
+                    num = self._learn(collection)
+                finally:
+                    _tell_notices(collection, bar)
                 last = self.frames
                 self.frames += num
                 take_time()
@@ -390,6 +395,12 @@ def check_scalars(scalars: Mapping[str, float]) -> None:
     for name, value in scalars.items():
         if not math.isfinite(value):
             raise DivergedError(f"{name} is {value}")
+
+
+def _tell_notices(collection: Collection, bar: tqdm) -> None:
+    for notice in collection.notices():
+        bar.clear()
+        warn(notice)
 
 
 def _is_due(before: int, now: int, every: int) -> bool:

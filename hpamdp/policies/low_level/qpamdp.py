@@ -168,7 +168,8 @@ class SarsaLambda(SizedByData):
             w: weights `[num_discrete, num_features]`.
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
                 `done` and `mask` `[N, T]`; only the rows in `mask` count. `next_allowed` `[N, T, num_discrete]`: the
-                discrete actions that may be taken in the next states, if not all.
+                discrete actions that may be taken in the next states, if not all. `is_first` `[N, T]`: whether a row
+                begins an episode, if that is known; the episode before it may have been abandoned.
             temperature: of the softmax policy, `[]`.
             step_scale: factors on the steps of the features' weights, `[num_features]`.
 
@@ -178,6 +179,8 @@ class SarsaLambda(SizedByData):
         num_envs, num_steps = rows.shape
         if self.traces.shape != (num_envs, *w.shape):
             self.traces = w.new_zeros(num_envs, *w.shape)
+        if "is_first" in rows.keys():
+            self.traces[rows["is_first"][:, 0]] = 0.0
         # The action at the next time step; -1 in the last column, where it is not known.
         next_discrete = F.pad(rows["discrete"][:, 1:], (0, 1), value=-1)
         size = num_envs if self.envs_per_update is None else self.envs_per_update
@@ -287,8 +290,10 @@ class NaturalActorCritic(SizedByData):
 
         Args:
             rows: `[N, T]` with `gradient` `[N, T, num_weights]`, `phi` `[N, T, num_features]`, and `reward`, `done` and
-                `mask` `[N, T]`; only the episodes whose last row is in `mask` count.
+                `mask` `[N, T]`; only the episodes whose last row is in `mask` count. `is_first` as for `SarsaLambda`.
         """
+        if "is_first" in rows.keys():
+            self.is_fresh = self.is_fresh | rows["is_first"][:, 0]
         ended_regressors: list[Tensor] = []
         ended_returns: list[Tensor] = []
         for t in range(rows.shape[1]):
@@ -525,6 +530,9 @@ class QPAMDP(Learner):
             "done": option_ends(batch).squeeze(-1),
             "mask": mask,
         }
+        episode_steps = batch.get(keys.EPISODE_STEPS, None)
+        if episode_steps is not None:
+            rows["is_first"] = episode_steps.squeeze(-1) == 0
         if self.phase == SARSA:
             next_observation = batch["next", keys.OBSERVATION]
             rows["next_phi"] = self.policy.phi(next_observation)

@@ -9,7 +9,11 @@ from typing import Any, ClassVar
 from tensordict import TensorDictBase
 
 
-class WorkerDiedError(RuntimeError):
+class CollectionError(Exception):
+    """Other processes cannot start or go on; told in one line."""
+
+
+class WorkerDiedError(CollectionError):
     """A worker process that ended before the run did."""
 
 
@@ -31,9 +35,13 @@ class Collection:
         """Collect a batch `[num_envs, steps_per_batch]`.
 
         Raises:
-            WorkerDiedError: another process died.
+            CollectionError: another process died, or this machine does not let it go on.
         """
         raise NotImplementedError
+
+    def notices(self) -> list[str]:
+        """Return the lines for the user since the last call, such as of a worker that was replaced."""
+        return []
 
     @abstractmethod
     def state(self) -> dict[str, Any]:

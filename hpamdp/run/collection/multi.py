@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import signal
-from collections.abc import Sequence
 from multiprocessing import connection, resource_tracker
 
-from pydantic import PositiveInt
+from pydantic import NonNegativeInt, PositiveInt
 from torchrl.collectors import MultiSyncCollector
 
 from hpamdp.config import Config
+from hpamdp.messages import warn
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.worker import EnvShard
-from hpamdp.run.collection.workers import WorkerCollection, children_without
+from hpamdp.run.collection.limits import full_shared_memory
+from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
+from hpamdp.run.collection.workers import WorkerCollection, children_without, modules_here_last
 from hpamdp.run.stopping import STOP_SIGNALS
 
 _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an exit code
@@ -21,36 +23,52 @@ _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an e
 class MultiCollection(WorkerCollection):
     """Steps the environments in processes of TorchRL's MultiSyncCollector, which write into shared memory."""
 
-    def __init__(self, config: Config, parts: Parts, frames: int, *, num_workers: PositiveInt, ahead: bool) -> None:
-        super().__init__(config, parts, frames, num_workers, ahead=ahead)
-
-    def _death(self) -> str | None:
-        workers = self._collector.procs
-        ended = connection.wait([worker.sentinel for worker in workers if not worker._closed], _PATIENCE_S)
-        for i, worker in enumerate(workers):
-            if worker._closed or worker.sentinel not in ended:
-                continue
-            worker.join(_PATIENCE_S)  # its files are closed before it has an exit code
-            code = worker.exitcode
-            if code is None:
-                continue
-            why = f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
-            return f"collector=multi: worker {i} of {len(workers)} died ({why})"
-        return None
-
-    def _start(self, shares: Sequence[EnvShard], config: Config) -> MultiSyncCollector:
+    def __init__(
+        self,
+        config: Config,
+        parts: Parts,
+        frames: int,
+        *,
+        num_workers: PositiveInt,
+        ahead: bool,
+        max_restarts: NonNegativeInt = 0,
+    ) -> None:
+        num_cpus = len(os.sched_getaffinity(0))
+        if num_workers > num_cpus:
+            warn(f"collector.num_workers={num_workers}: more than the {num_cpus} CPUs there are, which they will share")
         # multiprocessing unblocks the signals when it starts this helper of its own.
-        resource_tracker.ensure_running()
+        with modules_here_last():
+            resource_tracker.ensure_running()
+        super().__init__(config, parts, frames, num_workers, ahead=ahead, max_restarts=max_restarts)
+
+    def _start(self, shard: EnvShard) -> MultiSyncCollector:
         # A terminal sends its Ctrl-C, and a cluster its stop, to every process of a run.
         with children_without(*STOP_SIGNALS):
             return MultiSyncCollector(
-                [share.make_env for share in shares],
-                policy_factory=[share.make_policy for share in shares],
-                frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
+                [shard.make_env],
+                policy_factory=[shard.make_policy],
+                frames_per_batch=shard.num_envs * self._config.run.steps_per_batch,
                 total_frames=-1,
                 device="cpu",
-                num_threads=config.run.threads,
-                cat_results=0,
+                num_threads=self._config.run.threads,
+                collector_class=SharedMemoryCollector,
                 use_buffers=True,
                 auto_register_policy_transforms=False,
             )
+
+    def _kill(self, worker: MultiSyncCollector) -> None:
+        worker.procs[0].kill()
+
+    def _death(self, worker: MultiSyncCollector | None, error: Exception) -> str | None:
+        if worker is None:
+            return "as it started" if isinstance(error.__cause__, EOFError) else None
+        process = worker.procs[0]
+        if not connection.wait([process.sentinel], _PATIENCE_S):
+            return None
+        process.join(_PATIENCE_S)  # its files are closed before it has an exit code
+        code = process.exitcode
+        if code is None:
+            return None
+        if code == -signal.SIGBUS:
+            return f"signal {signal.SIGBUS}, SIGBUS: {full_shared_memory()}"
+        return f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
+import socket
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar, NoReturn
 
-from pydantic import PositiveInt
-from tensordict import TensorDictBase
+from pydantic import NonNegativeInt, PositiveInt
 from torchrl.collectors.distributed import RayCollector
 
 from hpamdp.config import Config
+from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.worker import EnvShard
+from hpamdp.run.collection.base import CollectionError
+from hpamdp.run.collection.worker import EnvShard, RemoteShard, ShardCollector, WorkingDir
 from hpamdp.run.collection.workers import WorkerCollection, children_without
 from hpamdp.run.stopping import STOP_SIGNALS
+
+_CONNECT_S = 10.0  # until a cluster's address must have answered
+_SLOW_START_S = 120.0
+_SLOW = f"an actor has not started after {_SLOW_START_S:.0f} s; the run waits for it, see `ray status` and Ray's logs"
 
 
 class RayCollection(WorkerCollection):
@@ -34,35 +42,117 @@ class RayCollection(WorkerCollection):
         *,
         num_workers: PositiveInt,
         ahead: bool,
+        max_restarts: NonNegativeInt = 0,
         address: str | None = None,
     ) -> None:
-        self.address = address
-        super().__init__(config, parts, frames, num_workers, ahead=ahead)
-
-    def _start(self, shares: Sequence[EnvShard], config: Config) -> RayCollector:
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        # The learner waits for its actors, to which a local Ray would give niceness 15.
-        os.environ.setdefault("RAY_worker_niceness", "0")
-        # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
-        own = {"address": "local", "num_cpus": len(shares), "include_dashboard": False}
-        init = own if self.address is None else {"address": self.address}
-        # It misses weights to send; `receive` is there for them.
+        # It misses weights to send; `collect` is there for them.
         for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
             warnings.filterwarnings("ignore", message=warning)
-        # Ray ends its own processes by SIGTERM.
-        with children_without(*(number for number in STOP_SIGNALS if number != signal.SIGTERM)):
+        _connect(address, num_workers)
+        super().__init__(config, parts, frames, num_workers, ahead=ahead, max_restarts=max_restarts)
+
+    def _start(self, shard: EnvShard) -> RayCollector:
+        remote = RemoteShard(WorkingDir(os.getcwd()), shard)
+        late = threading.Timer(_SLOW_START_S, warn, [f"{self.name}: {_SLOW}"])
+        late.start()
+        try:
             return RayCollector(
-                [share.make_env for share in shares],
-                policy_factory=[share.make_policy for share in shares],
-                frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
+                [remote.make_env],
+                policy_factory=[remote.make_policy],
+                frames_per_batch=shard.num_envs * self._config.run.steps_per_batch,
                 total_frames=sys.maxsize,  # it has no sign for endless
                 device="cpu",
-                ray_init_config={**init, "log_to_driver": False, "logging_level": "warning"},
                 remote_configs={"num_cpus": 1},
+                collector_class=ShardCollector,
                 collector_kwargs={"auto_register_policy_transforms": False},
                 weight_sync_schemes={},
                 sync=True,
             )
+        finally:
+            late.cancel()
 
-    def _joined(self, batch: TensorDictBase) -> TensorDictBase:
-        return batch.flatten(0, 1)
+    def _kill(self, worker: RayCollector) -> None:
+        import ray
+
+        ray.kill(worker.remote_collectors[0])
+
+    def _raise_explained(self, number: int, error: Exception) -> NoReturn:
+        from ray.exceptions import RayTaskError
+
+        # Ray wraps an actor's error into one whose text is a traceback.
+        super()._raise_explained(number, error.cause if isinstance(error, RayTaskError) else error)
+
+    def _death(self, worker: RayCollector | None, error: Exception) -> str | None:
+        from ray.exceptions import RayActorError
+
+        if not isinstance(error, RayActorError):
+            return None
+        text = str(error)
+        if error.actor_init_failed:
+            return f"as it started: {one_line(text.strip().splitlines()[-1])}"
+        node = re.search(r"^\s*ip: (\S+)$", text, re.MULTILINE)
+        why = re.search(r"(?:is dead because|died because) (.*?)\.(?:\s|$)", text)
+        where = f"on {node.group(1)}" if node else "on an unknown node"
+        return f"{where}: {one_line(why.group(1))}" if why else f"{where}: {first_line(text)}"
+
+    def close(self) -> None:
+        """End the actors, and Ray itself if it was started for the run."""
+        import ray
+
+        super().close()
+        ray.shutdown()
+
+
+def _connect(address: str | None, num_workers: int) -> None:
+    """Start Ray on this machine for the time of the run, or connect to a running cluster.
+
+    Raises:
+        CollectionError: Ray does not start, or the cluster does not answer.
+    """
+    import ray
+
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    # The learner waits for its actors, to which a local Ray would give niceness 15.
+    os.environ.setdefault("RAY_worker_niceness", "0")
+    # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
+    init: dict[str, Any] = {"address": "local", "num_cpus": num_workers, "include_dashboard": False}
+    if address is not None:
+        _check_answers(address)
+        init = {"address": address}
+    on_sigterm = signal.getsignal(signal.SIGTERM)  # which Ray replaces
+    working_dir = os.getcwd()
+    try:
+        # Ray has its workers search the working directory before all packages.
+        os.chdir(Path(__file__).parents[3])
+        # Ray ends its own processes by SIGTERM.
+        with children_without(*(number for number in STOP_SIGNALS if number != signal.SIGTERM)):
+            ray.init(**init, log_to_driver=False, logging_level="warning")
+    except Exception as error:  # of many classes
+        what = "does not start" if address is None else "does not answer"
+        raise CollectionError(f"{_named(address)}: Ray {what} ({first_line(error)})") from error
+    finally:
+        os.chdir(working_dir)
+        if signal.getsignal(signal.SIGTERM) is not on_sigterm:
+            signal.signal(signal.SIGTERM, on_sigterm)
+    num_cpus = int(ray.cluster_resources().get("CPU", 0))
+    if num_cpus < num_workers:
+        warn(f"collector.num_workers={num_workers}: the cluster has {num_cpus} CPUs; the run waits until more join it")
+
+
+def _check_answers(address: str) -> None:
+    """Check that there is something at an address of the form `HOST:PORT` or `ray://HOST:PORT`.
+
+    Raises:
+        CollectionError: there is nothing.
+    """
+    place = re.fullmatch(r"(?:ray://)?\[?([^\[\]/]+?)\]?:(\d+)", address)
+    if place is None:
+        return
+    try:
+        socket.create_connection((place.group(1), int(place.group(2))), timeout=_CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        raise CollectionError(f"{_named(address)}: does not answer ({one_line(error)})") from error
+
+
+def _named(address: str | None) -> str:
+    return "collector=ray" if address is None else f"collector.address={address}"

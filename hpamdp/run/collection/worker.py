@@ -5,17 +5,23 @@ from __future__ import annotations
 import io
 import multiprocessing
 import os
+import sys
 import threading
 import time
+import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
 from hpamdp.config import Config
+from hpamdp.env.base import ProblemError
+from hpamdp.messages import one_line
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import acting, make_agent, make_env
 from hpamdp.search_path import unprotect_children
@@ -64,6 +70,51 @@ class PolicyCopy(TensorDictModuleBase):
         torch.set_rng_state(state)
 
 
+class RemoteError(RuntimeError):
+    """An error in a worker, with its traceback in the text."""
+
+
+class ShardCollector(Collector):
+    """TorchRL's collector of a worker's shard."""
+
+    def __bool__(self) -> bool:
+        """Return True: Ray asks for it when it passes on an error, and an endless collector has no length."""
+        return True
+
+    def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
+        """Load the `packed` policy and collect a batch.
+
+        Returns:
+            The CPU seconds of this process before the batch, and the batch `[num_envs, steps_per_batch]`.
+
+        Raises:
+            ProblemError: the problem broke its contract.
+            MemoryError: memory does not suffice.
+            RemoteError: any other error of the environment.
+        """
+        try:
+            return self.policy.receive(policy), self.next()
+        except (ProblemError, MemoryError) as error:
+            raise type(error)(str(error)) from None
+        except Exception as error:  # which may be of a class that the learner's process does not have
+            summary = one_line(f"{type(error).__name__}: {error}")
+            raise RemoteError(f"{summary}\n\nIn a worker:\n{traceback.format_exc()}") from None
+
+
+class SharedMemoryCollector(ShardCollector):
+    """A `ShardCollector` whose batches all lie in the same shared memory."""
+
+    _is_shared = False
+
+    def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
+        """Collect as a `ShardCollector`. Only the first batch is returned, then None: all are written to its memory."""
+        cpu_s, batch = super().collect(policy)
+        if self._is_shared or batch is None:
+            return cpu_s, None
+        self._is_shared = True
+        return cpu_s, batch.share_memory_()
+
+
 @dataclass(frozen=True)
 class EnvShard:
     """The environments of one worker, with everything needed to build them in its process.
@@ -72,6 +123,7 @@ class EnvShard:
         config: of the run.
         specs: of the problem.
         first_env, num_envs: which of the run's environments.
+        env_seed: of the environments.
         exploration_seed: of the worker's global generator.
         low: the `packed` low level of a run with `low.freeze`, whose environments play whole episodes with it.
     """
@@ -80,6 +132,7 @@ class EnvShard:
     specs: PAMDPSpecs
     first_env: int
     num_envs: int
+    env_seed: int
     exploration_seed: int
     low: bytes | None
 
@@ -91,7 +144,7 @@ class EnvShard:
         agent = self._make_agent()
         if self.low is not None:
             unpack(agent.router, self.low)
-        env = make_env(self.config, self.num_envs, _CPU, self.config.run.seed, self.first_env)
+        env = make_env(self.config, self.num_envs, _CPU, self.env_seed, self.first_env)
         return acting(env, agent, self.config)[0]
 
     def make_policy(self) -> PolicyCopy:
@@ -102,6 +155,49 @@ class EnvShard:
 
     def _make_agent(self) -> HierarchicalAgent:
         return make_agent(self.config, self.specs, _CPU)
+
+
+class WorkingDir:
+    """A working directory, which a process that unpickles this object enters.
+
+    Classes of the user's own are then found there, after all installed packages, as in the run's process. On another
+    machine there may be no such directory.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Callable[[str], WorkingDir], tuple[str]]:
+        return _entered, (self.path,)
+
+
+def _entered(path: str) -> WorkingDir:
+    if os.path.isdir(path):
+        os.chdir(path)
+    if path not in sys.path:
+        sys.path.append(path)
+    return WorkingDir(path)
+
+
+@dataclass(frozen=True)
+class RemoteShard:
+    """An `EnvShard` for a process that does not share this one's working directory and search path.
+
+    Attributes:
+        working_dir: comes first, since it is entered before the classes that the shard needs are looked for.
+        shard: the environments.
+    """
+
+    working_dir: WorkingDir
+    shard: EnvShard
+
+    def make_env(self) -> TransformedEnv:
+        """Build the environments."""
+        return self.shard.make_env()
+
+    def make_policy(self) -> PolicyCopy:
+        """Build the policy."""
+        return self.shard.make_policy()
 
 
 def _end_with_parent() -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import signal
+import threading
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NoReturn, TypeVar
 
 import numpy as np
 import torch
@@ -15,10 +16,16 @@ from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.config import Config
+from hpamdp.env.base import ProblemError
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.base import Collection, WorkerDiedError
-from hpamdp.run.collection.worker import EnvShard, packed
+from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError
+from hpamdp.run.collection.limits import limit_of
+from hpamdp.run.collection.worker import EnvShard, RemoteError, packed
 from hpamdp.search_path import protect_children, unprotect_children
+
+_PATIENCE_S = 2.0  # for workers in the middle of a batch that nobody waits for any more
+
+_Returned = TypeVar("_Returned")
 
 
 class WorkerCollection(Collection):
@@ -32,86 +39,195 @@ class WorkerCollection(Collection):
     learned from that one. What is collected does not depend on how long either takes. A batch that is on its way when
     the run is saved is saved with it.
 
-    A subclass starts TorchRL's collector in `_start`.
+    Each worker has a collector of TorchRL's and a thread that waits for it. If a worker dies, the others keep their
+    episodes and what they have collected. Its replacement begins new episodes, with seeds of its own, and collects its
+    part of the batch from their beginning.
+
+    A subclass starts a worker in `_start`, and says in `_death` how it died.
+
+    Args:
+        config, parts, frames: as for any collection.
+        num_workers: how many processes there are.
+        ahead: whether workers collect while the agent learns.
+        max_restarts: how many workers that died are replaced.
     """
 
     has_workers: ClassVar[bool] = True
 
-    def __init__(self, config: Config, parts: Parts, frames: int, num_workers: int, *, ahead: bool) -> None:
+    def __init__(
+        self, config: Config, parts: Parts, frames: int, num_workers: int, *, ahead: bool, max_restarts: int
+    ) -> None:
+        self.name = str(config.collector)
+        self._config = config
+        self._frames = frames
         self._ahead = ahead
-        self._coming: Future[TensorDictBase] | None = None
+        self._max_restarts = max_restarts
+        self._restarts = 0
+        self._restarting = threading.Lock()
+        self._notices: list[str] = []
         self._policy = parts.policy
+        self._specs = parts.agent.specs
+        self._frozen = packed(parts.agent.router) if config.run.low.freeze else None
         self._device = parts.device
         self._keeps_episodes = parts.env.keeps_episodes
         self._num_envs = config.run.num_envs
         self._size = config.run.num_envs // num_workers
         self._state: dict[str, Any] = {"env": parts.env.env_state()}
-        self._collector: Any = None
         self._is_idle = False
-        shares = [
-            EnvShard(
-                config,
-                parts.agent.specs,
-                first,
-                self._size,
-                # Other numbers than before where a run goes on.
-                int(np.random.SeedSequence((config.run.seed, first, frames)).generate_state(1)[0]),
-                packed(parts.agent.router) if config.run.low.freeze else None,
-            )
-            for first in range(0, self._num_envs, self._size)
-        ]
+        self._workers: list[Any] = [None] * num_workers  # TorchRL's collector of each
+        self._batches: list[TensorDictBase | None] = [None] * num_workers  # the memory that each writes to
+        self._cpu_s = [0.0] * num_workers
+        self._cpu_s_of_dead = 0.0
+        self._coming: list[Future[TensorDictBase]] = []
+        self._threads = ThreadPoolExecutor(num_workers)
         try:
-            self._collector = self._start(shares, config)
+            with modules_here_last():
+                self._on_all(self._start_first)
         except BaseException:
             self.close()
             raise
-        self._batches = iter(self._collector)
-        self._thread = ThreadPoolExecutor(max_workers=1)
         self._is_idle = True
 
     @abstractmethod
-    def _start(self, shares: Sequence[EnvShard], config: Config) -> Any:
-        """Start a worker for each share, and return TorchRL's collector of them."""
+    def _start(self, shard: EnvShard) -> Any:
+        """Start a worker and return TorchRL's collector of it, whose class is a `ShardCollector`."""
         raise NotImplementedError
+
+    @abstractmethod
+    def _kill(self, worker: Any) -> None:
+        """End a worker in the middle of whatever it does."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def _death(self, worker: Any | None, error: Exception) -> str | None:
+        """Return in words how a worker died, if that is what an error of a call to it means.
+
+        Args:
+            worker: TorchRL's collector; None while it starts.
+            error: that was raised.
+        """
+        raise NotImplementedError
+
+    def _shard(self, worker: int, restart: int = 0) -> EnvShard:
+        """Return the environments of a worker.
+
+        Args:
+            worker: its number.
+            restart: 0 at first; for a replacement, the number of the restart.
+        """
+        seed, first = self._config.run.seed, worker * self._size
+        # Other numbers than before if a run goes on, and those of no other worker.
+        source = (seed, first, self._frames, restart) if restart else (seed, first, self._frames)
+        exploration_seed, env_seed = map(int, np.random.SeedSequence(source).generate_state(2))
+        return EnvShard(
+            self._config, self._specs, first, self._size, env_seed if restart else seed, exploration_seed, self._frozen
+        )
+
+    def _start_first(self, number: int) -> None:
+        try:
+            self._workers[number] = self._start(self._shard(number))
+        except Exception as error:
+            self._raise_explained(number, error)
+
+    def _raise_explained(self, number: int, error: Exception) -> NoReturn:
+        """Raise an error of a worker: a death or a limit of the machine in one line, anything else as it is.
+
+        Raises:
+            WorkerDiedError: the worker died.
+            CollectionError: the machine does not let it go on.
+        """
+        if isinstance(error, ProblemError | MemoryError | RemoteError):
+            raise error
+        limit = limit_of(error)
+        if limit is not None:
+            raise CollectionError(f"{self.name}: {limit}") from error
+        death = self._death(self._workers[number], error)
+        if death is not None:
+            raise WorkerDiedError(f"{self.name}: worker {number} of {len(self._workers)} died ({death})") from error
+        raise error
+
+    def _on(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
+        """Return what a call to a worker returns; if the worker dies, replace it and call again.
+
+        Raises:
+            CollectionError: it died and may not be replaced, or this machine does not let it go on.
+        """
+        while True:
+            try:
+                return self._attempt(number, call)
+            except WorkerDiedError as death:
+                self._count_restart(number, death)
+
+    def _attempt(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
+        try:
+            if self._workers[number] is None:
+                with self._restarting, modules_here_last():
+                    self._workers[number] = self._start(self._shard(number, self._restarts))
+            return call(self._workers[number])
+        except Exception as error:
+            self._raise_explained(number, error)
+
+    def _count_restart(self, number: int, death: WorkerDiedError) -> None:
+        """Count the restart of a worker that died, and drop what is left of it.
+
+        Raises:
+            WorkerDiedError: there were as many restarts as are allowed.
+        """
+        with self._restarting:
+            if self._restarts >= self._max_restarts:
+                raise death
+            self._restarts += 1
+            self._notices.append(f"{death}; it was replaced (restart {self._restarts} of {self._max_restarts})")
+        self._end(number)
+        self._batches[number] = None
+        self._cpu_s_of_dead += self._cpu_s[number]
+        self._cpu_s[number] = 0.0
+
+    def _on_all(self, call: Callable[[int], _Returned]) -> list[_Returned]:
+        """Call a function for each worker's number at the same time; return what it returns in their order."""
+        futures = [self._threads.submit(call, number) for number in range(len(self._workers))]
+        wait(futures)
+        return [future.result() for future in futures]
+
+    def notices(self) -> list[str]:
+        """Return a line for each worker that was replaced since the last call."""
+        told, self._notices = self._notices, []
+        return told
 
     def next(self) -> TensorDictBase:
         """Send the policy's state, then collect a batch; with `ahead`, hand out the one on its way and begin another.
 
         Raises:
-            WorkerDiedError: a worker died.
+            CollectionError: a worker died and may not be replaced, or this machine does not let it go on.
         """
         self._is_idle = False
         policy = packed(self._policy)
-        try:
-            batch = self._collect(policy) if self._coming is None else self._coming.result()
-        except Exception as error:
-            # TorchRL ends the other workers by a signal that they block, and then complains of these.
-            death = self._death()
-            if death is None:
-                raise
-            raise WorkerDiedError(death) from error
+        self._coming = self._coming or self._begin(policy)
+        batch = self._finished()
+        self._coming = self._begin(policy) if self._ahead else []
         self._is_idle = True
-        self._coming = None
-        if self._ahead:
-            batch = batch.clone()  # the workers write the next one to the same place
-            self._coming = self._thread.submit(self._collect, policy)
         return batch.to(self._device)
 
-    def _collect(self, policy: bytes) -> TensorDictBase:
-        self.cpu_s = sum(self._call("policy.receive", policy))
-        return self._joined(next(self._batches))
+    def _begin(self, policy: bytes) -> list[Future[TensorDictBase]]:
+        """Have all workers collect their part of a batch."""
+        return [self._threads.submit(self._collect, number, policy) for number in range(len(self._workers))]
 
-    def _joined(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return what TorchRL's collector gave as `[num_envs, steps_per_batch]`."""
-        return batch
+    def _finished(self) -> TensorDictBase:
+        """Wait for the parts of the batch on its way and return a copy of all of them, in the workers' order."""
+        return torch.cat([part.result() for part in self._coming])
 
-    def _death(self) -> str | None:
-        """Return in words which worker has died and why, if one has."""
-        return None
+    def _collect(self, number: int, policy: bytes) -> TensorDictBase:
+        self._cpu_s[number], batch = self._on(number, lambda worker: _call(worker, "collect", policy))
+        self.cpu_s = self._cpu_s_of_dead + sum(self._cpu_s)
+        if batch is not None:
+            self._batches[number] = batch
+        collected = self._batches[number]
+        assert collected is not None
+        return collected
 
-    def _call(self, method: str, *arguments: Any) -> list[Any]:
+    def _call(self, method: str) -> list[Any]:
         """Return what a method of each worker's collector returns."""
-        return self._collector.map_fn(method, [arguments] * self._collector.num_workers)
+        return self._on_all(lambda number: self._on(number, lambda worker: _call(worker, method)))
 
     def state(self) -> dict[str, Any]:
         """Return the workers' states side by side; if one failed, the last ones that are known.
@@ -119,15 +235,25 @@ class WorkerCollection(Collection):
         `generators` holds the state of each worker's random generator, `coming` the batch that is handed out next, if
         it has been collected.
         """
-        is_known = self._is_idle and (self._coming is None or self._coming.exception() is None)
-        if is_known:
-            self._state = {"env": _side_by_side(self._call("env.env_state"))}
-            if self._keeps_episodes:
-                self._state["root"] = _side_by_side([_without_ids(root) for root in self._call("_carrier.to_dict")])
-            self._state["generators"] = self._call("policy.generator_state")
-            if self._coming is not None:
-                self._state["coming"] = self._coming.result().clone().to_dict()
+        if not self._is_idle or any(part.exception() for part in self._coming):
+            return self._state
+        try:
+            states = self._on_all(lambda number: self._on(number, self._state_of))
+        except CollectionError:  # which the next batch will tell
+            return self._state
+        state: dict[str, Any] = {"generators": [each["generator"] for each in states]}
+        for name in states[0].keys() & {"env", "root"}:
+            state[name] = _side_by_side([each[name] for each in states])
+        if self._coming:
+            state["coming"] = self._finished().to_dict()
+        self._state = state
         return self._state
+
+    def _state_of(self, worker: Any) -> dict[str, Any]:
+        state = {"env": _call(worker, "env.env_state"), "generator": _call(worker, "policy.generator_state")}
+        if self._keeps_episodes:
+            state["root"] = _without_ids(_call(worker, "_carrier.to_dict"))
+        return state
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state` of any collection; exploration is the same only with as many workers."""
@@ -135,41 +261,76 @@ class WorkerCollection(Collection):
         if sizes - {self._num_envs}:
             raise ValueError(f"the state is of {sizes.pop()} environments, but there are {self._num_envs}")
         self._state = dict(state)
-        if state["env"]:  # else the episodes that the workers have just begun go on
-            self._send("env.set_env_state", state["env"])
-        if "root" in state and self._keeps_episodes:
-            self._send("_carrier.update", state["root"])
-        if "coming" in state:
-            self._coming = Future()
-            shape = state["coming"]["next"][keys.DONE].shape
-            self._coming.set_result(TensorDict(state["coming"], batch_size=shape[:-1]))
         generators = state.get("generators", [])
-        if len(generators) == self._collector.num_workers:
-            self._collector.map_fn("policy.set_generator_state", [(generator,) for generator in generators])
 
-    def _send(self, method: str, values: Mapping[str, Any]) -> None:
-        """Call a method of each worker's collector with the worker's rows of nested values."""
-        rows = [_sliced(values, first, self._size) for first in range(0, self._num_envs, self._size)]
-        self._collector.map_fn(method, [(shard,) for shard in rows])
+        def send(number: int) -> None:
+            first = number * self._size
+
+            def send_to(worker: Any) -> None:
+                if state["env"]:  # else the episodes that the worker has just begun go on
+                    _call(worker, "env.set_env_state", _sliced(state["env"], first, self._size))
+                if "root" in state and self._keeps_episodes:
+                    _call(worker, "_carrier.update", _sliced(state["root"], first, self._size))
+                if len(generators) == len(self._workers):
+                    _call(worker, "policy.set_generator_state", generators[number])
+
+            self._on(number, send_to)
+
+        self._on_all(send)
+        if "coming" in state:
+            shape = state["coming"]["next"][keys.DONE].shape
+            coming = TensorDict(state["coming"], batch_size=shape[:-1])
+            self._coming = [_done(rows) for rows in coming.split(self._size)]
 
     def close(self) -> None:
-        """End the workers."""
-        if self._collector is not None:
-            self._thread.shutdown()  # after the batch that is on its way
-            self._collector.shutdown()
-            self._collector = None
+        """End the workers, after the batch that is on its way unless that takes long."""
+        _, running = wait(self._coming, _PATIENCE_S)
+        self._max_restarts = 0
+        for part, worker in zip(self._coming, self._workers, strict=False):
+            if part in running and worker is not None:
+                self._kill(worker)
+        self._threads.shutdown()
+        with ThreadPoolExecutor(len(self._workers)) as threads:
+            list(threads.map(self._end, range(len(self._workers))))
+
+    def _end(self, number: int) -> None:
+        worker, self._workers[number] = self._workers[number], None
+        if worker is not None:
+            worker.shutdown()
+            torch.set_num_threads(self._config.run.threads)  # which TorchRL raises
+
+
+def _call(worker: Any, method: str, *arguments: Any) -> Any:
+    """Return what a method of a worker's collector returns."""
+    (returned,) = worker.map_fn(method, [arguments])
+    return returned
+
+
+def _done(batch: TensorDictBase) -> Future[TensorDictBase]:
+    """Return a batch as one that has been waited for."""
+    future: Future[TensorDictBase] = Future()
+    future.set_result(batch)
+    return future
 
 
 @contextmanager
 def children_without(*numbers: signal.Signals) -> Iterator[None]:
-    """Block these signals in all processes that are started within the block, and look for modules here last."""
+    """Block these signals in all processes that this thread starts within the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def modules_here_last() -> Iterator[None]:
+    """Let processes that are started within the block look for modules in the working directory last."""
     protect_children()
     try:
         yield
     finally:
         unprotect_children()
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,0 +1,45 @@
+"""Which of this machine's limits keeps other processes from starting or from sharing memory."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+
+_SHARED_MEMORY = "/dev/shm"  # where Linux keeps it
+# What Python and torch say of them where they raise no OSError.
+_NO_FILES = ("Too many open files", "received 0 items of ancdata")
+_NO_PROCESSES = ("can't start new thread", "Resource temporarily unavailable")
+_NO_SPACE = ("No space left on device",)
+
+
+def limit_of(error: BaseException) -> str | None:
+    """Return in words which limit an error is about, and its cure; None if it is about none."""
+    code = error.errno if isinstance(error, OSError) else None
+    text = str(error) if isinstance(error, OSError | RuntimeError) else ""
+
+    def says(signs: tuple[str, ...]) -> bool:
+        return any(sign in text for sign in signs)
+
+    if code in (errno.EMFILE, errno.ENFILE) or says(_NO_FILES):
+        return f"too many open files (ulimit -n is {_soft(resource.RLIMIT_NOFILE)}; raise it, or use fewer workers)"
+    if code == errno.EAGAIN or says(_NO_PROCESSES):
+        return f"too many processes (ulimit -u is {_soft(resource.RLIMIT_NPROC)}; raise it, or use fewer workers)"
+    if code in (errno.ENOSPC, errno.EDQUOT) or says(_NO_SPACE):
+        return full_shared_memory()
+    return None
+
+
+def full_shared_memory() -> str:
+    """Return in words that shared memory is full, and what to do."""
+    size = ""
+    if os.path.isdir(_SHARED_MEMORY):
+        disk = os.statvfs(_SHARED_MEMORY)
+        size = f", {disk.f_blocks * disk.f_frsize / 1e6:,.1f} MB"
+    cure = "set --shm-size of the container, or use fewer environments or collector=single"
+    return f"shared memory is full ({_SHARED_MEMORY}{size}; {cure})"
+
+
+def _soft(limit: int) -> str:
+    value, _ = resource.getrlimit(limit)
+    return "unlimited" if value == resource.RLIM_INFINITY else str(value)
