@@ -12,8 +12,8 @@ import sys
 import textwrap
 import uuid
 import warnings
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, NoReturn
@@ -127,7 +127,8 @@ def _main() -> None:
     try:
         _check_surroundings()
         if sys.argv[1:2] and sys.argv[1] in _COMMANDS:
-            sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
+            with _limits_told():
+                sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
         conf = conf_dir()
         arguments = _parse()
         if arguments.help:
@@ -145,6 +146,34 @@ def _main() -> None:
         _exit_with(f"stdout: {getattr(error.__cause__, 'strerror', None) or first_line(error.__cause__)}", 1)
     except KeyboardInterrupt:
         sys.exit(_INTERRUPTED)
+
+
+@contextmanager
+def _limits_told() -> Iterator[None]:
+    """Exit with 1 and one line if the process has too few files or too little memory, whichever library finds it."""
+    try:
+        yield
+    except ConfigError:
+        raise
+    except Exception as error:
+        cause: BaseException | None = error
+        while cause is not None:
+            limit = _limit(cause)
+            if limit is not None:
+                _exit_with(f"{first_line(cause) or type(cause).__name__}: the program needs {limit}", 1)
+            cause = cause.__cause__ or cause.__context__
+        raise
+
+
+def _limit(error: BaseException) -> str | None:
+    """Return which limit of the process an error is about, if it is about one."""
+    text = str(error)
+    if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE) or "Too many open files" in text:
+        return "more open files, see ulimit -n"
+    is_memory = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
+    if is_memory or "annot allocate memory" in text or "failed to map segment" in text:
+        return "more memory, see ulimit -v"
+    return None
 
 
 def _check_surroundings() -> None:
@@ -227,7 +256,8 @@ def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
     def job(cfg: DictConfig) -> float | None:
         nonlocal has_started
         has_started = True
-        return _run_job(cfg, start)
+        with _limits_told():
+            return _run_job(cfg, start)
 
     protect_children()
     try:
@@ -427,6 +457,8 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     resource_tracker.ensure_running()  # which environments start, while it is protected
     unprotect_children()
     job = HydraConfig.get()
+    if job.job.chdir:
+        _stay(job.runtime.cwd)
     if job.mode == RunMode.MULTIRUN:
         return sweep.run_job(cfg, start)
     # These take seconds, which --help need not wait for.
@@ -447,8 +479,6 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
             output_dir.rmdir()  # Hydra made it; it stays if there is something in it
         _exit_with(str(error))
     except OSError as error:
-        if error.errno in (errno.EMFILE, errno.ENFILE):
-            _exit_with(f"{reason_of(error)}; see ulimit -n; the run was stopped", 1)
         if not is_about_folder(error, output_dir):
             raise
         _exit_with(f"{output_dir}: {error.strerror or error}; the run was stopped", 1)
@@ -476,6 +506,12 @@ def _go_on(cfg: DictConfig, output_dir: Path) -> int:
     if source is not None:
         say(f"Going on from {source}")
     return train.run(cfg, output_dir, words, source, may_overwrite=True)
+
+
+def _stay(directory: str) -> None:
+    """Go back to the working directory, from which all relative paths of a command line and its yaml files count."""
+    os.chdir(directory)
+    warn(f"hydra.job.chdir=true: the run stays in {directory}, so that relative paths stay right")
 
 
 def _exit_with(mistake: str, code: int = _MISTAKE) -> NoReturn:

@@ -1,6 +1,9 @@
 """The program as it is started from a shell: words that can be pasted, streams, folders and limits of any kind."""
 
+import errno
 import os
+import resource
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,10 +17,11 @@ from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
 
 from hpamdp import cli
+from hpamdp.files import replacing
 from hpamdp.messages import say
 from hpamdp.run import train
 from hpamdp.search_path import put_working_directory_last
-from hpamdp.shell import path_setting, setting
+from hpamdp.shell import _for_hydra, path_setting, setting
 from hpamdp.yaml_files import CheckedYamlFiles, check_before_hydra_reads
 
 FOLDERS = [
@@ -269,3 +273,84 @@ def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_pat
     monkeypatch.chdir(tmp_path)
     put_working_directory_last()
     assert sys.path == [root, "/packages", str(tmp_path)]
+
+
+def test_relative_paths_count_from_where_the_user_stands_though_hydra_changes_the_directory(
+    command, tmp_path, monkeypatch
+):
+    seen = []
+    monkeypatch.setattr(train, "run", lambda cfg, folder, *_, **__: seen.append((os.getcwd(), str(folder))) or 0)
+    words = ["hydra.job.chdir=true", "low.checkpoint=nowhere"]
+    code, _, err = command(*words, "hydra.run.dir=a")
+    assert code == 0 and err.count("\n") == 1 and "hydra.job.chdir=true: the run stays in" in err
+    assert command("-m", *words, "seed=1,2", "hydra.sweep.dir=b")[0] == 0
+    assert seen == [(str(tmp_path), str(tmp_path / folder)) for folder in ("a", "b/0", "b/1")]
+
+
+def of_a_limited_process(folder: Path, limit: int, value: int, err: Path) -> None:
+    resource.setrlimit(limit, (value, value))
+    ends_with(folder, ["hydra.run.dir=out"], 1, "utf-8", err)
+
+
+def test_a_limit_of_the_size_of_files_is_a_full_disk(tmp_path, monkeypatch):
+    def run(cfg, folder, *_, **__):
+        with replacing(folder / "checkpoint.zip") as partial:
+            partial.write_bytes(bytes(100_000))
+
+    monkeypatch.setattr(train, "run", run)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/checkpoint.zip").write_text("the one before")
+    err = tmp_path / "err.txt"
+    assert forked(of_a_limited_process, tmp_path, resource.RLIMIT_FSIZE, 50_000, err) == 1
+    assert err.read_text() == f"{tmp_path / 'out'}: File too large; the run was stopped\n"
+    assert (tmp_path / "out/checkpoint.zip").read_text() == "the one before"
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(errno.EMFILE, "Too many open files"), "the program needs more open files, see ulimit -n\n"),
+        (
+            ImportError("lib.so: cannot open shared object file: Too many open files"),
+            "more open files, see ulimit -n\n",
+        ),
+        (MemoryError(), "MemoryError: the program needs more memory, see ulimit -v\n"),
+        (ImportError("lib.so: failed to map segment from shared object"), "more memory, see ulimit -v\n"),
+    ],
+)
+def test_a_limit_of_the_process_is_told_in_one_line_wherever_a_library_finds_it(command, monkeypatch, error, line):
+    def run(*_, **__):
+        try:
+            raise error
+        finally:
+            raise RuntimeError("what was learned could not be saved")  # as `Trainer.train` may
+
+    monkeypatch.setattr(train, "run", run)
+    code, _, err = command()
+    assert code == 1 and err.endswith(line) and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["--help"], ["summary", "--help"]])
+def test_the_commands_of_the_recording_tell_a_full_device_too(tmp_path, capsys, words):
+    from hpamdp.data.human import cli as human
+
+    def run() -> None:
+        sys.stdout = open("/dev/full", "w")  # noqa: SIM115
+        sys.stderr = (tmp_path / "err.txt").open("w")
+        code = human.main(words)
+        sys.stderr.close()
+        os._exit(code)
+
+    assert forked(run) == 1
+    assert (tmp_path / "err.txt").read_text() == "stdout: No space left on device\n"
+
+
+def test_the_command_that_is_told_goes_on_when_it_is_pasted(command, tmp_path, monkeypatch):
+    folder = "my runs/lr=0.1,seed=[1] it's $5"
+    small = ["high=fixed", "low=random", "num_envs=2", "steps_per_batch=2", "eval.layouts=2", "film=false"]
+    assert command(*small, "total_frames=4", f"hydra.run.dir={_for_hydra(folder)}")[0] == 0
+    assert (tmp_path / folder / "checkpoint.zip").is_file()
+    err = command(*small, "total_frames=8", f"hydra.run.dir={_for_hydra(folder)}")[2]
+    told = err.partition("continue it with ")[2].partition(", take another")[0]
+    code, out, err = command(*shlex.split(told), "total_frames=8", f"hydra.run.dir={_for_hydra(folder)}")
+    assert code == 0 and "8 frames" in out, err

@@ -21,7 +21,7 @@ from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SH
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
-from hpamdp.messages import one_line, reopen_standard_streams, say, warn
+from hpamdp.messages import first_line, lenient_streams, lost_output, one_line, reopen_standard_streams, say, warn
 
 _USAGE_ERROR = 2
 _INTERRUPTED = 130
@@ -36,9 +36,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: the words after the program's name; None: those it was started with.
 
     Returns:
-        The exit code: 0, 2 after an error (printed to stderr in one line) or 130 after an interrupt.
+        The exit code: 0, 1 if stdout takes no text, 2 after an error (printed to stderr in one line) or 130 after an
+        interrupt.
     """
     reopen_standard_streams()
+    with lenient_streams():
+        try:
+            code = _main(arguments)
+        except SystemExit as stop:
+            if stop.code or lost_output() is None:
+                raise
+            code = 0  # argparse has shown its help
+        error = lost_output()
+        if code or error is None:
+            return code
+        if not isinstance(error, BrokenPipeError):  # else the reader has seen enough
+            warn(f"stdout: {getattr(error, 'strerror', None) or first_line(error)}")
+        return 1
+
+
+def _main(arguments: Sequence[str] | None) -> int:
     options = _parser().parse_args(arguments)
     try:
         options.run(options)
