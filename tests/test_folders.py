@@ -342,3 +342,24 @@ def test_a_run_outlives_the_folder_of_its_tensorboard_events(tmp_path, monkeypat
     err = capsys.readouterr().err
     assert err.count("the run goes on without this logger") == 1 and "Traceback" not in err
     assert len(read_rows(tmp_path / "metrics.csv")) == 5
+
+
+def test_a_job_that_a_signal_stops_is_saved_before_its_launcher_gets_the_signal(tmp_path, command, monkeypatch):
+    """As submitit does, whose handler requeues the job and exits."""
+    found = []
+
+    def requeue(number, frame):
+        found.append(checkpoint.progress_of(tmp_path / "sweep/0/checkpoint.zip")["frames"])
+        raise SystemExit(7)
+
+    before = signal.signal(signal.SIGUSR2, requeue)
+    words = ["-m", *TINY, "film=false", "seed=0", "hydra.sweep.dir=sweep"]
+    try:
+        with monkeypatch.context() as patch:
+            after_batches(patch, 2, lambda: os.kill(os.getpid(), signal.SIGUSR2))
+            assert command(*words)[0] == 130
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert found == [64]
+    code, out, _ = command(*words)
+    assert code == 0 and "1 jobs: 1 resumed and finished\n" in out

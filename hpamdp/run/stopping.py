@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import ClassVar
 
 from hpamdp.messages import one_line
 
@@ -19,8 +21,11 @@ _URGENT = (signal.SIGINT, signal.SIGTERM)
 class StopRequest:
     """Whether a signal has asked the run to stop."""
 
+    latest: ClassVar[signal.Signals | None] = None  # of all runs of this process
+
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
+        StopRequest.latest = None
 
     def note(self, number: int, frame: FrameType | None) -> None:
         """Note the signal; a second Ctrl-C or SIGTERM interrupts at once.
@@ -30,7 +35,7 @@ class StopRequest:
         """
         if self.signal is not None and number in _URGENT:
             raise KeyboardInterrupt
-        self.signal = signal.Signals(number)
+        self.signal = StopRequest.latest = signal.Signals(number)
 
 
 @contextmanager
@@ -62,6 +67,13 @@ def signals_ignored() -> Iterator[None]:
             signal.signal(number, handler)
 
 
+def pass_on_signal() -> None:
+    """Give the signal that stopped the last run to who handled it before, such as a launcher that requeues jobs."""
+    number = StopRequest.latest
+    if number is not None and signal.getsignal(number) not in (signal.SIG_DFL, signal.default_int_handler):
+        os.kill(os.getpid(), number)
+
+
 def _changeable_signals() -> tuple[signal.Signals, ...]:
     """Return the signals whose handlers this thread can set: those that stop a run, in the main thread."""
     return STOP_SIGNALS if threading.current_thread() is threading.main_thread() else ()
@@ -73,7 +85,9 @@ class ProgramExitError(RuntimeError):
 
 @contextmanager
 def exits_told() -> Iterator[None]:
-    """Turn a call of `sys.exit` inside the block into an error that says where it is; those of argparse stay.
+    """Turn a call of `sys.exit` inside the block into an error that says where it is.
+
+    Calls of argparse stay, and those of submitit, which ends a job that way to requeue it.
 
     Raises:
         ProgramExitError: there was such a call.
@@ -82,7 +96,7 @@ def exits_told() -> Iterator[None]:
         yield
     except SystemExit as error:
         frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
-        if frame.f_globals.get("__name__") == "argparse":
+        if str(frame.f_globals.get("__name__")).partition(".")[0] in ("argparse", "submitit"):
             raise
         where = f"{frame.f_code.co_filename}, line {line}"
         raise ProgramExitError(one_line(f"{where}: called sys.exit({error.code!r}), which stopped the run")) from error

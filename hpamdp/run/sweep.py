@@ -29,7 +29,7 @@ from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, say, warn
 from hpamdp.run.folder import ERROR_NAME, check_no_link, is_about_folder, locked, saved_summary
 from hpamdp.run.search import go_on
-from hpamdp.run.stopping import exits_told
+from hpamdp.run.stopping import exits_told, pass_on_signal
 from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
@@ -197,6 +197,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     if job.state != _FINISHED:
         say(f"Job {job.number}: {job.state}{f': {job.reason}' if job.reason else ''}")
     if job.state == _STOPPED:
+        pass_on_signal()
         sys.exit(_INTERRUPTED)
     return job.score
 
