@@ -241,20 +241,20 @@ def test_a_killed_sweep_is_finished_by_the_same_command(tmp_path, launcher):
 @pytest.mark.slow
 @needs("hydra-submitit-launcher")
 def test_a_job_of_submitit_that_is_preempted_is_requeued_and_goes_on(tmp_path):
-    words = ["high=uniform", "seed=0", "total_frames=524288", "log_every=8192", "hydra/launcher=submitit_local"]
+    words = ["high=uniform", "seed=0", "total_frames=131072", "log_every=2048", "hydra/launcher=submitit_local"]
     process = sweep(tmp_path, *words)
     metrics = tmp_path / "sweep/0/metrics.csv"
     deadline = time.monotonic() + 120
     while not metrics.exists() or metrics.read_text().count("\n") < 4:
         assert process.poll() is None and time.monotonic() < deadline, process.communicate()
         time.sleep(0.02)
-    listed = subprocess.run(["ps", "-eo", "pid=,args="], capture_output=True, text=True).stdout.splitlines()
+    listed = subprocess.run(["ps", "-ewwo", "pid=,args="], capture_output=True, text=True).stdout.splitlines()
     (job,) = [line.split()[0] for line in listed if "submitit.core._submit" in line and str(tmp_path) in line]
     os.kill(int(job), signal.SIGUSR2)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     assert "1 jobs: 1 resumed and finished\n" in out
-    assert frames_of(tmp_path / "sweep/0") == [float(n) for n in range(0, 524289, 8192)]
+    assert frames_of(tmp_path / "sweep/0") == [float(n) for n in range(0, 131073, 2048)]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,16 @@ from hpamdp.run.folder import SUMMARY_NAME, saved_config, saved_summary
 from hpamdp.saved_config import in_todays_form
 
 # Settings that change neither what is learned nor what is scored.
-_BOOKKEEPING = ("resume", "overwrite", "film", "logger", "checkpoint_every", "checkpoint_minutes", "checkpoint_replay")
+_BOOKKEEPING = (
+    "resume",
+    "trust",
+    "overwrite",
+    "film",
+    "logger",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "checkpoint_replay",
+)
 
 
 class Left(NamedTuple):
