@@ -102,6 +102,19 @@ def test_plans_choose_the_boat(is_shared):
     assert len(value.argmax(-1).unique()) == 2 or not is_shared, "another boat for another layout"
 
 
+@pytest.mark.parametrize("end_values", [False, True])
+def test_while_exploring_options_without_an_update_come_first(end_values):
+    learners = [PETS(BOATS.of_option(i), CPU, **{**OPTIONS, "end_values": end_values}) for i in range(2)]
+    agent = HierarchicalAgent(Value(BOATS, epsilon=0.0), learners, BOATS)
+    learners[0].updates += 1
+    learners[0].policy.is_trained.fill_(True)
+    observation = with_decisions(BoatDockEnv(4, controller="choose")).reset()[keys.OBSERVATION]
+    value = agent.selector.option_values(observation)
+    assert value[:, 0].isfinite().all() and value[:, 1].isinf().all()
+    with set_exploration_type(GREEDY):
+        assert agent.selector.option_values(observation).isfinite().all()
+
+
 def test_one_model_of_both_boats_sees_directions_alone():
     (learner,) = make_agent(is_shared=True).learners
     model = learner.model

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.base import Learner, Selector, is_greedy
 from hpamdp.policies.shared.masks import allowed_or_first
 from hpamdp.specs import PAMDPSpecs
 
@@ -117,24 +117,33 @@ class OptionValues(nn.Module):
     def forward(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the values `[N, num_options]` of observations `[N, observation_dim]`.
 
+        While exploring, the value is infinite if its learner has learned nothing yet.
+
         Args:
             observation: of the states.
             action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
         """
         masks = () if action_mask is None else (action_mask,)
         if len(self.learners) == self.num_options:
-            return torch.stack([learner.value(observation, *masks) for learner in self._learners()], -1)
+            return torch.stack([_exploring_value(each, observation, *masks) for each in self._learners()], -1)
         (learner,) = self._learners()
         values = []
         for one_hot in torch.eye(self.num_options, device=observation.device, dtype=torch.float32):
             seen = torch.cat([observation, one_hot.expand(len(observation), -1)], -1)
-            values.append(learner.value(seen, *masks))
+            values.append(_exploring_value(learner, seen, *masks))
         return torch.stack(values, -1)
 
     def _learners(self) -> Iterator[Learner]:
         for learner in self.learners:
             assert isinstance(learner, Learner)
             yield learner
+
+
+def _exploring_value(learner: Learner, observation: Tensor, *masks: Tensor) -> Tensor:
+    """Return a learner's values `[N]` of observations `[N, *]`: infinite while exploring before it has learned."""
+    if learner.is_untrained() and not is_greedy():
+        return torch.full_like(observation[:, 0], torch.inf)
+    return learner.value(observation, *masks)
 
 
 class HeldOption(TensorDictModuleBase):

@@ -369,6 +369,13 @@ class Learner(nn.Module):
         """
         raise NotImplementedError(f"{type(self).__name__} has no value to bootstrap from")
 
+    def is_untrained(self) -> bool:
+        """Return whether `value` is still that of fresh networks, as far as parameters and buffers tell.
+
+        While exploring, `high=value` chooses the options of such learners first, so that all of them get steps.
+        """
+        return False
+
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Learn from a collected batch `[*B, T]` and return scalars to log, averaged over the updates made.
 

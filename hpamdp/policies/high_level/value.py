@@ -5,6 +5,8 @@ there. Bandits need thousands of decisions to learn as much. In a hierarchy it i
 Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, Artificial Intelligence 112. A learner such as PETS without
 `end_values`, whose value is that of a random member of its ensemble when exploring, makes it posterior sampling over
 options: Osband, Russo and Van Roy 2013, arXiv 1306.0940.
+
+While exploring, options whose learner has made no update come first, in random order: nothing is known of them.
 """
 
 from __future__ import annotations

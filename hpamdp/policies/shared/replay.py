@@ -131,6 +131,10 @@ class ReplayLearner(Learner):
         scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
         return {**scalars, "updates": self.updates.item()}
 
+    def is_untrained(self) -> bool:
+        """Return whether no update was made."""
+        return int(self.updates) == 0
+
     def steps_to_update(self) -> dict[str, int]:
         """Return the lengths of the warm-up and of an update's share of steps."""
         needed = {"warmup_frames": self.warmup_frames}
