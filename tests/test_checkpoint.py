@@ -15,9 +15,11 @@ from test_grid import SHORT
 from hpamdp.config import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
+from hpamdp.run.checks import example_steps
 from hpamdp.run.train import run
 
 SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=256", "eval.layouts=4", "eval.every=0", "high=ucb"]
+PROGRESS = {"config": {}, "frames": 0, "wall_s": 0.0, "cpu_s": 0.0, "last_score": None}
 PDQN = [*SMALL, "low=pdqn", *SHORT["pdqn"]]
 
 
@@ -43,10 +45,15 @@ def rewritten(file, target, change):
     return target
 
 
+def load(file, parts):
+    steps = example_steps(parts.env, parts.policy)
+    return checkpoint.load(file, parts.agent, parts.device, with_training=True, steps=steps)
+
+
 def refusal(file, parts) -> str:
     weights = {name: value.clone() for name, value in parts.agent.state_dict().items() if torch.is_tensor(value)}
     with pytest.raises(ConfigError) as error:
-        checkpoint.load(file, parts.agent, parts.device, with_training=True)
+        load(file, parts)
     assert "\n" not in str(error.value) and str(file) in str(error.value)
     now = parts.agent.state_dict()
     assert all(torch.equal(value, now[name]) for name, value in weights.items()), "the agent was changed"
@@ -118,7 +125,7 @@ def load_damaged(numbers, trained, parts, tmp_path) -> int:
         file.write_bytes(damaged(data, number))
         try:
             checkpoint.find(file, "resume")
-            checkpoint.load(file, parts.agent, parts.device, with_training=True)
+            load(file, parts)
         except ConfigError as error:
             assert "\n" not in str(error), number
             refused += 1
@@ -161,7 +168,7 @@ def test_weights_that_are_nan_are_refused(trained, parts, tmp_path):
     with torch.no_grad():
         next(parts.agent.parameters()).fill_(torch.nan)
     states = {"collection": {}, "recorder": {}}
-    checkpoint.save(tmp_path / "nan.zip", parts.agent, states, {"config": {}})
+    checkpoint.save(tmp_path / "nan.zip", parts.agent, states, PROGRESS)
     other = assemble(make_config(PDQN), tmp_path)
     assert "holds NaN" in refusal(tmp_path / "nan.zip", other)
 
@@ -190,10 +197,10 @@ def test_a_policy_file_is_scored_like_the_run_that_it_is_of(trained, tmp_path):
 def test_a_kill_while_writing_leaves_the_old_checkpoint_and_its_leftover_is_removed_later(trained, parts, tmp_path):
     file = tmp_path / "checkpoint.zip"
     states = {"collection": {}, "recorder": {}}
-    checkpoint.save(file, parts.agent, states, {"config": {}, "frames": 1})
+    checkpoint.save(file, parts.agent, states, {**PROGRESS, "frames": 1})
     (tmp_path / ".checkpoint.zip.999.partial.zip").write_bytes(b"half a checkpo")
     assert checkpoint.progress_of(file)["frames"] == 1
-    checkpoint.save(file, parts.agent, states, {"config": {}, "frames": 2})
+    checkpoint.save(file, parts.agent, states, {**PROGRESS, "frames": 2})
     assert checkpoint.progress_of(file)["frames"] == 2
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["checkpoint.zip"]
 
@@ -201,7 +208,7 @@ def test_a_kill_while_writing_leaves_the_old_checkpoint_and_its_leftover_is_remo
 def test_a_full_disk_leaves_the_old_checkpoint(parts, tmp_path, monkeypatch):
     file = tmp_path / "checkpoint.zip"
     states = {"collection": {}, "recorder": {}}
-    checkpoint.save(file, parts.agent, states, {"config": {}, "frames": 1})
+    checkpoint.save(file, parts.agent, states, {**PROGRESS, "frames": 1})
     before = file.read_bytes()
 
     def full(*_):
@@ -209,6 +216,6 @@ def test_a_full_disk_leaves_the_old_checkpoint(parts, tmp_path, monkeypatch):
 
     monkeypatch.setattr(zipfile.ZipFile, "writestr", full)
     with pytest.raises(OSError, match="No space left"):
-        checkpoint.save(file, parts.agent, states, {"config": {}, "frames": 2})
+        checkpoint.save(file, parts.agent, states, {**PROGRESS, "frames": 2})
     assert file.read_bytes() == before
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["checkpoint.zip"]

@@ -29,8 +29,8 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 
 def members_of(folder: Path) -> dict:
-    _, members = checkpoint._read(folder / checkpoint.FILE_NAME, None)
-    return members
+    with checkpoint._Opened(folder / checkpoint.FILE_NAME) as opened:
+        return {name: opened.filled(name) for name in opened.names}
 
 
 def assert_same(one: object, other: object, where: str = "") -> None:

@@ -291,6 +291,18 @@ class PAMDPEnv(EnvBase):
         """Return what the episodes' future depends on, each `[N, ...]`, for a checkpoint; empty where it is unknown."""
         return {}
 
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Refuse an `env_state` of the right names, dtypes and shapes whose numbers make no sense.
+
+        By default all numbers must be finite. Override it if there are others, or if an index is among them.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        for name, column in columns.items():
+            if not column.isfinite().all():
+                raise ValueError(f"{name} is not finite")
+
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`; an empty one starts new episodes.
 

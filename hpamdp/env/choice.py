@@ -76,6 +76,10 @@ class OptionChoiceEnv(PAMDPEnv):
         """Return the state of the wrapped environment."""
         return self._inner_env.env_state()
 
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Check the state of the wrapped environment."""
+        self._inner_env.check_env_state(columns)
+
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Set the state of the wrapped environment."""
         self._inner_env.set_env_state(columns)

@@ -53,6 +53,18 @@ def overwrite(state: State, new: State) -> None:
         column.copy_(values)
 
 
+def check_range(columns: Mapping[str, Tensor], limits: Mapping[str, tuple[int, int]]) -> None:
+    """Refuse columns with numbers below their first limit, or at or above their second one.
+
+    Raises:
+        ValueError: with the first of them.
+    """
+    for name, (low, high) in limits.items():
+        column = columns[name]
+        if column.numel() and not low <= int(column.min()) <= int(column.max()) < high:
+            raise ValueError(f"{name} has {int(column.min())} to {int(column.max())}, not {low} to {high - 1}")
+
+
 def restored(saved: Mapping[str, Tensor], current: State, owner: str) -> State:
     """Return the state that was saved as `_asdict`, with the dtypes and devices of the current one.
 

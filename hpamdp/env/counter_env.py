@@ -23,7 +23,7 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.columns import Columns, cloned, from_arrays, overwrite, replaced, restored, where
+from hpamdp.env.columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.rows import Advance, Results, Rows
 
@@ -238,6 +238,15 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def env_state(self) -> dict[str, Tensor]:
         """Return the columns of the state, `[N]` each."""
         return self.state._asdict()
+
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Refuse counters and outcomes that do not exist.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        super().check_env_state(columns)
+        check_range(columns, {"steps": (0, 2**30), "outcome": (0, len(self.outcomes)), "episode": (-1, 2**30)})
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`; an empty one starts new episodes.

@@ -371,6 +371,43 @@ class HierarchicalAgent(nn.Module):
             levels["selector"] = self.selector
         return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
 
+    @torch.no_grad()
+    def replay_rows(self, name: str, steps: TensorDictBase) -> TensorDictBase:
+        """Return what a replay buffer would hold of some steps, rows `[N]`.
+
+        Args:
+            name: of the buffer in `stateful`.
+            steps: of the environments `[N]`, with what the policy writes.
+        """
+        batch = steps.unsqueeze(-1)
+        if self.selector is not None and self.selector.decides_ends and self.next_options is not None:
+            batch = self.next_options.with_ends(batch)
+        owner, _, part = name.partition("_")
+        if owner == "selector":
+            return self._level(owner).replay_rows(batch)[part]
+        for i, (_, learner, seen, _) in enumerate(self._shares(batch)):
+            if owner == f"learner{i}":
+                return learner.replay_rows(seen)[part]
+        raise KeyError(name)
+
+    def check_rows(self, name: str, rows: TensorDictBase, example: TensorDictBase) -> None:
+        """Refuse saved rows of a replay buffer that do not make sense.
+
+        Args:
+            name: of the buffer in `stateful`.
+            rows: saved.
+            example: what `replay_rows` returned.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        self._level(name.partition("_")[0]).check_rows(rows, example)
+
+    def _level(self, owner: str) -> Learner | Selector:
+        level = self.selector if owner == "selector" else self.learners[int(owner.removeprefix("learner"))]
+        assert isinstance(level, Learner | Selector)
+        return level
+
     def portable(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if a part of it cannot say.
 

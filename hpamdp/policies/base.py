@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.shared.masks import random_choice
+from hpamdp.policies.shared.stored_rows import check_rows
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -242,9 +243,9 @@ class Selector(TensorDictModuleBase):
         return self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1).float() * goes_on
 
     def stateful(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold besides parameters and buffers, by name: optimisers, replay buffers.
+        """Return what a checkpoint must hold besides parameters and buffers, by name.
 
-        Each value has `state_dict` and `load_state_dict`, or is a TorchRL `ReplayBuffer`.
+        Each value is an optimizer or a TorchRL `ReplayBuffer`. If there is a buffer, `replay_rows` returns its rows.
         """
         return {}
 
@@ -262,6 +263,34 @@ class Selector(TensorDictModuleBase):
         By default, the optimizers of `stateful` tell. Override it if the selector learns without one.
         """
         return have_stepped(self.stateful())
+
+    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
+        """Return what each replay buffer of `stateful` would hold of a collected batch `[*B, T]`, rows `[N]`.
+
+        A checkpoint's rows are compared with them in names, shapes and dtypes.
+        """
+        return {}
+
+    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
+        """Refuse saved rows `[N]` of a replay buffer that do not make sense.
+
+        Args:
+            rows: to be put into the buffer.
+            example: what `replay_rows` returned.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        check_rows(rows, self.specs)
+
+    def check_state(self, state: Mapping[str, Any]) -> None:
+        """Refuse a state dict that has the names and shapes of this selector's, but does not make sense.
+
+        Called before `load_state_dict`. Override it if there is more to check than that numbers are finite.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
 
     def portable(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to choose greedily; None if that is not known.
@@ -342,6 +371,7 @@ class Learner(nn.Module):
         value_option: name of the setting without which there is no `value`; None: where there is the method, there is.
         progress: the buffers, by the last part of their names, that say how far a run has come: counters of its steps
             and the exploration that follows from them. They begin afresh where a new run takes over the learner.
+        may_be_nan: the columns of the replay buffer that may hold NaN.
         following: what follows an option that ends inside its episode; the agent sets it.
     """
 
@@ -350,6 +380,7 @@ class Learner(nn.Module):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_option: ClassVar[str | None] = None
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
+    may_be_nan: ClassVar[frozenset[str]] = frozenset()
 
     policy: TensorDictModuleBase
     following: Following
@@ -459,3 +490,22 @@ class Learner(nn.Module):
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, as `Selector.stateful` does."""
         return {}
+
+    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
+        """Return what each replay buffer would hold of a batch, as `Selector.replay_rows` does."""
+        return {}
+
+    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
+        """Refuse saved rows that do not make sense, as `Selector.check_rows` does.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        check_rows(rows, self.specs, self.may_be_nan)
+
+    def check_state(self, state: Mapping[str, Any]) -> None:
+        """Refuse a state dict that does not make sense, as `Selector.check_state` does.
+
+        Raises:
+            ValueError: with what is wrong.
+        """

@@ -1,9 +1,10 @@
 """A run on disk: everything that is needed to continue it or to score its agent.
 
 A checkpoint is a zip archive: `manifest.json` with the run's progress and the checksums of the other members, and one
-member for each component, written by `torch.save` and read with `weights_only`, so that opening somebody else's file
-runs none of its code. TorchRL's `Checkpoint` is not used: it reads a replay buffer's prefetch queue with pickle, stores
-replay buffers at full capacity, and moves the old file away before the new one is in place.
+member for each component, written by `torch.save`. Opening somebody else's file runs none of its code, see `archive`.
+It changes nothing of an agent unless the whole file fits it, see `checks`. TorchRL's `Checkpoint` is not used: it reads
+a replay buffer's prefetch queue with pickle, stores replay buffers at full capacity, and moves the old file away before
+the new one is in place.
 """
 
 from __future__ import annotations
@@ -12,45 +13,66 @@ import hashlib
 import io
 import json
 import os
-import pickle
+import random
 import zipfile
-import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
-from typing import Any
+from typing import IO, Annotated, Any, Literal
 
 import torch
-from tensordict import TensorDict
-from torch import Tensor
+from pydantic import Field, FiniteFloat
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 
 from hpamdp.config import ConfigError
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
-from hpamdp.messages import first_line, one_line, warn
+from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.base import Learner
+from hpamdp.policies.base import Learner, Selector
+from hpamdp.run.archive import MemberFile, TensorArchive, stored_members
+from hpamdp.run.checks import (
+    Progress,
+    SavedPart,
+    check_form,
+    check_generator,
+    check_moments,
+    check_names,
+    check_optimizer,
+    check_replay,
+    check_rows,
+    check_values,
+    checked,
+    checked_as,
+    scheduled,
+    stepped,
+    varying,
+)
 from hpamdp.run.folder import CHECKPOINT_NAME as FILE_NAME
 from hpamdp.run.folder import POLICY_NAME
 
 _FORMAT = 2
 _MANIFEST = "manifest.json"
+_MAX_JSON = 2**24
+_BLOCK = 2**20
+_CUDA_STATE_BYTES = 16
 # Parts of a run that are saved beside the agent.
 STATES = ("collection", "recorder")
 # What can be wrong with the bytes of a file.
 _DAMAGE = (
     zipfile.BadZipFile,
-    zlib.error,
-    pickle.UnpicklingError,
-    json.JSONDecodeError,
-    UnicodeDecodeError,
     EOFError,
     OSError,
     KeyError,
     TypeError,
     AttributeError,
-    NotImplementedError,
+    IndexError,
+    OverflowError,
     ValueError,
     RuntimeError,
 )
@@ -87,14 +109,25 @@ class Saved:
     """What `load` returns; the agent itself is filled in place.
 
     Attributes:
+        file: the checkpoint.
         progress: JSON values that `save` was given.
         states: of the other parts of the run, by name, as `save` was given them.
-        generators: the states of the random generators, for `set_generators`.
+        generators: the states of the random generators, for `set_generators`; None without training.
     """
 
+    file: Path
     progress: dict[str, Any]
     states: dict[str, dict[str, Any]]
-    generators: dict[str, Any]
+    generators: Generators | None
+
+    def set_statistics(self, env: PAMDPEnv) -> None:
+        """Have an environment scale its observations as that of the saved run did.
+
+        Raises:
+            ConfigError: they are of another environment.
+        """
+        with _named(f"{self.file}: does not fit env"):
+            env.set_statistics(_strings(self.states.get("collection", {}).get("env", {})))
 
 
 def save(
@@ -150,61 +183,293 @@ def progress_of(file: Path) -> dict[str, Any]:
     Raises:
         ConfigError: the file is damaged or not a checkpoint of this program.
     """
-    return _read(file, set())[0]
+    with _Opened(file) as opened:
+        return opened.progress
 
 
 def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:
     """Fill the agent's learners from another run's checkpoint, but neither their optimizers, replay nor `progress`.
 
+    Nothing is changed unless all learners fit.
+
     Raises:
         ConfigError: the checkpoint is damaged or of other learners.
     """
-    _, members = _read(file, {"agent"}, device)
     prefix = "learners."
-    own = {name.removeprefix(prefix): value for name, value in members["agent"].items() if name.startswith(prefix)}
-    saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
-    if own and saved_num != num:
-        learners = "learner" if saved_num == 1 else "learners"
-        raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} {learners}, but this agent has {num}")
-    try:
+    with _Opened(file) as opened, _named(f"low.checkpoint={file}: of another class or size than low"):
+        saved = _strings(opened.part("agent"))
+        own = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}
+        saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
+        if own and saved_num != num:
+            learners = "learner" if saved_num == 1 else "learners"
+            raise ConfigError(f"low.checkpoint={file}: it holds {saved_num} {learners}, but this agent has {num}")
+        states = []
         for i, learner in enumerate(agent.learners):
-            assert isinstance(learner, Learner)
             start = f"{i}."
-            learner.load_networks({name.removeprefix(start): own[name] for name in own if name.startswith(start)})
-    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigError(f"low.checkpoint={file}: of another class or size than low: {_misfit(error)}") from error
+            state = {name.removeprefix(start): own[name] for name in own if name.startswith(start)}
+            states.append(opened.state("agent", state, learner, device))
+    for learner, state in zip(agent.learners, states, strict=True):
+        assert isinstance(learner, Learner)
+        learner.load_networks(state)
 
 
-def load(file: Path, agent: HierarchicalAgent, device: torch.device, *, with_training: bool) -> Saved:
+def load(
+    file: Path,
+    agent: HierarchicalAgent,
+    device: torch.device,
+    *,
+    with_training: bool,
+    steps: TensorDictBase | None = None,
+) -> Saved:
     """Fill the agent from a checkpoint, with training also its optimizers and replay.
 
     Nothing is changed before the whole file was read and checked. The random generators are left to `set_generators`.
 
+    Args:
+        file: the checkpoint.
+        agent: to fill.
+        device: its device.
+        with_training: whether the run goes on.
+        steps: see `HierarchicalAgent.replay_rows`; with training they must be given.
+
     Raises:
         ConfigError: the checkpoint is damaged or of another agent.
     """
-    stateful = agent.stateful()
-    progress, members = _read(file, None if with_training else {"agent", *STATES}, device)
-    replays = {name for name, part in stateful.items() if isinstance(part, ReplayBuffer)}
-    missing = {"agent", "rng", *STATES, *stateful} - replays - set(members) if with_training else set()
-    if missing:
-        raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
-    try:
-        agent.load_state_dict(members["agent"])
-        if with_training:
+    misfit = f"{file}: does not fit this agent, whose sizes env sets"
+    states: dict[str, dict[str, Any]] = {}
+    optimizers: dict[str, dict[str, Any]] = {}
+    replays: dict[str, _Replay] = {}
+    with _Opened(file) as opened:
+        stateful = agent.stateful() if with_training else {}
+        buffers = {name: part for name, part in stateful.items() if isinstance(part, ReplayBuffer)}
+        missing = ({"agent", "rng", *STATES, *stateful} if with_training else {"agent"}) - {*buffers} - opened.names
+        if missing:
+            raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
+        with _named(misfit):
+            networks = opened.state("agent", opened.part("agent"), agent, device)
             for name, part in stateful.items():
-                if name in replays:
-                    _fill_replay(part, members.get(name))
-                else:
-                    part.load_state_dict(members[name])
-    except (RuntimeError, KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise ConfigError(f"{file}: does not fit this agent, whose sizes env sets: {_misfit(error)}") from error
-    return Saved(progress, {name: members.get(name, {}) for name in STATES}, members.get("rng", {}))
+                if name not in buffers:
+                    optimizers[name] = opened.optimizer(name, part, device)
+            for name in opened.names & {*buffers}:
+                replays[name] = opened.replay(name, buffers[name], agent, steps)
+        with _named(f"{file}: damaged, or not a checkpoint of this program"):
+            for name in STATES if with_training else STATES[:1]:
+                if name in opened.names:
+                    states[name] = _strings(opened.filled(name, device))
+            generators = Generators.of(opened.filled("rng")) if with_training else None
+        progress = opened.progress
+    agent.load_state_dict(networks)
+    for name, state in optimizers.items():
+        stateful[name].load_state_dict(state)
+    for name, buffer in buffers.items():
+        if name in replays:
+            replays[name].put_into(buffer)
+        else:
+            warn("the checkpoint holds no replay (checkpoint_replay=false); the learner begins with an empty one")
+    return Saved(file, progress, states, generators)
 
 
-def _misfit(error: Exception) -> str:
-    """Return the beginning of what torch says when weights do not fit, without its heading."""
-    return f"{one_line(error).partition('state_dict for ')[2].partition(': ')[2] or one_line(error):.160}"
+@contextmanager
+def _named(what: str) -> Iterator[None]:
+    """Report whatever is wrong with the bytes or the values of a file in one line that begins with `what`.
+
+    Raises:
+        ConfigError: instead of the error.
+    """
+    try:
+        yield
+    except MemoryError as error:
+        raise ConfigError(f"{what}: there is not enough memory for it") from error
+    except _DAMAGE as error:
+        if isinstance(error, ConfigError):
+            raise
+        told = first_line(error) if type(error) is ValueError else f"{type(error).__name__}: {first_line(error)}"
+        raise ConfigError(f"{what} ({told:.160})") from error
+
+
+def _strings(values: Any) -> dict[str, Any]:
+    return checked_as(dict[str, Any], values)
+
+
+@dataclass(frozen=True)
+class _Replay:
+    """The checked contents of a replay buffer."""
+
+    rows: TensorDict | None
+    writer: dict[str, int]
+
+    def put_into(self, buffer: ReplayBuffer) -> None:
+        """Fill an empty buffer."""
+        if self.rows is not None:
+            buffer.extend(self.rows)
+        buffer._writer.load_state_dict(self.writer)
+
+
+class _Manifest(SavedPart):
+    format: int
+    members: dict[str, str]
+    progress: dict[str, Any]
+
+
+class _Opened:
+    """A checkpoint or policy file that is being read: its members are described first, and read when they fit.
+
+    Args:
+        file: the path.
+
+    Attributes:
+        names: of the members.
+        progress: of the run.
+
+    Raises:
+        ConfigError: the file is damaged or not a checkpoint of this program.
+    """
+
+    names: set[str]
+    progress: dict[str, Any]
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._damaged = f"{path}: damaged, or not a checkpoint of this program"
+        self._parts: dict[str, TensorArchive] = {}
+        self._stack = ExitStack()
+
+    def __enter__(self) -> _Opened:
+        with _named(self._damaged):
+            file = self._stack.enter_context(self.path.open("rb"))
+            num_bytes = os.fstat(file.fileno()).st_size
+            try:
+                self._open(file, num_bytes)
+            except BaseException:
+                self._stack.close()
+                raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _open(self, file: IO[bytes], num_bytes: int) -> None:
+        archive = stored_members(file, num_bytes)
+        self._file, self._infos = file, {info.filename: info for info in archive.infolist()}
+        if _MANIFEST in self._infos:
+            text = archive.read(_MANIFEST)
+            manifest = checked(_Manifest, _json(text))
+            _check_format(manifest.format)
+            self._checksums = manifest.members
+            self.names = {*manifest.members}
+            progress = manifest.progress
+        else:
+            saved = TensorArchive(file, num_bytes)
+            _check_format(saved.state["format"])
+            progress = _json(saved.state["progress"])
+            saved.state = saved.state["agent"]
+            self.names, self._parts = {"agent"}, {"agent": saved}
+        self.progress = checked(Progress, progress).model_dump(exclude_unset=True)
+
+    def part(self, name: str) -> Any:
+        """Return what a member holds, with a `SavedTensor` in the place of each tensor."""
+        if name not in self._parts:
+            with _named(self._damaged):
+                info = self._infos[f"{name}.pt"]
+                if _checksum(MemberFile(self._file, info)) != self._checksums[name]:
+                    raise ValueError(f"the checksum of {name} is wrong")
+                self._parts[name] = TensorArchive(BufferedReader(MemberFile(self._file, info)), info.file_size)
+        return self._parts[name].state
+
+    def filled(self, name: str, device: torch.device | None = None) -> Any:
+        """Return what a member holds."""
+        state = self.part(name)
+        return self._parts[name].filled(state, device)
+
+    def state(self, name: str, saved: Any, module: nn.Module, device: torch.device) -> dict[str, Any]:
+        """Return a state dict that a module can load.
+
+        Args:
+            name: the member.
+            saved: the state dict, not yet read.
+            module: it is for.
+            device: of the tensors.
+
+        Raises:
+            ValueError: it is of another module, or holds numbers that make no sense.
+            ConfigError: it holds NaN or inf.
+        """
+        archive = self._parts[name]
+        own = module.state_dict(keep_vars=True)
+        any_size = varying(module)
+        check_names(saved, own)
+        for key, value in own.items():
+            if isinstance(value, Tensor):
+                check_form(key, saved[key], value, any_size=id(value) in any_size)
+        read: dict[int, Tensor] = {}  # weights that several parts share occur several times
+        state: dict[str, Any] = {}
+        for key, value in own.items():
+            if not isinstance(value, Tensor):
+                state[key] = archive.filled(saved[key], device)
+                continue
+            tensor = archive.tensor(saved[key], device).to(value.dtype)
+            first = read.setdefault(id(value), tensor)
+            try:
+                check_values(key, tensor, value)
+            except ValueError as error:
+                raise ConfigError(f"{self.path}: {error}; take an earlier checkpoint") from error
+            if not torch.equal(first, tensor):
+                raise ValueError(f"{key} differs from another name of the same weights")
+            state[key] = first
+        for prefix, part in module.named_modules():
+            if isinstance(part, Learner | Selector):
+                start = f"{prefix}." if prefix else ""
+                part.check_state({key.removeprefix(start): state[key] for key in state if key.startswith(start)})
+        return state
+
+    def optimizer(self, name: str, optimizer: torch.optim.Optimizer, device: torch.device) -> dict[str, Any]:
+        """Return a state dict that an optimizer can load.
+
+        Raises:
+            ValueError: it is of another optimizer, or holds numbers that make no sense.
+        """
+        own = stepped(optimizer)
+        saved = self.part(name)
+        check_optimizer(name, saved, own)
+        moments = self._parts[name].filled(saved["state"], device)
+        check_moments(name, moments)
+        groups = zip(own["param_groups"], saved["param_groups"], strict=True)
+        return {"state": moments, "param_groups": [scheduled(*pair) for pair in groups]}
+
+    def replay(
+        self, name: str, buffer: ReplayBuffer, agent: HierarchicalAgent, steps: TensorDictBase | None
+    ) -> _Replay:
+        """Return the contents of a replay buffer.
+
+        Raises:
+            ValueError: they are of another buffer, or hold numbers that make no sense.
+        """
+        saved = check_replay(name, self.part(name), buffer)
+        writer = saved.writer.model_dump(by_alias=True)
+        if not saved.num_rows:
+            return _Replay(None, writer)
+        assert steps is not None
+        example = agent.replay_rows(name, steps)
+        check_rows(f"{name}.rows", saved.rows, example.to_dict(), saved.num_rows)
+        rows = TensorDict(self._parts[name].filled(saved.rows, example.device), batch_size=[saved.num_rows])
+        agent.check_rows(name, rows, example)
+        return _Replay(rows, writer)
+
+
+def _json(text: Any) -> Any:
+    def refuse(name: str) -> None:
+        raise ValueError(f"it holds the number {name}")
+
+    if not isinstance(text, str | bytes) or len(text) > _MAX_JSON:
+        raise ValueError(f"its progress is no text of at most {_MAX_JSON:,} bytes")
+    return json.loads(text, parse_constant=refuse)
+
+
+def _checksum(member: MemberFile) -> str:
+    digest = hashlib.sha256()
+    while block := member.read(_BLOCK):
+        digest.update(block)
+    return digest.hexdigest()
 
 
 def _packed(state: object) -> bytes:
@@ -213,57 +478,9 @@ def _packed(state: object) -> bytes:
     return stream.getvalue()
 
 
-def _read(
-    file: Path, wanted: set[str] | None, device: torch.device | None = None
-) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the progress and the wanted members that are there, None: all; check every byte that is used."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            if _MANIFEST not in archive.namelist():
-                return _read_policy(file, device)
-            manifest = json.loads(archive.read(_MANIFEST))
-            _check_format(manifest["format"])
-            members = {}
-            names = set(manifest["members"])
-            for name in sorted(names if wanted is None else wanted & names):
-                data = archive.read(f"{name}.pt")
-                if hashlib.sha256(data).hexdigest() != manifest["members"][name]:
-                    raise ValueError(f"the checksum of {name} is wrong")
-                members[name] = torch.load(io.BytesIO(data), map_location=device, weights_only=True)
-            progress = dict(manifest["progress"])
-            _check_progress(progress)
-    except _DAMAGE as error:
-        raise ConfigError(
-            f"{file}: damaged, or not a checkpoint of this program ({type(error).__name__}: {first_line(error):.120})"
-        ) from error
-    _check_weights(file, members.get("agent", {}))
-    return progress, members
-
-
-def _read_policy(file: Path, device: torch.device | None) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Read what `save_policy` wrote."""
-    saved = torch.load(file, map_location=device, weights_only=True)
-    _check_format(saved["format"])
-    progress = json.loads(saved["progress"])
-    _check_progress(progress)
-    _check_weights(file, saved["agent"])
-    return progress, {"agent": saved["agent"]}
-
-
 def _check_format(number: int) -> None:
     if number != _FORMAT:
         raise ValueError(f"format {number}, but this version reads {_FORMAT}")
-
-
-def _check_progress(progress: Mapping[str, Any]) -> None:
-    if not isinstance(progress["config"], Mapping):
-        raise TypeError("the config is no mapping")
-
-
-def _check_weights(file: Path, state: Mapping[str, Any]) -> None:
-    for name, value in state.items():
-        if isinstance(value, Tensor) and value.is_floating_point() and value.isnan().any():
-            raise ConfigError(f"{file}: {name} holds NaN; take an earlier checkpoint")
 
 
 def _replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
@@ -272,20 +489,63 @@ def _replay_state(buffer: ReplayBuffer) -> dict[str, Any]:
     return {"rows": rows, "num_rows": len(buffer), "writer": dict(buffer._writer.state_dict())}
 
 
-def _fill_replay(buffer: ReplayBuffer, state: Mapping[str, Any] | None) -> None:
-    if state is None:
-        warn("the checkpoint holds no replay (checkpoint_replay=false); the learner begins with an empty one")
-        return
-    if state["num_rows"]:
-        buffer.extend(TensorDict(state["rows"], batch_size=[state["num_rows"]]))
-    buffer._writer.load_state_dict(state["writer"])
+class _PythonState(SavedPart):
+    version: Literal[3]
+    words: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**32)], ...], Field(min_length=625, max_length=625)]
+    gauss: FiniteFloat | None
 
 
-def set_generators(state: Mapping[str, Any]) -> None:
+class _NumpyState(SavedPart):
+    kind: Literal["MT19937"]
+    words: Tensor
+    place: Annotated[int, Field(ge=0, le=624)]
+    has_gauss: Literal[0, 1]
+    gauss: FiniteFloat
+
+
+class Generators(SavedPart):
+    """The states of the random generators of a process."""
+
+    python: tuple[Any, ...]
+    numpy: tuple[Any, ...]
+    torch_cpu: Tensor
+    torch_cuda: list[Tensor] | None = None
+    torch_xpu: list[Tensor] | None = None
+    torch_mps: Tensor | None = None
+
+    @classmethod
+    def of(cls, saved: Any) -> Generators:
+        """Return the states, after trying them on generators that nobody uses.
+
+        Raises:
+            ValueError: they are no states of generators.
+        """
+        states = checked(cls, saved)
+        for model, values in ((_PythonState, states.python), (_NumpyState, states.numpy)):
+            checked(model, dict(zip(model.model_fields, values, strict=True)))
+        words = states.numpy[1]
+        if words.dtype != torch.int64 or list(words.shape) != [624] or (words < 0).any() or (words >= 2**32).any():
+            raise ValueError("numpy: must hold 624 numbers of 32 bits")
+        random.Random().setstate(states.python)
+        check_generator(states.torch_cpu)
+        for state in states.torch_cuda or []:
+            if state.dtype != torch.uint8 or list(state.shape) != [_CUDA_STATE_BYTES]:
+                raise ValueError(f"torch_cuda: must hold {_CUDA_STATE_BYTES} bytes for each device")
+        return states
+
+
+def set_generators(generators: Generators) -> None:
     """Restore the random generators; those of devices that this machine lacks are left out, with a warning."""
-    here = dict(state)
-    if "torch_cuda" in here and not torch.cuda.is_available():
-        del here["torch_cuda"]
-        warn("the checkpoint was made with CUDA, which is not here: its random generators are left out")
-    here["torch_cpu"] = here["torch_cpu"].cpu()
-    GlobalRNGState().load_state_dict(here)
+    states = {name: state for name, state in generators if state is not None}
+    if "torch_cuda" in states:
+        num = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if num < len(states["torch_cuda"]):
+            warn("the checkpoint was made with CUDA devices that are not here: their random generators are left out")
+            states["torch_cuda"] = states["torch_cuda"][:num]
+        if not num:
+            del states["torch_cuda"]
+    for name, module in (("torch_xpu", "xpu"), ("torch_mps", "mps")):
+        if name in states and not getattr(torch, module).is_available():
+            del states[name]
+            warn(f"the checkpoint was made with {module}, which is not here: its random generators are left out")
+    GlobalRNGState().load_state_dict(states)

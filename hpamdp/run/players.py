@@ -77,7 +77,7 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     if source is not None:
         check_saved_options(config, env)
         saved = checkpoint.load(source, agent, device, with_training=False)
-        env.set_statistics(saved.states["collection"].get("env", {}))
+        saved.set_statistics(env)
     return Player(config, agent, make_evaluation(config, env, num_filmed=config.run.eval.layouts))
 
 

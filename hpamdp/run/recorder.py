@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import FiniteFloat
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.analysis import figures, film
@@ -17,6 +19,7 @@ from hpamdp.config import Config
 from hpamdp.files import replacing
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
+from hpamdp.run.checks import SavedPart, check_columns, check_values, checked
 from hpamdp.run.closing_table import WITHOUT_UPDATE, closing_table
 from hpamdp.run.folder import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 from hpamdp.run.loggers import CSVLogger, EarlierRun, Guarded, Logger
@@ -25,6 +28,12 @@ from hpamdp.run.summary import summarise
 
 # Small and short enough to take a second or two.
 _FPS, _FILM_SIZE, _FILMED_STEPS = 20.0, 200, 40
+
+
+class _State(SavedPart):
+    ended: list[dict[str, Tensor]]
+    scalars: dict[str, FiniteFloat]
+    held: dict[str, FiniteFloat]
 
 
 class Recorder:
@@ -79,10 +88,22 @@ class Recorder:
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`."""
-        self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in state["ended"]]
-        self._scalars = dict(state["scalars"])
-        self._held = dict(state["held"])
+        """Continue from a `state`.
+
+        Raises:
+            ValueError: it is of another environment, or holds numbers that make no sense.
+        """
+        saved = checked(_State, state)
+        own = self._results(self.parts.env.fake_tensordict()).to_dict()
+        for ended in saved.ended:
+            check_columns("ended", ended, own, any_rows=True)
+            if len({len(column) for column in ended.values()}) > 1:
+                raise ValueError("ended: columns of different lengths")
+            for name, column in ended.items():
+                check_values(f"ended.{name}", column, own[name])
+        self._ended = [TensorDict(ended).auto_batch_size_(1) for ended in saved.ended]
+        self._scalars = saved.scalars
+        self._held = saved.held
 
     def take(self, batch: TensorDictBase | None, scalars: dict[str, float]) -> None:
         """Note a collected batch `[N, T]`, if there is one, and the scalars that the agent returned from learning."""
@@ -91,10 +112,14 @@ class Recorder:
         if batch is None:
             return
         is_end = batch.get(("next", keys.DONE)).squeeze(-1)
-        ended = batch.get("next").select(*self.parts.env.result_keys, keys.EPISODE_RETURN, keys.EPISODE_STEPS)[is_end]
-        if keys.OPTION in batch.keys():
-            ended.set(keys.OPTION, batch.get(keys.OPTION)[is_end])
-        self._ended.append(ended)
+        self._ended.append(self._results(batch)[is_end])
+
+    def _results(self, steps: TensorDictBase) -> TensorDictBase:
+        """Return what is noted of steps `[*B]` that end an episode."""
+        results = steps.get("next").select(*self.parts.env.result_keys, keys.EPISODE_RETURN, keys.EPISODE_STEPS)
+        if keys.OPTION in steps.keys():
+            results.set(keys.OPTION, steps.get(keys.OPTION))
+        return results
 
     def forget_evaluation(self) -> None:
         """Evaluate again when the scores are needed next, as the agent may have changed."""

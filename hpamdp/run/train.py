@@ -21,6 +21,7 @@ from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
+from hpamdp.run.checks import example_steps
 from hpamdp.run.collection.base import Collection, CollectionError
 from hpamdp.run.folder import (
     CONFIG_NAME,
@@ -170,17 +171,22 @@ class Trainer:
     def restore(self, source: Path) -> None:
         """Take the agent from a checkpoint and, to continue training, the state of its run."""
         is_training = self.config.run.mode != "eval"
-        saved = checkpoint.load(source, self.parts.agent, self.parts.device, with_training=is_training)
+        agent, env = self.parts.agent, self.parts.env
+        steps = example_steps(env, self.parts.policy) if is_training else None
+        saved = checkpoint.load(source, agent, self.parts.device, with_training=is_training, steps=steps)
         progress = saved.progress
         self.frames = progress["frames"]
         self.wall_s = progress["wall_s"]
         self.cpu_s = progress["cpu_s"]
         self.last_score = progress["last_score"]
         if not is_training:
-            self.parts.env.set_statistics(saved.states["collection"].get("env", {}))
+            saved.set_statistics(env)
             return
         self.recorder.resume_from(source.parent, self.frames)
-        self.recorder.set_state(saved.states["recorder"])
+        try:
+            self.recorder.set_state(saved.states["recorder"])
+        except ValueError as error:
+            raise ConfigError(f"{source}: does not fit this run ({first_line(error)})") from error
         self._saved = saved
 
     def start(self, *, is_own: bool) -> None:
@@ -244,13 +250,14 @@ class Trainer:
         """Put the collection and the random generators into the state that was saved, if there is one."""
         if self._saved is None:
             return
+        state, generators = self._saved.states["collection"], self._saved.generators
         try:
-            collection.set_state(self._saved.states["collection"])
+            collection.set_state(state)
         except (ValueError, RuntimeError, KeyError) as error:
-            raise ConfigError(
-                f"num_envs={self.config.run.num_envs}: {first_line(error)}; leave it out when you resume"
-            ) from error
-        checkpoint.set_generators(self._saved.generators)
+            where = f"{self._saved.file}, num_envs={self.config.run.num_envs}"
+            raise ConfigError(f"{where}: {first_line(error)}; leave num_envs out when you resume") from error
+        assert generators is not None
+        checkpoint.set_generators(generators)
 
     def _loop(self, collection: Collection, request: StopRequest) -> None:
         run = self.config.run

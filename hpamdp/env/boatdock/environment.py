@@ -29,7 +29,7 @@ from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import check_arguments, invalid_press, make_rules
-from hpamdp.env.columns import cloned, from_arrays, overwrite, where
+from hpamdp.env.columns import check_range, cloned, from_arrays, overwrite, where
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:
@@ -415,6 +415,16 @@ class BoatDockEnv(PAMDPEnv):
         """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
         plans = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
         return {**self.state._asdict(), **plans}
+
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Refuse controllers, keymaps and outcomes that do not exist.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        super().check_env_state(columns)
+        limits = {"controller": (-1, len(self.rules.names)), "outcome": (0, len(physics.OUTCOMES))}
+        check_range(columns, {**limits, "keymap": (0, 3), "presses": (0, 2**30), "episode": (-1, 2**30)})
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`.

@@ -149,11 +149,14 @@ class RunningStatistics(RunningMeanStd):
         """Continue from saved `columns`.
 
         Raises:
-            ValueError: they are of vectors of another length.
+            ValueError: they are of vectors of another length, or hold numbers that make no sense.
         """
         for name, column in self.columns().items():
             if name not in columns or columns[name].shape != column.shape:
                 raise ValueError(f"running statistics: {name} must have shape {list(column.shape)}")
+            is_mean = name == "observation_mean"
+            if not (columns[name].isfinite() & (is_mean | (columns[name] >= 0.0))).all():
+                raise ValueError(f"running statistics: {name} must be finite{'' if is_mean else ' and at least 0'}")
         self.count = columns["observation_count"].item()
         self.mean = columns["observation_mean"].to("cpu", torch.float64, copy=True).numpy()
         self.var = columns["observation_variance"].to("cpu", torch.float64, copy=True).numpy()

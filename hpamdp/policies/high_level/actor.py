@@ -138,6 +138,15 @@ class Actor(OnPolicy, Selector):
             rows["allowed"] = decisions.get(ALLOWED)
         return TensorDict(rows, batch_size=decisions.shape)
 
+    def empty_rows(self) -> dict[str, Tensor]:
+        """Return the columns of `_rows`."""
+        number = torch.zeros(0)
+        columns = {"state": torch.zeros(0, self.specs.observation_dim), "option": number.long()}
+        columns |= dict.fromkeys(("log_prob", "weight", "target"), number)
+        if self.specs.has_option_mask:
+            columns["allowed"] = torch.zeros(0, self.specs.num_options, dtype=torch.bool)
+        return columns
+
     def _loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of policy and critic on decisions `[B]`, and scalars to log."""
         log_probs = masked_logits(self.logits(rows["state"]), rows.get("allowed", None)).log_softmax(-1)

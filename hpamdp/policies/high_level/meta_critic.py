@@ -101,6 +101,10 @@ class MetaCritic(Selector):
         """Return the optimiser and the replay buffer."""
         return {"critics": self.optimizer, "buffer": self.buffer}
 
+    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
+        """Return what the buffer would hold if every step of a batch `[*B, T]` ended an option."""
+        return {"buffer": self._rows(batch.flatten())}
+
     def portable(self) -> dict[str, Any]:
         """Return the critics: see `hpamdp.policies.shared.portable`."""
         return portable_ensemble(self.critics)

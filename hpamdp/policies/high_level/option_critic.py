@@ -121,6 +121,10 @@ class OptionCritic(Selector):
         """Return the optimizers and the replay buffer."""
         return {**self.optimizers, "buffer": self.buffer}
 
+    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
+        """Return what the buffer would hold of a batch `[*B, T]`."""
+        return {"buffer": self._rows(batch).flatten()}
+
     @property
     def epsilon(self) -> float:
         """Probability of a random option."""

@@ -259,6 +259,16 @@ class HPPO(OnPolicy, Learner):
         rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
         return TensorDict(rows, batch_size=[int(mask.sum())])
 
+    def empty_rows(self) -> dict[str, Tensor]:
+        """Return the columns of `_rows`."""
+        number, observation = torch.zeros(0), torch.zeros(0, self.specs.observation_dim)
+        names = ("advantage", "target", "discrete_log_prob", "parameter_log_prob")
+        columns = {keys.OBSERVATION: observation, RAW: torch.zeros(0, self.specs.num_parameters)}
+        columns |= {"discrete": number.long(), **dict.fromkeys(names, number)}
+        if self.specs.has_action_mask:
+            columns[keys.ACTION_MASK] = torch.zeros(0, self.specs.num_discrete, dtype=torch.bool)
+        return columns
+
     def _distribution(self, rows: Mapping[str, Tensor]) -> HybridDistribution:
         allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION], allowed)

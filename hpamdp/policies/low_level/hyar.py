@@ -338,6 +338,7 @@ class HyAR(ReplayLearner):
     """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
+    may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
 
     policy: HyARPolicy
     dynamics_error: Tensor

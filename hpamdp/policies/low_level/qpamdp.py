@@ -32,7 +32,8 @@ Differs from the source:
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -43,10 +44,11 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
-from hpamdp.policies.low_level.qpamdp_features import FourierBasis, SizedByData, num_fourier_features
+from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.masks import masked_logits, masked_values
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
+from hpamdp.policies.shared.sized_by_data import SizedByData
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
@@ -481,6 +483,37 @@ class QPAMDP(Learner):
         scalars["updates"] = self.updates.item()
         scalars["sigma"] = self.policy.sigma.item()
         return scalars
+
+    def check_state(self, state: Mapping[str, Any]) -> None:
+        """Refuse sizes that do not fit together, and phases that do not exist.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        num_features = []
+        for name, weights in (("phi", state["policy.w"]), ("psi", state["policy.theta"])):
+            basis: FourierBasis = getattr(self.policy, name)
+            basis.check_state({key: state[f"policy.{name}.{key}"] for key, _ in basis.named_buffers()}, len(self.low))
+            num_features.append(len(state[f"policy.{name}.coefficients"]))
+            if weights.shape[-1] != num_features[-1]:
+                raise ValueError(f"{name} has {num_features[-1]} features, but {weights.shape[-1]} weights for each")
+        num_discrete, num_parameters = self.specs.num_discrete, self.specs.num_parameters
+        if len(state["policy.w"]) != num_discrete or len(state["policy.theta"]) != num_parameters:
+            raise ValueError(f"the weights are not of {num_discrete} discrete actions and {num_parameters} parameters")
+        traces = state["sarsa.traces"]
+        if len(traces) and traces.shape[1:] != state["policy.w"].shape:
+            raise ValueError(f"traces {list(traces.shape)} do not fit weights {list(state['policy.w'].shape)}")
+        sizes = {key: list(state[f"enac.{key}"].shape) for key, _ in self.enac.named_buffers()}
+        num, num_regressors = sizes["regressors"]
+        expected = {"is_fresh": [num], "is_whole": [num], "regressors": [num, num_regressors], "returns": [num]}
+        expected |= {"gram": [num_regressors] * 2, "moment": [num_regressors], "num_episodes": []}
+        if sizes != expected or (num_regressors and num_regressors != state["policy.theta"].numel() + num_features[0]):
+            raise ValueError("the parts of the regression do not fit together")
+        if state["phase"] not in (SARSA, PARAMETERS):
+            raise ValueError(f"phase is {int(state['phase'])}, but must be {SARSA} or {PARAMETERS}")
+        for name in ("policy.temperature", "policy.sigma", "sarsa.step_size"):
+            if not state[name] > 0.0:
+                raise ValueError(f"{name} is {float(state[name])}, but must be greater than 0")
 
     def _warm_up(self, observation: Tensor) -> None:
         """Extend the ranges by observations `[N, observation_dim]`; fit the bases once there are enough."""

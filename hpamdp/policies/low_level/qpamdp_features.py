@@ -1,4 +1,4 @@
-"""Fourier features of the observation for Q-PAMDP, and modules whose buffers are sized by data.
+"""Fourier features of the observation for Q-PAMDP.
 
 Source: Konidaris, Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learning using the Fourier
 Basis*; see `qpamdp.py`, also for the differences from the source.
@@ -8,21 +8,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any
+from collections.abc import Mapping
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-
-class SizedByData(nn.Module):
-    """A module whose buffers are sized by data; loading a state dict resizes them to what was saved."""
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        for name, buffer in list(self.named_buffers(recurse=False)):
-            saved = state_dict.get(prefix + name)
-            if saved is not None and saved.shape != buffer.shape:
-                self.register_buffer(name, buffer.new_zeros(saved.shape))
-        super()._load_from_state_dict(state_dict, prefix, *args)
+from hpamdp.policies.shared.sized_by_data import SizedByData
 
 
 def fourier_coefficients(num_inputs: int, order: int, max_coupled: int) -> Tensor:
@@ -82,6 +73,25 @@ class FourierBasis(SizedByData):
         self.low = low
         self.width = (high - low).clamp(min=1e-6)
         self.coefficients = fourier_coefficients(len(inputs), self.order, self.max_coupled).to(low)
+
+    def check_state(self, state: Mapping[str, Tensor], observation_dim: int) -> None:
+        """Refuse buffers that `fit` does not set.
+
+        Args:
+            state: the buffers by name.
+            observation_dim: length of the observations.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        inputs, width = state["inputs"], state["width"]
+        num = len(inputs)
+        wanted = fourier_coefficients(num, self.order, self.max_coupled)
+        is_fitted = torch.equal(state["coefficients"].cpu(), wanted)
+        if not is_fitted and not torch.equal(state["coefficients"].cpu(), torch.zeros(1, 1)):
+            raise ValueError(f"coefficients are not those of order {self.order} for {num} entries")
+        if len(state["low"]) != num or len(width) != num or (inputs >= observation_dim).any() or (width <= 0.0).any():
+            raise ValueError(f"inputs, low and width must be of the same entries of {observation_dim}")
 
     def step_scale(self) -> Tensor:
         """Return the factor 1 / ||c|| on the step of each feature's weight, 1 for the constant, `[num_features]`.

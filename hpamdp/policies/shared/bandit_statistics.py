@@ -7,7 +7,8 @@ long as their episodes.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Annotated, ClassVar, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.shared.masks import masked_values
+from hpamdp.policies.shared.stored_rows import check_choices
 from hpamdp.specs import PAMDPSpecs
 
 Memory = Literal["all", "discounted", "sliding_window"]
@@ -176,6 +178,18 @@ class Bandit(Selector):
     def has_updated(self) -> bool:
         """Return whether any reward is known."""
         return bool(self.statistics.counts.any())
+
+    def check_state(self, state: Mapping[str, Any]) -> None:
+        """Refuse negative counts and decisions for options that do not exist.
+
+        Raises:
+            ValueError: with what is wrong.
+        """
+        for name, value in state.items():
+            if name.endswith(("counts", "squares")) and (value < 0.0).any():
+                raise ValueError(f"{name} holds {float(value.min())}, but must be at least 0")
+            if name.endswith("recent_options"):
+                check_choices({"option": value[value >= 0]}, self.specs)
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the rewards of finished decisions, oldest first; return the mean reward of each option."""

@@ -153,6 +153,16 @@ class ReplayLearner(Learner):
             rows["unit"] = rows["unit"].gather(-1, self.slots[rows["discrete"]])
         self.buffer.extend(rows)
 
+    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
+        """Return what the buffer would hold of a batch `[*B, T]`."""
+        own = self.buffer
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(batch.numel(), device=self.frames.device))
+        try:
+            self.store(batch, torch.ones(batch.shape, dtype=torch.bool, device=self.frames.device))
+            return {"buffer": self.buffer[:]}
+        finally:
+            self.buffer = own
+
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples for `num_batches` updates, each with transitions `[batch_size]`."""
         # One call for all updates: the buffer's overhead is as long as a forward pass.

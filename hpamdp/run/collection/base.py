@@ -6,7 +6,75 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from tensordict import TensorDictBase
+from pydantic import Field
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.policies.shared.stored_rows import check_choices
+from hpamdp.run.assemble import Parts
+from hpamdp.run.checks import SavedPart, check_columns, check_generator, checked, example_steps
+
+
+class CollectionState(SavedPart):
+    """What `Collection.state` returns."""
+
+    env: dict[str, Tensor]
+    root: dict[str, Any] | None = None
+    generators: list[Tensor] = Field(default_factory=list)
+    coming: dict[str, Any] | None = None
+
+
+def checked_state(saved: Any, parts: Parts) -> CollectionState:
+    """Return the state of a collection.
+
+    Raises:
+        ValueError: it is of another run, or holds numbers that make no sense.
+    """
+    state, env = checked(CollectionState, saved), parts.env
+    if state.env:
+        own = env.env_state()
+        if env.keeps_episodes:
+            sizes = {len(column) if column.ndim else 0 for column in state.env.values()} - {env.num_envs}
+            if sizes:
+                raise ValueError(f"the state is of {sizes.pop()} environments, but there are {env.num_envs}")
+        check_columns("env", state.env, own)
+        env.check_env_state(state.env)
+    for generator in state.generators:
+        check_generator(generator)
+    for name, steps in (("root", state.root), ("coming", state.coming)):
+        if steps is not None:
+            _check_steps(name, steps, example_steps(env, parts.policy), parts)
+    return state
+
+
+def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, parts: Parts) -> None:
+    """Refuse steps other than `[N, *]` of the run.
+
+    Raises:
+        ValueError: with the first entry that is wrong.
+    """
+    if where == "coming":
+        next_steps = saved.get("next")
+        done = next_steps.get(keys.DONE) if isinstance(next_steps, Mapping) else None
+        if not isinstance(done, Tensor) or done.ndim != example.ndim + 2 or not done.numel():
+            raise ValueError(f"{where} is no batch")
+        example = example.unsqueeze(1).expand(len(example), done.shape[1])
+    else:
+        example = example.exclude("next")
+        if keys.DISCRETE not in TensorDict(saved).keys(include_nested=True):  # before the first step
+            example = example.exclude(*parts.policy.out_keys)
+    own = example.to_dict()
+    if "collector" in saved:  # the numbers of trajectories, by TorchRL
+        own["collector"] = {"traj_ids": example.get(keys.DONE).squeeze(-1).long()}
+    check_columns(where, saved, own)
+    steps = TensorDict(saved)
+    for key in parts.env.fake_tensordict().keys(include_nested=True, leaves_only=True):
+        value = steps.get(key, None)
+        if value is not None and not value.isfinite().all():
+            raise ValueError(f"{where}: {key} is not finite")
+    choices = {"discrete": steps.get(keys.DISCRETE, None), "option": steps.get(keys.OPTION, None)}
+    check_choices({name: column for name, column in choices.items() if column is not None}, parts.agent.specs)
 
 
 class CollectionError(Exception):
@@ -57,7 +125,7 @@ class Collection:
         """Continue from a `state`.
 
         Raises:
-            ValueError: it is of another number of environments.
+            ValueError: it is of another run, such as one of another number of environments.
         """
         raise NotImplementedError
 

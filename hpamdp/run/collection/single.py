@@ -15,13 +15,14 @@ from torchrl.collectors import Collector
 
 from hpamdp.config import Config
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.base import Collection
+from hpamdp.run.collection.base import Collection, checked_state
 
 
 class SingleCollection(Collection):
     """Steps the environments in the learner's own process, between two updates."""
 
     def __init__(self, config: Config, parts: Parts) -> None:
+        self._parts = parts
         self.env = parts.env
         selector = parts.agent.selector
         pending = None if selector is None else selector.pending.clone()
@@ -61,13 +62,14 @@ class SingleCollection(Collection):
         """Continue from a `state`.
 
         Raises:
-            ValueError: the state is of another number of environments.
+            ValueError: it is of another run, such as one of another number of environments.
         """
-        if state["env"]:  # else the episodes that the collector has just begun go on
-            self.env.set_env_state(state["env"])
-        if "root" in state and self.env.keeps_episodes:
+        saved = checked_state(state, self._parts)
+        if saved.env:  # else the episodes that the collector has just begun go on
+            self.env.set_env_state(saved.env)
+        if saved.root is not None and self.env.keeps_episodes:
             root = self._collector._carrier
-            root.update(TensorDict(state["root"], batch_size=root.batch_size))
+            root.update(TensorDict(saved.root, batch_size=root.batch_size))
 
     def close(self) -> None:
         """Stop collecting; the environment stays open."""

@@ -18,7 +18,7 @@ from hpamdp import keys
 from hpamdp.config import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.run.assemble import Parts
-from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError
+from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state
 from hpamdp.run.collection.limits import limit_of
 from hpamdp.run.collection.worker import EnvShard, RemoteError, packed
 from hpamdp.search_path import protect_children, unprotect_children
@@ -65,6 +65,7 @@ class WorkerCollection(Collection):
         self._restarts = 0
         self._restarting = threading.Lock()
         self._notices: list[str] = []
+        self._parts = parts
         self._policy = parts.policy
         self._specs = parts.agent.specs
         self._frozen = packed(parts.agent.router) if config.run.low.freeze else None
@@ -257,29 +258,26 @@ class WorkerCollection(Collection):
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a `state` of any collection; exploration is the same only with as many workers."""
-        sizes = {len(column) for column in state["env"].values()}
-        if sizes - {self._num_envs}:
-            raise ValueError(f"the state is of {sizes.pop()} environments, but there are {self._num_envs}")
+        saved = checked_state(state, self._parts)
         self._state = dict(state)
-        generators = state.get("generators", [])
 
         def send(number: int) -> None:
             first = number * self._size
 
             def send_to(worker: Any) -> None:
-                if state["env"]:  # else the episodes that the worker has just begun go on
-                    _call(worker, "env.set_env_state", _sliced(state["env"], first, self._size))
-                if "root" in state and self._keeps_episodes:
-                    _call(worker, "_carrier.update", _sliced(state["root"], first, self._size))
-                if len(generators) == len(self._workers):
-                    _call(worker, "policy.set_generator_state", generators[number])
+                if saved.env:  # else the episodes that the worker has just begun go on
+                    _call(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
+                if saved.root is not None and self._keeps_episodes:
+                    _call(worker, "_carrier.update", _sliced(saved.root, first, self._size))
+                if len(saved.generators) == len(self._workers):
+                    _call(worker, "policy.set_generator_state", saved.generators[number])
 
             self._on(number, send_to)
 
         self._on_all(send)
-        if "coming" in state:
-            shape = state["coming"]["next"][keys.DONE].shape
-            coming = TensorDict(state["coming"], batch_size=shape[:-1])
+        if saved.coming is not None:
+            shape = saved.coming["next"][keys.DONE].shape
+            coming = TensorDict(saved.coming, batch_size=shape[:-1])
             self._coming = [_done(rows) for rows in coming.split(self._size)]
 
     def close(self) -> None:
