@@ -133,13 +133,11 @@ def test_an_evaluation_never_touches_the_record_of_a_run(tmp_path, command, caps
     capsys.readouterr()
     before = contents(tmp_path)
     for folder in ("run", "killed"):
-        for word in ("overwrite=false", "overwrite=true"):
-            code, _, err = command("mode=eval", "checkpoint=run", f"hydra.run.dir={folder}", word)
-            assert code == 2 and err.count("\n") == 1 and "an evaluation never changes" in err
-        code, _, err = command(
-            "-m", "mode=eval", "checkpoint=run", "overwrite=true", "hydra.sweep.dir=.", f"hydra.sweep.subdir={folder}"
-        )
-        assert code == 2 and err.count("\n") == 1
+        code, _, err = command("mode=eval", "checkpoint=run", f"hydra.run.dir={folder}", "overwrite=true")
+        assert code == 2 and err.count("\n") == 1 and "an evaluation never changes" in err
+    words = ["mode=eval", "checkpoint=run", "overwrite=true", "hydra.sweep.dir=.", "hydra.sweep.subdir=killed"]
+    code, _, err = command("-m", *words)
+    assert code == 2 and err.count("\n") == 1
     code, _, err = command("mode=eval", "checkpoint=run", "hydra.run.dir=run", "hydra.output_subdir=.hydra")
     assert code == 2 and err.count("\n") == 1
     after = contents(tmp_path)
@@ -208,21 +206,19 @@ def wandb_records(file: Path) -> Iterator:
             yield record
 
 
-@pytest.mark.parametrize("place", ["killed", "elsewhere"])
-def test_tensorboard_shows_a_resumed_run_as_the_one_that_was_never_stopped(place, tmp_path):
+def test_tensorboard_shows_a_resumed_run_as_the_one_that_was_never_stopped(tmp_path):
     words = ["logger=tensorboard", "total_frames=256", "checkpoint_every=96"]
     start(tmp_path / "whole", *words)
     start_and_kill(tmp_path / "killed", 192, *words)
     (tmp_path / "killed").rename(tmp_path / "moved")
-    folder = tmp_path / ("moved" if place == "killed" else place)
-    assert resume(tmp_path / "moved", folder) == 0
-    assert curves(folder) == curves(tmp_path / "whole") and len(curves(folder)["frames"]) == 9
-    assert len(list((folder / "tensorboard").iterdir())) == 1
+    whole = curves(tmp_path / "whole")
+    assert len(whole["frames"]) == 9
+    for folder in (tmp_path / "elsewhere", tmp_path / "moved"):
+        assert resume(tmp_path / "moved", folder) == 0
+        assert curves(folder) == whole and len(list((folder / "tensorboard").iterdir())) == 1
 
 
-@pytest.mark.parametrize("place", ["killed", "elsewhere"])
 def test_wandb_has_a_resumed_run_as_one_run_with_the_curve_of_the_one_never_stopped(
-    place,
     tmp_path,
     without_login,  # noqa: F811
 ):
@@ -230,17 +226,15 @@ def test_wandb_has_a_resumed_run_as_one_run_with_the_curve_of_the_one_never_stop
     start(tmp_path / "whole", *words)
     start_and_kill(tmp_path / "killed", 192, *words)
     wandb.teardown()  # as at the end of a process
-    assert resume(tmp_path / "killed", tmp_path / place) == 0
-    wandb.teardown()  # waits until all is written
-    (whole,) = wandb_curves(tmp_path / "whole").values()
-    ((run_id, rows),) = wandb_curves(tmp_path / place).items()
-    assert rows == whole and len(rows) >= 9
-    assert list((tmp_path / place / "wandb").glob(f"offline-run-*-{run_id}")) and run_id in {
-        *wandb_curves(tmp_path / "killed")
-    }
+    (run_id,) = wandb_curves(tmp_path / "killed")
+    for folder in (tmp_path / "elsewhere", tmp_path / "killed"):
+        assert resume(tmp_path / "killed", folder) == 0
+        wandb.teardown()  # waits until all is written
+        (whole,) = wandb_curves(tmp_path / "whole").values()
+        assert wandb_curves(folder) == {run_id: whole} and len(whole) >= 9
 
 
-@pytest.mark.parametrize("where", ["__init__", "log", "summary", "close"])
+@pytest.mark.parametrize("where", ["__init__", "log", "close"])
 def test_a_logger_that_fails_is_switched_off_with_one_warning(where, tmp_path, monkeypatch, capsys):
     def broken(*_, **__):
         raise BrokenPipeError("the other end\nis gone")
@@ -282,23 +276,23 @@ def test_jobs_whose_folder_cannot_be_made_are_named_and_the_others_run(tmp_path,
     (folder / "seed0").write_text("a file of this name")
     (folder / "seed2").symlink_to(folder / "nowhere/at/all")
     capsys.readouterr()
-    words = ["-m", *TINY, "film=false", "seed=0,1,2,3", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=seed${seed}"]
-    for state in ("2 finished", "2 skipped, finished before"):
+    words = ["-m", *TINY, "film=false", "seed=0,1,2", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=seed${seed}"]
+    for state in ("1 finished", "1 skipped, finished before"):
         code, out, err = command(*words)
         named = [line for line in err.splitlines() if "(sweep/" in line]
         assert code == 1 and len(named) == 2 and all("its folder cannot be made" in line for line in named)
-        assert f"4 jobs: 2 failed; {state}\n" in out and "Traceback" not in err
+        assert f"3 jobs: 2 failed; {state}\n" in out and "Traceback" not in err
     assert (folder / "seed0").read_text() == "a file of this name"
 
 
 def test_a_job_that_was_finished_by_hand_counts_as_finished_in_its_sweep(tmp_path, command):
-    words = ["-m", *TINY, "film=false", "checkpoint_every=96", "seed=0,1", "hydra.sweep.dir=sweep"]
+    words = ["-m", *TINY, "film=false", "checkpoint_every=96", "seed=0", "hydra.sweep.dir=sweep"]
     with pytest.MonkeyPatch.context() as patch:
         kill_at(patch, 128)
         assert command(*words)[0] == 1
     assert command("resume=sweep/0", "hydra.run.dir=sweep/0", "film=false")[0] == 0
     code, out, _ = command(*words)
-    assert code == 0 and "2 jobs: 1 skipped, finished before; 1 resumed and finished\n" in out
+    assert code == 0 and "1 jobs: 1 skipped, finished before\n" in out
 
 
 def after_batches(monkeypatch: pytest.MonkeyPatch, number: int, do: Callable[[], object]) -> None:

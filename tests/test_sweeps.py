@@ -154,6 +154,12 @@ def test_the_results_of_another_config_stay_as_they_are(command, jobs, tmp_path)
     assert {file: file.read_bytes() for file in (tmp_path / "sweep/0").iterdir()} == before
 
 
+def test_with_overwrite_a_job_replaces_the_results_of_another_config_alone(command, jobs):
+    command("-m", "seed=4,0", "hydra.sweep.dir=sweep")
+    assert command("-m", "seed=7,0", "overwrite=true", "hydra.sweep.dir=sweep")[0] == 0
+    assert jobs == [(4, None), (0, None), (7, None)]
+
+
 def test_a_run_without_a_checkpoint_starts_afresh(command, jobs, tmp_path):
     (tmp_path / "sweep/0").mkdir(parents=True)
     (tmp_path / "sweep/0/config.yaml").write_text("seed: 9\n")
