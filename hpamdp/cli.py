@@ -35,6 +35,7 @@ from hpamdp.config import (
     RUN_FILE,
     ConfigError,
     beginning_of,
+    choosing,
     conf_dir,
     job_overrides,
     no_such,
@@ -384,7 +385,7 @@ def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
     has_own_files = arguments.config_dir is not None or "hydra.searchpath" in given
     choices = saved_choices(source, where, arguments.overrides)
     return [
-        f"{group}={name}"
+        choosing(group, name)
         for group, name in choices.items()
         if group not in given and (has_own_files or os.path.isfile(conf / group / f"{name}.yaml"))
     ]

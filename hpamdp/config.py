@@ -67,6 +67,7 @@ _KINDS = {
 
 _CAN_BE_NONE = ("high", "data")
 _MOST_COMPLAINTS = 3
+_LONGEST_NAME, _LONGEST_VALUE = 200, 300  # of a yaml file, and of a value in a message
 _SHOWN = 200  # letters of a command line in an error
 # Larger numbers leave those that a computation can hold; infinity is refused as well.
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
@@ -433,7 +434,7 @@ def _learners_of_options(run: RunConfig, env: str) -> dict[str, Component]:
             if word in given:
                 raise ConfigError(f"{where}.{word}: {instead}")
         try:
-            cfg = compose([f"env={env}", f"low={name}"])
+            cfg = compose([choosing("env", env), choosing("low", name)])
         except ConfigError as error:
             raise ConfigError(f"{where}={name}: there is no {_file('low', name)}") from error
         yaml = plain_groups(cfg, run.model_dump(), ["low"])["low"]
@@ -552,7 +553,14 @@ def plain_groups(cfg: DictConfig, run: Mapping[str, Any], groups: Iterable[str])
 
 def is_name(name: object) -> TypeGuard[str]:
     """Return whether this can be the name of a group's yaml file: words and slashes, but no way out of the folder."""
-    return isinstance(name, str) and re.fullmatch(r"\w[\w.+-]*(/\w[\w.+-]*)*", name) is not None
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        return False
+    return re.fullmatch(r"\w[\w.+-]*(/\w[\w.+-]*)*", name) is not None
+
+
+def choosing(group: str, name: str) -> str:
+    """Return the word that chooses a yaml file for a group; in quotes even `null` and `3` are names."""
+    return f"{group}='{name}'"
 
 
 def compose(overrides: list[str]) -> DictConfig:
@@ -772,7 +780,8 @@ def _file(group: str, name: str) -> str:
 
 
 def _as_json(value: Any) -> str:
-    return json.dumps(value, default=str)
+    text = json.dumps(value, default=str)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
 
 
 def _is_deliberate(error: ValueError, cls: type) -> bool:

@@ -10,8 +10,12 @@ from typing import Any, TextIO, cast
 
 
 def one_line(text: object) -> str:
-    """Return a text or an error's message as one line, with a space in place of every line break."""
-    return " ".join(line for line in map(str.strip, str(text).splitlines()) if line)
+    """Return a text or an error's message as one line, with a space in place of every line break.
+
+    Other characters that a terminal may obey, such as those of its escape sequences, become question marks.
+    """
+    line = " ".join(line for line in map(str.strip, str(text).expandtabs().splitlines()) if line)
+    return "".join(character if character.isprintable() else "?" for character in line)
 
 
 def first_line(text: object) -> str:

@@ -18,6 +18,7 @@ from hpamdp.config import (
     MissingChoiceError,
     RunConfig,
     check,
+    choosing,
     compose,
     is_name,
     names_of,
@@ -62,7 +63,7 @@ def read_saved(
     saved = in_todays_form(saved)
     groups = [group for group in GROUPS if group not in given]
     choices = {group: saved[_CHOICES][group] for group in groups}
-    today = plain_groups(compose([f"{group}={name}" for group, name in choices.items()]), saved, groups)
+    today = plain_groups(compose([choosing(group, name) for group, name in choices.items()]), saved, groups)
     values = {name: value for name, value in saved.items() if name not in (*GROUPS, _CHOICES)}
     for group in groups:
         values[group] = {**today[group], **saved[group], TARGET: today[group][TARGET]}
@@ -148,7 +149,7 @@ def _settings_of(choices: Mapping[str, Any]) -> dict[str, set[str]]:
     of_any = {group: {*RUN_ENTRIES.get(group, ())} for group in choices}
     try:
         if all(map(is_name, choices.values())):
-            cfg = compose([f"{group}={name}" for group, name in choices.items()])
+            cfg = compose([choosing(group, name) for group, name in choices.items()])
             return {group: of_any[group] | {str(name) for name in cfg[group]} for group in choices}
     except MissingChoiceError:
         pass

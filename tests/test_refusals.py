@@ -84,7 +84,8 @@ REFUSED = [
     ("low=random low._target_=hpamdp.policies.random_agent.random_agent", "there is no class random_agent in "),
     ("low=random low._target_=torch.nn.Identity", "low=random: Identity is no Learner (hpamdp.policies.base)"),
     ("high=uniform high._target_=torch.nn.Identity", "high=uniform: Identity is no Selector (hpamdp.policies.base)"),
-    ("low._target_=collections.OrderedDict", " more like this"),
+    ("low._target_=hpamdp.policies.low_level.random.Random", " more like this"),
+    ("low._target_=collections.OrderedDict", "low=hyar: OrderedDict is no Learner (hpamdp.policies.base)"),
     ("agent=null", "agent=null: must be a mapping (conf/config.yaml)"),
     ("env.motor_noise=[1]", "env: BoatDockEnv: motor_noise=[1.0], but must be one number or two (BoatDockEnv"),
     # Boats.

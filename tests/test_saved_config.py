@@ -15,6 +15,7 @@ from conftest import OWN, choices, compose_config, make_config
 from test_grid import SHORT, SHORT_SELECTORS, SMALL
 
 from hpamdp.config import GROUPS, Config, ConfigError
+from hpamdp.messages import one_line
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.play import _permissions
 from hpamdp.run.resume import check_saved_options
@@ -268,6 +269,36 @@ def test_text_of_a_saved_config_stays_text(of_toy, monkeypatch, tmp_path, comman
         config = read_saved(values)
         assert config.logger.options["name"] == text and config.run.env.options == {text: [text]}
         assert read_saved(saved(config)) == config
+
+
+def nested(depth: int) -> dict:
+    return {} if depth == 0 else {"a": nested(depth - 1)}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        set_to("choices", "env", "null"),
+        set_to("choices", "env", "3"),
+        set_to("choices", "env", "hydra"),
+        set_to("choices", "env", "x" * 5000),
+        set_to("low", "per_option", {"a": "null"}),
+        set_to("low", "per_option", {"a": {"name": ["random"]}}),
+        set_to("env", "\x1b[31m", 1),
+        set_to("logger", "deep", nested(500)),
+        lambda config: config.update(choices=None),
+        lambda config: config.update(logger=[1]),
+        lambda config: config.pop("choices"),
+        lambda config: config.update(hydra={"run": {"dir": "/"}}),
+    ],
+)
+def test_a_config_that_is_none_is_told_in_one_short_line(change):
+    values = saved(make_config(["low=random"]))
+    change(values)
+    with pytest.raises(ConfigError) as error:
+        read_saved(values)
+    line = one_line(error.value)
+    assert "\n" not in str(error.value) and len(line) < 1000 and line.isprintable()
 
 
 def test_an_earlier_checkpoint_without_the_names_of_its_options_is_compared_only_if_nothing_is_run(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from hpamdp.config import Config, ConfigError, compose_words, read
+from hpamdp.config import Config, ConfigError, choosing, compose_words, read
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_choice, make_agent, make_env, make_evaluation
@@ -86,6 +86,7 @@ def _config(path: str | None, settings: list[str]) -> tuple[Config, Path | None]
         return read(compose_words(settings)), None
     chosen = saved_choices(path, "checkpoint", settings)
     given = {word.partition("=")[0] for word in settings}
-    cfg = compose_words([*(f"{group}={name}" for group, name in chosen.items() if group not in given), *settings])
+    words = [choosing(group, name) for group, name in chosen.items() if group not in given]
+    cfg = compose_words([*words, *settings])
     cfg.mode, cfg.checkpoint = "eval", path
     return resolve(cfg, settings)

@@ -132,7 +132,7 @@ def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple
 def _anew(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
     """Return the words that set something anew: without those that choose for a group what the saved run has."""
     choices = choices_of(saved)
-    anew = [word for word in overrides if _key(word) not in GROUPS or word != f"{_key(word)}={choices[_key(word)]}"]
+    anew = [word for word in overrides if _key(word) not in GROUPS or _choice(word) != choices[_key(word)]]
     for word in anew:
         if _key(word).split(".")[0] in _AGENT:
             raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")
@@ -141,3 +141,7 @@ def _anew(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where:
 
 def _key(override: str) -> str:
     return override.partition("=")[0].lstrip("+~")
+
+
+def _choice(override: str) -> str:
+    return override.partition("=")[2].strip("'\"")
