@@ -455,7 +455,8 @@ def _is_choice(value: object) -> bool:
 def _run_job(cfg: DictConfig, start: str) -> float | None:
     """Run one job; return its score if it is one of a sweep."""
     put_working_directory_last()  # in a worker of a launcher, too
-    resource_tracker.ensure_running()  # which environments start, while it is protected
+    with suppress(OSError):  # whoever needs it will say so
+        resource_tracker.ensure_running()  # a process of Python's own, which starts while it is protected
     unprotect_children()
     job = HydraConfig.get()
     if job.job.chdir:
