@@ -288,7 +288,6 @@ def nested(depth: int) -> dict:
         set_to("logger", "deep", nested(500)),
         lambda config: config.update(choices=None),
         lambda config: config.update(logger=[1]),
-        lambda config: config.pop("choices"),
         lambda config: config.update(hydra={"run": {"dir": "/"}}),
     ],
 )
