@@ -232,7 +232,7 @@ def check_moments(where: str, state: Mapping[int, Mapping[str, Tensor]]) -> None
     """
     for number, moments in state.items():
         for name, value in moments.items():
-            check_values(f"{where}.{number}.{name}", value, torch.zeros(()))
+            check_values(f"{where}.{number}.{name}", value, torch.zeros((), dtype=torch.float32))
             if (name == "step" or name.endswith("_sq")) and (value < 0.0).any():
                 raise ValueError(f"{where}.{number}.{name} is negative")
 

@@ -140,8 +140,8 @@ class Actor(OnPolicy, Selector):
 
     def empty_rows(self) -> dict[str, Tensor]:
         """Return the columns of `_rows`."""
-        number = torch.zeros(0)
-        columns = {"state": torch.zeros(0, self.specs.observation_dim), "option": number.long()}
+        number = torch.zeros(0, dtype=torch.float32)
+        columns = {"state": torch.zeros(0, self.specs.observation_dim, dtype=torch.float32), "option": number.long()}
         columns |= dict.fromkeys(("log_prob", "weight", "target"), number)
         if self.specs.has_option_mask:
             columns["allowed"] = torch.zeros(0, self.specs.num_options, dtype=torch.bool)

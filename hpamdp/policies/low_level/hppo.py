@@ -261,9 +261,12 @@ class HPPO(OnPolicy, Learner):
 
     def empty_rows(self) -> dict[str, Tensor]:
         """Return the columns of `_rows`."""
-        number, observation = torch.zeros(0), torch.zeros(0, self.specs.observation_dim)
+        number, observation = (
+            torch.zeros(0, dtype=torch.float32),
+            torch.zeros(0, self.specs.observation_dim, dtype=torch.float32),
+        )
         names = ("advantage", "target", "discrete_log_prob", "parameter_log_prob")
-        columns = {keys.OBSERVATION: observation, RAW: torch.zeros(0, self.specs.num_parameters)}
+        columns = {keys.OBSERVATION: observation, RAW: torch.zeros(0, self.specs.num_parameters, dtype=torch.float32)}
         columns |= {"discrete": number.long(), **dict.fromkeys(names, number)}
         if self.specs.has_action_mask:
             columns[keys.ACTION_MASK] = torch.zeros(0, self.specs.num_discrete, dtype=torch.bool)

@@ -88,7 +88,7 @@ class FourierBasis(SizedByData):
         num = len(inputs)
         wanted = fourier_coefficients(num, self.order, self.max_coupled)
         is_fitted = torch.equal(state["coefficients"].cpu(), wanted)
-        if not is_fitted and not torch.equal(state["coefficients"].cpu(), torch.zeros(1, 1)):
+        if not is_fitted and not torch.equal(state["coefficients"].cpu(), torch.zeros(1, 1, dtype=torch.float32)):
             raise ValueError(f"coefficients are not those of order {self.order} for {num} entries")
         if len(state["low"]) != num or len(width) != num or (inputs >= observation_dim).any() or (width <= 0.0).any():
             raise ValueError(f"inputs, low and width must be of the same entries of {observation_dim}")
