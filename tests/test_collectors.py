@@ -5,6 +5,7 @@ import importlib.util
 import multiprocessing
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
@@ -448,11 +449,80 @@ def test_when_a_worker_dies_the_run_names_it_and_saves_its_agent_and_leaves_no_p
     monkeypatch.setattr(Recorder, "take", take)
     words = [*SMALL, "collector=multi", f"collector.ahead={ahead}", "total_frames=4096"]
     assert run(compose_config(words), tmp_path) == 1
-    death = "collector=multi: worker 0 of 2 died (signal 9, SIGKILL) at frame"
-    told = {f"{death} {frame}; to go on: python run.py resume={tmp_path}" for frame in frames}
-    assert told & {*capsys.readouterr().err.splitlines()}
+    death = r"collector=multi: worker [01] of 2 died \(signal 9, SIGKILL\) at frame (\d+); to go on: .* resume=(\S+)"
+    (told,) = filter(None, (re.fullmatch(death, line) for line in capsys.readouterr().err.splitlines()))
+    assert int(told.group(1)) in frames and told.group(2) == str(tmp_path)
     assert (tmp_path / "checkpoint.zip").is_file()
     assert not set(multiprocessing.active_children()) - set(others)
+
+
+MORTAL = """
+import os
+import signal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+
+class Mortal(gymnasium.Env):
+    observation_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    action_space = spaces.Tuple((spaces.Discrete(1), spaces.Tuple((spaces.Box(-1.0, 1.0, (1,)),))))
+
+    def __init__(self, run, way):
+        self.way = way if os.getpid() != run else "none"
+        self.steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 70 and self.way == "kill":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.steps == 70 and self.way == "exit":
+            os._exit(7)
+        return np.zeros(2 if self.steps == 70 and self.way == "problem" else 1, np.float32), 1.0, False, False, {}
+"""
+
+
+@pytest.fixture
+def mortal(tmp_path, monkeypatch):
+    """Return the words of a run whose workers end in a way of one's choice after 70 steps."""
+    (tmp_path / "mortal.py").write_text(MORTAL)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    problem = ["env=gymnasium", "env.entry_point=mortal:Mortal", "env.max_steps=4", "high=none", "eval.every=0"]
+    yield lambda way: [*SMALL, *problem, f"env.kwargs={{run:{os.getpid()},way:{way}}}"]
+    sys.modules.pop("mortal", None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["kill", "exit"])
+@pytest.mark.parametrize("collector", WORKERS)
+def test_a_run_goes_on_after_its_workers_deaths_if_it_may(collector, way, mortal, tmp_path, capsys):
+    words = [*mortal(way), f"collector={collector}", "total_frames=640", "log_every=32"]
+    assert run(compose_config(words), tmp_path / "ends") == 1
+    err = capsys.readouterr().err
+    line = rf"collector={collector}: worker [01] of 2 died \(.+\) at frame 544; to go on: .* resume=.*"
+    assert [text for text in err.splitlines() if re.fullmatch(line, text)] and "Traceback" not in err
+    assert checkpoint.progress_of(tmp_path / "ends/checkpoint.zip")["frames"] == 544
+
+    assert run(compose_config([*words, "collector.max_restarts=2"]), tmp_path / "goes_on") == 0
+    assert len(re.findall(r"it was replaced \(restart [12] of 2\)", capsys.readouterr().err)) == 2
+    rows = (tmp_path / "goes_on/metrics.csv").read_text().splitlines()
+    column = rows[0].split(",").index("train/return")
+    returns = {row.split(",")[column] for row in rows[1:]} - {""}
+    assert {float(value) for value in returns} == {4.0}
+    assert rows[-1].startswith("640,") or rows[-1].startswith("640.0,")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("collector", WORKERS)
+def test_a_problem_in_a_worker_is_told_in_one_line_and_what_was_learned_is_saved(collector, mortal, tmp_path):
+    with pytest.raises(ConfigError, match=r"^env: GymnasiumEnv: mortal:Mortal: environment \d: gave an observation"):
+        run(compose_config([*mortal("problem"), f"collector={collector}", "total_frames=6400"]), tmp_path / "run")
+    assert checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] == 544
 
 
 @pytest.mark.slow
@@ -501,6 +571,23 @@ class Sleeper(gymnasium.Env):
             time.sleep(1000.0)
         return np.zeros(1, np.float32), 0.0, False, False, {}
 """
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs Ray")
+def test_a_sigterm_to_a_run_with_ray_saves_and_ends_it_as_with_other_collectors(tmp_path):
+    command = [sys.executable, str(CONF.parent / "run.py"), "collector=ray", *SMALL, "total_frames=100000000"]
+    folder = f"hydra.run.dir={tmp_path / 'run'}"
+    process = subprocess.Popen([*command, "log_every=32", folder], start_new_session=True, cwd=tmp_path)
+    metrics = tmp_path / "run/metrics.csv"
+    try:
+        wait_until(lambda: metrics.is_file() and len(metrics.read_text().splitlines()) > 3, seconds=240)
+        process.terminate()
+        assert process.wait(120) == 130
+        assert (tmp_path / "run/checkpoint.zip").is_file()
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
 
 
 @pytest.mark.slow

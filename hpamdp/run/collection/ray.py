@@ -114,6 +114,8 @@ def _connect(address: str | None, num_workers: int) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # The learner waits for its actors, to which a local Ray would give niceness 15.
     os.environ.setdefault("RAY_worker_niceness", "0")
+    # Its C++ part prints a line a second while it waits for a cluster.
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")
     # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
     init: dict[str, Any] = {"address": "local", "num_cpus": num_workers, "include_dashboard": False}
     if address is not None:
