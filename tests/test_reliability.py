@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import IO, Any
 
@@ -122,12 +123,18 @@ def _main(folder: Path, words: Sequence[str], output: IO[str] | int) -> None:
     number = output if isinstance(output, int) else output.fileno()
     os.dup2(number, 1)
     os.dup2(number, 2)
-    os.closerange(3, 1000)  # as in a program of its own; a pipe would still have its reader
+    _close(3)  # as in a program of its own; a pipe would still have its reader
     sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115  # pytest has replaced these
     sys.stderr = open(2, "w", closefd=False)  # noqa: SIM115
     signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal, where Ctrl-C is not ignored
     sys.argv = [*PROGRAM, *words]
     cli.main()
+
+
+def _close(first: int) -> None:
+    """Close all files from this number on, that of the parent's resource tracker too, and forget the tracker."""
+    os.closerange(first, 1000)
+    resource_tracker._resource_tracker._fd = None
 
 
 def interpreter(folder: Path, words: Sequence[str], output: IO[str] | int) -> subprocess.Popen:
@@ -194,7 +201,7 @@ def test_a_run_whose_output_is_full_goes_on_and_saves(tmp_path):
 
 def _main_without_streams(folder: Path) -> None:
     os.chdir(folder)
-    os.closerange(0, 1000)  # a file that is opened now gets the number of a standard stream
+    _close(0)  # a file that is opened now gets the number of a standard stream
     sys.stdin = sys.stdout = sys.stderr = sys.__stderr__ = None  # as Python starts then
     sys.argv = [*PROGRAM, "total_frames=64", "film=false", "high=ucb", "hydra.run.dir=run"]
     cli.main()
