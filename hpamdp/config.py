@@ -55,7 +55,7 @@ RUN_FILE = "conf/config.yaml"
 TARGET = "_target_"
 NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
 RECIPE = "recipe"
-# What a class of each group has to be: derived from this one, or with its methods if it is a protocol.
+# The base class of each group's classes. If it is a protocol, a class only needs its methods.
 _KINDS = {
     "env": "hpamdp.env.base.PAMDPEnv",
     "high": "hpamdp.policies.base.Selector",
@@ -75,7 +75,7 @@ _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
 RUN_ENTRIES: dict[str, tuple[str, ...]] = {"low": ("budget", "checkpoint", "freeze", "per_option"), "env": ("options",)}
 # Entries of a learner that the learner of a single option cannot have, and what to do instead.
 _NOT_PER_OPTION = {
-    TARGET: "the class is that of the yaml file; give its name",
+    TARGET: "a yaml file names the class; give the name of the file",
     "budget": "a run has one budget; set total_frames, num_envs, steps_per_batch or eval.every",
     "checkpoint": "a checkpoint fills all learners; set low.checkpoint",
     "freeze": "all learners are frozen or none; set low.freeze",
@@ -92,10 +92,10 @@ class ConfigError(ValueError):
 
 
 class MissingChoiceError(ConfigError):
-    """A choice whose yaml file is in no folder that is searched.
+    """A choice whose yaml file is in none of the searched folders.
 
     Attributes:
-        known: the names that the group has.
+        known: the names that exist in the group.
     """
 
     def __init__(self, choice: str, known: Iterable[str]) -> None:
@@ -143,8 +143,8 @@ class OfflineConfig(BaseModel):
 class StartConfig(BaseModel):
     """The learners that a run starts with, and which of them are of another class than `low`.
 
-    `per_option` maps the name of an option to the name of a learner, or to its `name` and options; once checked, to the
-    name and all options.
+    `per_option` maps the name of an option to the name of a learner, or to its `name` and options; after the check, to
+    the name and all options.
     """
 
     model_config = _STRICT
@@ -253,9 +253,9 @@ class Component:
         return f"{self.group}={self.name}"
 
     def is_guarded(self, name: str, value: object) -> bool:
-        """Return whether a saved config cannot give a setting this value unasked.
+        """Return whether a saved config may give a setting this value only if the user says so.
 
-        The class says so in `guarded_settings`, by the name of the setting, or by `name=value` if only that value is
+        The class lists such settings in `guarded_settings`, as `name`, or as `name=value` if only that value is
         guarded.
         """
         guarded = getattr(self.cls, "guarded_settings", ())
@@ -290,7 +290,7 @@ class Component:
         """Return in words the options that may have made this component too large."""
         sizes = {name: value for name, value in self.options.items() if _is_size(value)}
         largest = sorted(sizes, key=lambda name: _size(sizes[name]))[-2:]
-        return ", ".join(f"{self.group}.{name}={_as_json(sizes[name])}" for name in reversed(largest)) or str(self)
+        return ", ".join(f"{self.group}.{name}={as_json(sizes[name])}" for name in reversed(largest)) or str(self)
 
 
 @dataclass(frozen=True)
@@ -326,7 +326,7 @@ class Config:
         return values
 
     def to_yaml(self) -> str:
-        """Return the same as text; a reader must not resolve what looks like an interpolation in it."""
+        """Return `to_dict` as yaml; a reader must not resolve text that looks like an interpolation."""
         return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
 
 
@@ -371,7 +371,7 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
 
 
 def _check_found(node: Any, names: Mapping[str, str]) -> None:
-    """Refuse what Hydra leaves out in silence if it is not there: a recipe, a folder of yaml files.
+    """Refuse a recipe or a folder of yaml files that does not exist; Hydra leaves it out without a message.
 
     Args:
         node: the config's `hydra` part.
@@ -407,7 +407,7 @@ def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
         file = _file("low", names["low"])
         budget = given["low"]["budget"]
         if not isinstance(budget, dict):
-            raise ConfigError(f"low.budget={_as_json(budget)}: must be a mapping ({file})")
+            raise ConfigError(f"low.budget={as_json(budget)}: must be a mapping ({file})")
         _validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
     _check_mode(run)
     for group in GROUPS:
@@ -429,7 +429,7 @@ def _learners_of_options(run: RunConfig, env: str) -> dict[str, Component]:
         where = f"low.per_option.{option}"
         name = given.pop("name", None)
         if not is_name(name):
-            raise ConfigError(f"{where}={_as_json(choice)}: must be the name of a learner, or its name and options")
+            raise ConfigError(f"{where}={as_json(choice)}: must be the name of a learner, or its name and options")
         for word, instead in _NOT_PER_OPTION.items():
             if word in given:
                 raise ConfigError(f"{where}.{word}: {instead}")
@@ -567,7 +567,7 @@ def compose(overrides: list[str]) -> DictConfig:
     """Return the config of these words, in the folders that the running job searches for yaml files.
 
     Raises:
-        MissingChoiceError: a word chooses what is in none of these folders.
+        MissingChoiceError: a word chooses a yaml file that is in none of these folders.
     """
     if HydraConfig.initialized():
         given = HydraConfig.get().overrides.hydra
@@ -626,7 +626,7 @@ def _load_target(group: str, target: Any, file: str) -> type:
 
 
 def _check_kind(group: str, name: str, target: object) -> None:
-    """Refuse a class that is none of the group's kind, or that leaves a method to its subclasses."""
+    """Refuse a class that does not fit the group, or that is abstract."""
     if target is None and group in _CAN_BE_NONE:
         return
     file = _file(group, name)
@@ -663,7 +663,7 @@ def no_such(what: str, name: str, known: Iterable[str]) -> str:
 def plain(node: Any, where: str = "the config") -> dict[str, Any]:
     """Resolve a part of the config into plain Python values."""
     if not isinstance(node, Mapping | DictConfig):
-        raise ConfigError(f"{where}={_as_json(node)}: must be a mapping")
+        raise ConfigError(f"{where}={as_json(node)}: must be a mapping")
     if not isinstance(node, DictConfig):
         return dict(node)
     try:
@@ -671,7 +671,7 @@ def plain(node: Any, where: str = "the config") -> dict[str, Any]:
     except OmegaConfBaseException as error:
         raise ConfigError(f"{error.full_key or where}: {first_line(error)}") from error
     except RecursionError as error:
-        raise ConfigError(f"{where}: a value stands for itself, or nests too deep") from error
+        raise ConfigError(f"{where}: a value refers to itself, or nests too deep") from error
     assert isinstance(container, dict)
     return {str(name): value for name, value in container.items()}
 
@@ -712,7 +712,7 @@ def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what
                 message = message.removesuffix(f" after validation, not {_length(value)}")
                 message = re.sub("^(Input|String|List) should", "must", message)
                 # A union complains once for each of its types.
-                wrong.setdefault(f"{key}={_as_json(value)}", {})[message] = None
+                wrong.setdefault(f"{key}={as_json(value)}", {})[message] = None
         complaints = [f"{key}: {' or '.join(messages)} ({where})" for key, messages in wrong.items()]
         raise ConfigError("; ".join([*_shortened(unknown), *complaints])) from error
     _refuse_huge(model, values, prefix, where)
@@ -739,7 +739,7 @@ def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str,
             largest = _LARGEST_INT if isinstance(number, int) else _LARGEST_FLOAT
             if abs(number) > largest:
                 raise ConfigError(
-                    f"{prefix}{name}={_as_json(value)}: must lie between -{largest} and {largest} ({where})"
+                    f"{prefix}{name}={as_json(value)}: must lie between -{largest} and {largest} ({where})"
                 )
 
 
@@ -779,7 +779,8 @@ def _file(group: str, name: str) -> str:
     return f"conf/{group}/{name}.yaml"
 
 
-def _as_json(value: Any) -> str:
+def as_json(value: object) -> str:
+    """Return a value as JSON, for a message; a long one is cut short."""
     text = json.dumps(value, default=str)
     return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
 

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and that are never written through a link."""
+"""Write files as a whole or not at all, and never through a link."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def remove_link(path: Path) -> None:
-    """Remove a symbolic or hard link, so that nobody writes through it; keep a file that has this name alone."""
+    """Remove a symbolic or hard link, so that nobody writes through it; keep a file that has no other name."""
     with suppress(FileNotFoundError):
         if path.is_symlink() or (path.lstat().st_nlink > 1 and path.is_file()):
             path.unlink()

@@ -1,4 +1,4 @@
-"""Files with a JSON value in each line, of which some lines may be damaged: a full disk cuts one short."""
+"""Files with a JSON value in each line; lines may be damaged, for example cut short by a full disk."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def read_json(line: bytes) -> Any:
     """Return the value of a line.
 
     Raises:
-        LineError: it has no value, or more bytes than a line may have.
+        LineError: the line holds no JSON value, or is too long.
     """
     if len(line) > MAX_LINE_BYTES:
         raise LineError(f"longer than {MAX_LINE_BYTES} bytes")
@@ -40,11 +40,11 @@ def lines_of(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def left_out(num_lines: int, problems: Mapping[int, str]) -> str:
-    """Say in one line how many lines were left out, and name the first.
+    """Return in one line how many lines were left out, and why the first ones were.
 
     Args:
-        num_lines: lines in all.
-        problems: what is wrong with each line that was left out, by its number.
+        num_lines: number of all lines.
+        problems: the problem of each line that was left out, by the line's number.
     """
     named = [f"line {number} ({problem})" for number, problem in sorted(problems.items())[:_NUM_SHOWN]]
     more = ", ..." if len(problems) > _NUM_SHOWN else ""

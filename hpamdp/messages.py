@@ -12,7 +12,7 @@ from typing import Any, TextIO, cast
 def one_line(text: object) -> str:
     """Return a text or an error's message as one line, with a space in place of every line break.
 
-    Other characters that a terminal may obey, such as those of its escape sequences, become question marks.
+    Other characters that control a terminal, such as those of escape sequences, become question marks.
     """
     line = " ".join(line for line in map(str.strip, str(text).expandtabs().splitlines()) if line)
     return "".join(character if character.isprintable() else "?" for character in line)
@@ -43,14 +43,14 @@ def reopen_standard_streams() -> None:
 class LenientStream:
     """A text stream on which writing never fails.
 
-    A terminal that was closed or a full disk costs the text alone. A letter that the stream cannot show is written as
-    its number.
+    If the terminal was closed or the disk is full, only the text is lost. A letter that the stream cannot show is
+    written as its number.
 
     Args:
-        stream: where the text goes; None, as `sys.stderr` is if it was closed: nowhere.
+        stream: where the text goes. If None, as `sys.stderr` is if it was closed, the text goes nowhere.
 
     Attributes:
-        error: the last one that cost some text; None if all was written.
+        error: the last error that lost some text; None if all text was written.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -97,7 +97,7 @@ class LenientStream:
 
 @contextmanager
 def lenient_streams() -> Iterator[None]:
-    """Let nothing that is printed inside fail, nor the interpreter when it flushes stdout and stderr at its end."""
+    """Let printing inside the block never fail, nor the interpreter's flush of stdout and stderr at its end."""
     before = sys.stdout, sys.stderr
     out, err = (stream if stream is None else LenientStream(stream) for stream in before)
     sys.stdout, sys.stderr = cast(TextIO, out), cast(TextIO, err)
@@ -111,7 +111,7 @@ def lenient_streams() -> Iterator[None]:
 
 
 def _finish(stream: LenientStream) -> None:
-    """Flush a stream; if that fails, let what is left of its text go nowhere."""
+    """Flush a stream; if that fails, drop the rest of its text."""
     stream.error = None
     stream.flush()
     if stream.error is not None:
@@ -120,7 +120,7 @@ def _finish(stream: LenientStream) -> None:
 
 
 def lost_output() -> OSError | ValueError | None:
-    """Return the error that cost some of the text on stdout, if there was one."""
+    """Return the error that lost some of the text on stdout, if there was one."""
     sys.stdout.flush()
     return getattr(sys.stdout, "error", None)
 
@@ -144,7 +144,7 @@ def _print(text: str, stream: TextIO | None) -> None:
 
 
 def reason_of(error: OSError) -> str:
-    """Return in one line what went wrong with which file."""
+    """Return in one line the file that an error is about, and what went wrong."""
     reason = error.strerror or first_line(error)
     return reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}"
 

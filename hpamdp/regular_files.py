@@ -18,7 +18,7 @@ _KINDS = {
 
 
 def regular_size(path: Path, *, follow_links: bool = True) -> int:
-    """Return the size of a regular file, bytes.
+    """Return the size of a regular file in bytes.
 
     Raises:
         OSError: the file is missing or not regular; `strerror` says what it is.

@@ -1,11 +1,10 @@
-"""The config in a file, which may be somebody else's: its values are taken as text and numbers, and nothing runs.
+"""Read the config of a saved run, which may be somebody else's: its values are text and numbers, and nothing runs.
 
 Classes come from today's yaml files alone. No text of a saved config is resolved, so `${oc.env:HOME}` stays as it is.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,6 +16,7 @@ from hpamdp.config import (
     ConfigError,
     MissingChoiceError,
     RunConfig,
+    as_json,
     check,
     choosing,
     compose,
@@ -29,10 +29,10 @@ _CHOICES = "choices"
 
 
 def choices_of(saved: Mapping[str, Any]) -> dict[str, str]:
-    """Return the name that a saved config has for each group.
+    """Return the name that a saved config chose for each group.
 
     Raises:
-        ConfigError: it is no config of this program.
+        ConfigError: `saved` is no config of this program.
     """
     choices = in_todays_form(saved)[_CHOICES]
     return {group: choices[group] for group in GROUPS}
@@ -46,18 +46,19 @@ def read_saved(
     trust: bool = False,
     file: object = "the saved run",
 ) -> Config:
-    """Check a config that `Config.to_dict` gave, changed by what is given.
+    """Return a saved config, changed by the given values and checked.
 
     Args:
-        saved: the config, of this version or an earlier one.
-        given: values by their names on the command line, such as `low.lr`; by its name a whole group, with its class.
+        saved: the config as `Config.to_dict` returned it, in this version or an earlier one.
+        given: values by their names on the command line, such as `low.lr`. The name of a group stands for all its
+            settings and its class.
         names: the names of the groups in `given`.
         trust: whether the saved config may set the `guarded_settings` of a class.
         file: where the config was read from.
 
     Raises:
-        ConfigError: a wrong value, a name that is in no folder that is searched for yaml files, or a guarded setting
-            that neither the yaml file nor `given` has.
+        ConfigError: a value is wrong, a name has no yaml file in the searched folders, or a guarded setting has its
+            value from `saved` alone.
     """
     given, names = given or {}, names or {}
     saved = in_todays_form(saved)
@@ -72,7 +73,7 @@ def read_saved(
     config = check(values, {**choices, **names})
     found = {} if trust else _guarded(config, saved, today, given)
     if found:
-        settings = ", ".join(f"{setting}={_shown(value)}" for setting, value in found.items())
+        settings = ", ".join(f"{setting}={as_json(value)}" for setting, value in found.items())
         raise ConfigError(
             f"{settings}: set by {file}, and can run code, read files or reach servers; set {' and '.join(found)} on "
             "the command line, or add trust=true if you trust the file"
@@ -81,7 +82,7 @@ def read_saved(
 
 
 def needs_trust(config: Config) -> bool:
-    """Return whether a run that continues one of this config may need `trust=true`: a guarded setting is not null."""
+    """Return whether continuing a run of this config may need `trust=true`, because a guarded setting is not null."""
     parts = [getattr(config, group) for group in GROUPS if group != "data"] + [*config.low_of.values()]
     settings = [(part, name, value) for part in parts for name, value in part.options.items()]
     return any(value is not None and part.is_guarded(name, value) for part, name, value in settings)
@@ -90,7 +91,7 @@ def needs_trust(config: Config) -> bool:
 def _guarded(
     config: Config, saved: Mapping[str, Any], today: Mapping[str, Mapping[str, Any]], given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the guarded settings that have their values from a saved config alone."""
+    """Return the guarded settings whose values come from a saved config alone."""
     found = {}
     for group, yaml in today.items():
         for name, value in saved[group].items():
@@ -106,10 +107,10 @@ def _guarded(
 
 
 def in_todays_form(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a saved config in the form that `Config.to_dict` has today, with the defaults of values that it lacks.
+    """Return a saved config in the form that `Config.to_dict` has today, with defaults for missing values.
 
     Raises:
-        ConfigError: it is no config of this program.
+        ConfigError: `saved` is no config of this program.
     """
     for group in GROUPS:
         if not isinstance(saved.get(group), Mapping):
@@ -119,7 +120,7 @@ def in_todays_form(saved: Mapping[str, Any]) -> dict[str, Any]:
     for group in GROUPS:
         name = choices.get(group) if isinstance(choices, Mapping) else None
         if not is_name(name):
-            raise ConfigError(f"the saved config chose {group}={_shown(name)}, which is no name of a yaml file")
+            raise ConfigError(f"the saved config chose {group}={as_json(name)}, which is no name of a yaml file")
     values.pop("trust", None)
     fields = {name: field for name, field in RunConfig.model_fields.items() if name != "trust"}
     return {name: field.default for name, field in fields.items() if not field.is_required()} | values
@@ -145,7 +146,7 @@ def _from_first_form(saved: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settings_of(choices: Mapping[str, Any]) -> dict[str, set[str]]:
-    """Return all entries that a group can have by the yaml file of its choice; of no file, those of any choice."""
+    """Return the entries that each group can have: those of its yaml file, if there is one, and the run's own ones."""
     of_any = {group: {*RUN_ENTRIES.get(group, ())} for group in choices}
     try:
         if all(map(is_name, choices.values())):
@@ -166,7 +167,3 @@ def _set(values: dict[str, Any], path: Sequence[str], value: Any) -> None:
         values[name] = dict(inner) if isinstance(inner, Mapping) else {}
         values = values[name]
     values[last] = value
-
-
-def _shown(value: object) -> str:
-    return f"{json.dumps(value, default=str):.80}"

@@ -1,11 +1,11 @@
-"""Where Python looks for modules: in the working directory last."""
+"""Make Python look for modules in the working directory last."""
 
 from __future__ import annotations
 
 import os
 import sys
 
-# With it Python does not put the working directory first; from 3.11 on.
+# If this variable is set, Python 3.11 or later does not put the working directory first.
 _VARIABLE, _OURS = "PYTHONSAFEPATH", "hpamdp"
 
 

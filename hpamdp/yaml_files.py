@@ -1,4 +1,4 @@
-"""What is checked of a yaml file before Hydra reads it."""
+"""Check yaml files before Hydra reads them."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def check_before_hydra_reads() -> None:
-    """Have every yaml file that Hydra reads checked, from now on in this process."""
+    """Check every yaml file that Hydra reads in this process from now on."""
     Plugins.instance()  # which registers Hydra's own reader
     SourcesRegistry.instance().types[CheckedYamlFiles.scheme()] = CheckedYamlFiles
 
 
 class CheckedYamlFiles(FileConfigSource):
-    """Hydra's folders of yaml files, of which none takes all memory."""
+    """Hydra's reader of yaml files, which refuses a file that would fill the memory."""
 
     def load_config(self, config_path: str) -> Any:
         """Check the file, then read it."""
@@ -32,15 +32,15 @@ class CheckedYamlFiles(FileConfigSource):
         return super().load_config(config_path)
 
 
-# Hydra in a worker of a launcher refuses a class of another name.
+# In a launcher's worker Hydra refuses a reader with another name.
 CheckedYamlFiles.__name__ = FileConfigSource.__name__
 
 
 def check_size(file: Path) -> None:
-    """Refuse a file that a few aliases make huge, or that nests too deep. Nothing is expanded for that.
+    """Refuse a file that a few aliases make huge, or that nests too deep. Aliases are counted, not expanded.
 
     Raises:
-        ConfigError: with the file's name.
+        ConfigError: the message names the file.
     """
     try:
         with file.open("rb") as stream:
@@ -50,19 +50,19 @@ def check_size(file: Path) -> None:
                 if levels > _MOST_LEVELS:
                     raise ConfigError(f"{file}: nests more than {_MOST_LEVELS} levels deep")
     except KeyError as error:
-        raise ConfigError(f"{file}: *{error.args[0]} stands for nothing, or is part of itself") from error
+        raise ConfigError(f"{file}: *{error.args[0]} refers to nothing, or to a value that contains it") from error
     except (yaml.YAMLError, UnicodeDecodeError):
-        return  # Hydra tells it with the line
+        return  # Hydra reports these errors with the line
 
 
 def _counted(stream: Any) -> Iterator[tuple[int, int]]:
-    """Yield after each piece of a yaml file how many values and open levels there are.
+    """Yield the numbers of values so far and of open levels after each event of a yaml file.
 
     Raises:
-        KeyError: an alias stands for nothing, or inside what it stands for.
+        KeyError: an alias refers to nothing, or to a value that contains it.
     """
-    sizes: dict[str, int] = {}  # of what each anchor stands for
-    opened: list[tuple[str | None, int]] = []  # for each open list or mapping its anchor and the number before it
+    sizes: dict[str, int] = {}  # number of values under each anchor
+    opened: list[tuple[str | None, int]] = []  # each open list's or mapping's anchor, and the values before it
     count = 0
     for event in yaml.parse(stream, Loader=_LOADER):
         if isinstance(event, yaml.AliasEvent):

@@ -63,7 +63,7 @@ def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_
         ),
         (
             ["+low.per_option={jump: {name: random, _target_: os.PathLike}}"],
-            "low.per_option.jump._target_: the class is that of the yaml file; give its name",
+            "low.per_option.jump._target_: a yaml file names the class; give the name of the file",
         ),
         (
             ["+low.per_option={jump: {name: random, budget: {num_envs: 3}}}"],

@@ -112,7 +112,7 @@ LAUGHS = "".join(f"  l{i}: &l{i} [{', '.join([f'*l{i - 1}' if i else '1'] * 9)}]
         ("defaults:\n  - odd\n", "a yaml file names itself among its defaults"),
         (f"env:\n  kwargs: {'{a: ' * 3000}1{'}' * 3000}\n", "odd.yaml: nests more than 50 levels deep"),
         (f"env:\n{LAUGHS}", "odd.yaml: has more than 100,000 values"),
-        ("env: &a\n  x: *a\n", "odd.yaml: *a stands for nothing, or is part of itself"),
+        ("env: &a\n  x: *a\n", "odd.yaml: *a refers to nothing, or to a value that contains it"),
         ("seed: 1\nseed: 2\n", "odd.yaml, line 3: found duplicate key seed"),
         ("env:\n\tseed: 1\n", "odd.yaml, line 3: "),
         ("num_envs: ${seed}\nseed: ${num_envs}\n", "seed: "),

@@ -57,7 +57,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
         if not isinstance(summary, dict):
             raise ValueError("it is no JSON object")
     except (ValueError, OSError, RecursionError) as error:
-        warn(f"{path} cannot be read, its references are left out: {one_line(error)}")
+        warn(f"{path} cannot be read; its references are left out: {one_line(error)}")
         return {}
     return summary
 
@@ -70,7 +70,7 @@ def _read_evaluation(path: Path) -> dict[str, np.ndarray]:
         with np.load(path, allow_pickle=False) as arrays:
             return dict(arrays)
     except (ValueError, EOFError, OSError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        warn(f"{path} cannot be read, its figures are left out: {one_line(error)}")
+        warn(f"{path} cannot be read; its figures are left out: {one_line(error)}")
         return {}
 
 

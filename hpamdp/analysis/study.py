@@ -42,9 +42,9 @@ class Run:
 
 
 def finished(folders: Iterable[Path | str]) -> list[Run]:
-    """Return the finished runs under the folders, in the order of their names; the others are named on stderr.
+    """Return the finished runs under the folders, in the order of their names; warn about all other runs.
 
-    Links to folders are followed. A run that is reached in two ways counts once.
+    Links to folders are followed. A run that is found twice counts once.
     """
     runs, seen = [], set[str]()
     found = [run for folder in folders for run in sorted(_run_folders(Path(folder), seen))]
@@ -60,12 +60,12 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
 
 
 def _run_folders(folder: Path, seen: set[str]) -> Iterator[Path]:
-    """Yield the folders with a summary, but none that was seen before; links to nothing are named on stderr."""
+    """Yield the folders with a summary that are not in `seen`; warn about links to nothing."""
 
-    def name_it(error: OSError) -> None:
+    def report(error: OSError) -> None:
         warn(f"{error.filename}: {error.strerror}, left out")
 
-    for path, folders, files in os.walk(folder, onerror=name_it, followlinks=True):
+    for path, folders, files in os.walk(folder, onerror=report, followlinks=True):
         real = os.path.realpath(path)
         # A link may lead to a folder above itself.
         folders[:] = () if real in seen else [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME)]

@@ -1,7 +1,7 @@
-"""The values of a data set, checked before anything learns from them; the error names the first wrong row.
+"""Check the values of a data set before anything learns from them; the error names the first wrong row.
 
-`check_transitions` and `check_decisions` need no environment: form, finite numbers, and flags that fit together.
-`check_actions` and `check_options` hold the rows against the environment at hand.
+`check_transitions` and `check_decisions` need no environment. They check the form, and that numbers are finite and
+flags agree. `check_actions` and `check_options` compare the rows with the environment at hand.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ TRAJECTORY = ("collector", "traj_ids")  # the number of a row's episode, where T
 
 _Key = str | tuple[str, ...]
 _FLOAT, _INT, _BOOL = torch.float32, torch.int64, torch.bool
-# The type of each entry, and how its shape goes on after the number of rows; None: any length.
+# The type of each entry, and its shape without the number of rows. If None, any length.
 _TRANSITIONS: dict[_Key, tuple[torch.dtype, tuple[int | None, ...]]] = {
     TRAJECTORY: (_INT, ()),
     keys.OBSERVATION: (_FLOAT, (None,)),
@@ -59,12 +59,12 @@ _OBSERVATIONS: tuple[_Key, ...] = (
 
 
 class _Rule(NamedTuple):
-    """What an entry of every row must be.
+    """A rule for an entry of every row.
 
     Attributes:
-        entry: its name.
-        holds: bool, of the entry's shape or `[N]`.
-        allowed: in words, or one text for each number of a row.
+        entry: the entry's name.
+        holds: where the entry keeps the rule, bool, of the entry's shape or `[N]`.
+        allowed: the allowed values in words, or one text for each number of a row.
     """
 
     entry: _Key
@@ -73,7 +73,7 @@ class _Rule(NamedTuple):
 
 
 def check_transitions(rows: TensorDict) -> None:
-    """Check transitions `[N]` that stand for themselves; `Demonstrations` has the contract.
+    """Check transitions `[N]` without an environment; `Demonstrations` has the contract.
 
     Raises:
         DataError: an entry is missing or has another shape or type, or a row breaks a rule.
@@ -96,7 +96,7 @@ def check_returns(rows: TensorDict) -> None:
 
 
 def check_decisions(rows: TensorDict) -> None:
-    """Check decisions `[K]` that stand for themselves; `Demonstrations` has the contract.
+    """Check decisions `[K]` without an environment; `Demonstrations` has the contract.
 
     Raises:
         DataError: an entry is missing or has another shape or type, or a row breaks a rule.
@@ -106,7 +106,7 @@ def check_decisions(rows: TensorDict) -> None:
 
 
 def check_actions(rows: TensorDictBase, specs: PAMDPSpecs) -> None:
-    """Check that transitions `[N]`, already checked by themselves, are those of an environment.
+    """Check that transitions `[N]`, which `check_transitions` accepted, fit an environment.
 
     Raises:
         DataError: the observation or the parameters have another length, or a row has an action or an option that the
@@ -121,10 +121,10 @@ def check_actions(rows: TensorDictBase, specs: PAMDPSpecs) -> None:
 
 
 def check_options(what: str, rows: TensorDictBase, specs: PAMDPSpecs) -> None:
-    """Check that rows `[N]` with options, already checked by themselves, are those of an environment.
+    """Check that the options of rows `[N]`, whose form and numbers are already checked, fit an environment.
 
     Raises:
-        DataError: an observation has another length, there are no options, or a row has one that does not exist.
+        DataError: an observation has another length, there are no options, or a row has an option that does not exist.
     """
     if keys.OPTION not in rows.keys():
         names = ", ".join(specs.option_names)
@@ -231,7 +231,7 @@ def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
     parameters = rows.get(keys.PARAMETERS)
     low, high = parameters.new_tensor(specs.parameter_low), parameters.new_tensor(specs.parameter_high)
     is_own = specs.parameter_owner.to(discrete.device) == discrete.unsqueeze(-1)
-    slack = 1e-5 * (high - low)  # of rounding
+    slack = 1e-5 * (high - low)  # for rounding
     is_inside = (parameters >= low - slack) & (parameters <= high + slack)
     bounds = [f"{low:.6g} to {high:.6g}" for low, high in zip(specs.parameter_low, specs.parameter_high, strict=True)]
     yield _Rule(keys.PARAMETERS, is_inside | ~is_own, bounds)

@@ -23,14 +23,14 @@ class Demonstrations:
 
     For a recording of your own, write a subclass and choose it in `conf/data`. Its constructor takes the environment
     as `env`, beside the options of its yaml, and passes its transitions to this one. Options last a whole episode.
-    Values are checked here; a run then holds them against its environment, with `check`.
+    The constructor checks the values. A run then compares them with its environment by `check`.
 
     Args:
         transitions: `[M]`, one episode after another, with ascending episode numbers under `TRAJECTORY`. At the root
             `observation`, the action leaves, `is_decision` and, where the agent chooses options, `option`; under
             `next` `observation`, `reward`, `done`, `terminated`, `truncated` and `is_decision`; shapes and types are
             the environment's. The last row of each episode is `done`, and no other row. Parameters of discrete actions
-            that a row does not take may be 0. `action_mask` and `option_mask` may be there, too.
+            that a row does not take may be 0. `action_mask` and `option_mask` are optional.
         device: where the tensors are kept.
         decisions: `[K]`, for selectors, where more is known of what the options earned than the transitions show: at
             the root `option`, under `next` `decision_observation`, `option_return`, `option_steps`, `observation`,
@@ -60,10 +60,10 @@ class Demonstrations:
             self.decisions = _batch(decisions, device)
 
     def check(self, specs: PAMDPSpecs) -> None:
-        """Check that every row could be of an environment with these specs.
+        """Check that every row is possible in an environment with these specs.
 
         Raises:
-            DataError: with the first row that could not.
+            DataError: a row is impossible; the message names the first one.
         """
         check_actions(self.batch.squeeze(0), specs)
         if self.decisions is not None and specs.num_options:

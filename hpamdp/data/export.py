@@ -90,7 +90,7 @@ def write_memmap(batch: TensorDict, folder: Path) -> None:
             batch.memmap_like(unfinished)
         except RuntimeError as error:  # torch's, if the files may not have this size
             raise OSError(first_line(error)) from error
-        # Not through the map: a full disk would end the interpreter.
+        # Without the map, because a full disk would then crash the interpreter.
         for name, values in batch.items(True, True):
             *folders, own = (name,) if isinstance(name, str) else name
             with unfinished.joinpath(*folders, f"{own}.memmap").open("r+b") as file:
@@ -100,10 +100,10 @@ def write_memmap(batch: TensorDict, folder: Path) -> None:
 
 
 def check_room(folder: Path, num_bytes: int) -> None:
-    """Check that the disk of a folder, which is made if it is missing, has room.
+    """Check that the disk has room for `num_bytes` in a folder, which is made if it is missing.
 
     Raises:
-        OSError: it has not, or the folder cannot be written to.
+        OSError: the disk has too little room, or the folder cannot be written to.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder) as file:

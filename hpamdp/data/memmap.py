@@ -1,7 +1,7 @@
 """Memory-mapped files of a tensordict, read as numbers and nothing else; `hpamdp.data.export` writes them.
 
 `TensorDict.load_memmap` alone would unpickle objects, build a class that a file names, and follow links. A file that is
-shorter than it should be would end the interpreter. So every file is checked before any is mapped.
+too short would crash the interpreter. So every file is checked before any is mapped.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def load(folder: Path) -> TensorDict:
     """Map a tensordict `[N]` of numbers.
 
     Raises:
-        DataError: a file is missing, is no regular file, has another size than it should, or holds something else.
+        DataError: a file is missing, is no regular file, has a wrong size, or holds something else.
     """
     try:
         _check(folder)

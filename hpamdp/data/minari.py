@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     import minari
 
 
-_MAX_RATIO = 100  # of the size of a data set to that of its file, which may be compressed
+_MAX_RATIO = 100  # largest size of a data set, in sizes of its file, which may be compressed
 _FEW_BYTES = 1 << 26
-_BYTES_AN_EPISODE = 40_000  # of the names and descriptions that HDF5 keeps of an episode, at most
+_BYTES_AN_EPISODE = 40_000  # upper bound of the names and descriptions in HDF5
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ def _episode(rows: TensorDict, layout: MinariLayout) -> dict[str, Any]:
 def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
     """Return a Minari data set that `export` wrote as the transitions `[N]` that it was made of.
 
-    Episodes are numbered anew, from 0. The data set may be somebody else's: nothing that it names is imported, and no
-    file is read but its own.
+    Episodes are numbered from 0. The data set may be somebody else's. So nothing that it names is imported, and only
+    its own files are read.
 
     Raises:
         DataError: Minari is missing, there is no such data set, it has another layout, or a value is wrong.
@@ -152,16 +152,16 @@ def load(dataset_id: str, layout: MinariLayout) -> TensorDict:
         check_transitions(rows)
     except DataError as error:
         raise DataError(f"{dataset_id}: {error}") from error
-    except Exception as error:  # whatever Minari and its storage raise about files that are none of theirs
+    except Exception as error:  # Minari and its storage raise any class of error about files of another kind
         raise DataError(f"{dataset_id}: cannot be read as transitions ({first_line(error)})") from error
     return rows
 
 
 def _check_files(dataset_id: str) -> None:
-    """Check what Minari would act on before it reads a data set.
+    """Refuse a data set with which Minari would build an environment, read other files or fill the memory.
 
-    Without spaces in the metadata, Minari would import and build the environment that they name. A link in the file of
-    episodes can lead to any other file, and a few bytes of it can stand for terabytes.
+    Without spaces in the metadata, Minari would import and build the environment that the metadata name. A link in the
+    file of episodes can lead to any other file, and a few bytes of the file can stand for terabytes.
     """
     import h5py
     from minari.storage import get_dataset_path

@@ -292,12 +292,12 @@ class PAMDPEnv(EnvBase):
         return {}
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Refuse an `env_state` of the right names, dtypes and shapes whose numbers make no sense.
+        """Refuse an `env_state` with invalid numbers; its names, dtypes and shapes have already been checked.
 
-        By default all numbers must be finite. Override it if there are others, or if an index is among them.
+        By default all numbers must be finite. Override it if other numbers are valid, or if a column holds an index.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a number is invalid.
         """
         for name, column in columns.items():
             if not column.isfinite().all():

@@ -57,7 +57,7 @@ def check_range(columns: Mapping[str, Tensor], limits: Mapping[str, tuple[int, i
     """Refuse columns with numbers below their first limit, or at or above their second one.
 
     Raises:
-        ValueError: with the first of them.
+        ValueError: the message names the first such column.
     """
     for name, (low, high) in limits.items():
         column = columns[name]

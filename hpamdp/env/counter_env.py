@@ -243,7 +243,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         """Refuse counters and outcomes that do not exist.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a number is invalid.
         """
         super().check_env_state(columns)
         check_range(columns, {"steps": (0, 2**30), "outcome": (0, len(self.outcomes)), "episode": (-1, 2**30)})

@@ -71,7 +71,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     except RuntimeError:  # there is no folder for it
         return njit(function, **_OPTIONS)
     if compiled is function:
-        # NUMBA_DISABLE_JIT is set. Machine code wraps integers around without a warning, and so does the function.
+        # NUMBA_DISABLE_JIT is set. Machine code wraps integers around silently, so NumPy must not warn.
         return np.errstate(over="ignore")(function)
     # Numba keeps the code for as long as the function's own file is unchanged, even if it calls functions of others.
     compiled._cache._cache_file._source_stamp = _sources()

@@ -117,7 +117,7 @@ class OptionValues(nn.Module):
     def forward(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the values `[N, num_options]` of observations `[N, observation_dim]`.
 
-        While exploring, the value is infinite if its learner has learned nothing yet.
+        While exploring, the value is infinite if its learner has made no update yet.
 
         Args:
             observation: of the states.
@@ -140,7 +140,7 @@ class OptionValues(nn.Module):
 
 
 def _exploring_value(learner: Learner, observation: Tensor, *masks: Tensor) -> Tensor:
-    """Return a learner's values `[N]` of observations `[N, *]`: infinite while exploring before it has learned."""
+    """Return a learner's values `[N]` of observations `[N, *]`; infinite while exploring before its first update."""
     if learner.is_untrained() and not is_greedy():
         return torch.full_like(observation[:, 0], torch.inf)
     return learner.value(observation, *masks)
@@ -373,11 +373,11 @@ class HierarchicalAgent(nn.Module):
 
     @torch.no_grad()
     def replay_rows(self, name: str, steps: TensorDictBase) -> TensorDictBase:
-        """Return what a replay buffer would hold of some steps, rows `[N]`.
+        """Return the rows `[N]` that a replay buffer would store of some steps.
 
         Args:
-            name: of the buffer in `stateful`.
-            steps: of the environments `[N]`, with what the policy writes.
+            name: the buffer's name in `stateful`.
+            steps: steps of the environments `[N]`, with the entries that the policy writes.
         """
         batch = steps.unsqueeze(-1)
         if self.selector is not None and self.selector.decides_ends and self.next_options is not None:
@@ -391,15 +391,15 @@ class HierarchicalAgent(nn.Module):
         raise KeyError(name)
 
     def check_rows(self, name: str, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse saved rows of a replay buffer that do not make sense.
+        """Refuse invalid saved rows of a replay buffer.
 
         Args:
-            name: of the buffer in `stateful`.
-            rows: saved.
-            example: what `replay_rows` returned.
+            name: the buffer's name in `stateful`.
+            rows: the saved rows.
+            example: the rows that `replay_rows` returned.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a row is invalid.
         """
         self._level(name.partition("_")[0]).check_rows(rows, example)
 

@@ -23,8 +23,8 @@ def is_greedy() -> bool:
 
 
 def have_stepped(parts: Mapping[str, Any]) -> bool:
-    """Return whether an optimizer among the parts has taken a step, or there is none to tell by."""
-    # Plain stochastic gradient descent has no state that tells.
+    """Return whether an optimizer among the parts has taken a step; true if no part is an optimizer with a state."""
+    # Plain stochastic gradient descent has no state that would show its steps.
     kinds = (part for part in parts.values() if isinstance(part, torch.optim.Optimizer))
     optimizers = [part for part in kinds if not isinstance(part, torch.optim.SGD)]
     return not optimizers or any(optimizer.state for optimizer in optimizers)
@@ -250,46 +250,46 @@ class Selector(TensorDictModuleBase):
         return {}
 
     def decisions_to_update(self) -> dict[str, int]:
-        """Return how many decisions the first update takes at least, by the settings that ask for them.
+        """Return the least number of decisions before the first update, by the name of each setting that requires one.
 
-        A selector that learns within options counts steps. A run that is too short for it is refused, with the setting
-        that asks for most. Override it if one decision is not enough.
+        A selector that learns within options counts steps. A run that is too short is refused, and the message names
+        the setting with the largest number. Override it if one decision is not enough.
         """
         return {}
 
     def has_updated(self) -> bool:
-        """Return whether the selector has made an update, or has nothing to learn; a run says if it has not.
+        """Return whether the selector has made an update, or has nothing to learn; a run reports if it has not.
 
-        By default, the optimizers of `stateful` tell. Override it if the selector learns without one.
+        By default the optimizers in `stateful` decide. Override it if the selector learns without an optimizer.
         """
         return have_stepped(self.stateful())
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return what each replay buffer of `stateful` would hold of a collected batch `[*B, T]`, rows `[N]`.
+        """Return the rows `[N]` that each replay buffer of `stateful` would store of a collected batch `[*B, T]`.
 
-        A checkpoint's rows are compared with them in names, shapes and dtypes.
+        The rows of a checkpoint must have the same names, shapes and dtypes.
         """
         return {}
 
     def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse saved rows `[N]` of a replay buffer that do not make sense.
+        """Refuse invalid saved rows `[N]` of a replay buffer.
 
         Args:
-            rows: to be put into the buffer.
-            example: what `replay_rows` returned.
+            rows: the rows to put into the buffer.
+            example: the rows that `replay_rows` returned.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a row is invalid.
         """
         check_rows(rows, self.specs)
 
     def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse a state dict that has the names and shapes of this selector's, but does not make sense.
+        """Refuse a state dict with the names and shapes of this selector's, but with invalid values.
 
-        Called before `load_state_dict`. Override it if there is more to check than that numbers are finite.
+        Called before `load_state_dict`. Override it if finite numbers are not enough.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a value is invalid.
         """
 
     def portable(self) -> dict[str, Any] | None:
@@ -401,7 +401,7 @@ class Learner(nn.Module):
         raise NotImplementedError(f"{type(self).__name__} has no value to bootstrap from")
 
     def is_untrained(self) -> bool:
-        """Return whether `value` is still that of fresh networks, as far as parameters and buffers tell.
+        """Return whether parameters and buffers show that `value` still comes from untrained networks.
 
         While exploring, `high=value` chooses the options of such learners first, so that all of them get steps.
         """
@@ -469,10 +469,10 @@ class Learner(nn.Module):
         self.load_state_dict({name: fresh.get(name, value) for name, value in state.items()})
 
     def steps_to_update(self) -> dict[str, int]:
-        """Return how many steps of its own the first update takes at least, by the settings that ask for them.
+        """Return the least number of own steps before the first update, by the name of each setting that requires one.
 
-        A run that is too short for it is refused, with the setting that asks for most. Override it if one step is not
-        enough.
+        A run that is too short is refused, and the message names the setting with the largest number. Override it if
+        one step is not enough.
         """
         return {}
 
@@ -492,20 +492,20 @@ class Learner(nn.Module):
         return {}
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return what each replay buffer would hold of a batch, as `Selector.replay_rows` does."""
+        """Return the rows that each replay buffer would store of a batch, as `Selector.replay_rows` does."""
         return {}
 
     def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse saved rows that do not make sense, as `Selector.check_rows` does.
+        """Refuse invalid saved rows, as `Selector.check_rows` does.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a row is invalid.
         """
         check_rows(rows, self.specs, self.may_be_nan)
 
     def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse a state dict that does not make sense, as `Selector.check_state` does.
+        """Refuse a state dict with invalid values, as `Selector.check_state` does.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a value is invalid.
         """

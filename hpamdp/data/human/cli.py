@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         error = lost_output()
         if code or error is None:
             return code
-        if not isinstance(error, BrokenPipeError):  # else the reader has seen enough
+        if not isinstance(error, BrokenPipeError):  # a reader such as `head` has seen enough
             warn(f"stdout: {getattr(error, 'strerror', None) or first_line(error)}")
         return 1
 

@@ -61,7 +61,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
 
     Raises:
         DataError: the file is missing or not the right one, an argument is out of range, no episode is left, or `root`
-            has files that are not those rows.
+            has files of other rows.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         return self.root / self._name
 
     def _checked_rows(self, reward: RewardForm, observation: ObservationForm, has_choice: bool) -> TensorDict:
-        """Return the rows of the files, which may be somebody else's."""
+        """Return the rows of the files, checked, because the files may be somebody else's."""
         controller = "choose" if has_choice else "random"
         env = BoatDockEnv(1, controller=controller, reward=reward, observation=observation)
         try:

@@ -23,7 +23,7 @@ SUFFIX = ".jsonl"
 
 
 def read(path: Path | str, *, practice: bool = False) -> HumanData:
-    """Read a file of played episodes; lines that are no episode are left out, with a warning.
+    """Read a file of played episodes; leave out lines that hold no episode, with a warning.
 
     Args:
         path: of `hpamdp play`, or downloaded from its page.
@@ -46,8 +46,7 @@ def verify(path: Path | str) -> int:
     """Check every line of a file as the page's server does, from the raw events on; return how many episodes there are.
 
     Raises:
-        DataError: the file cannot be read, or a line has no episode that can have been played, or one that an earlier
-            line has.
+        DataError: the file cannot be read, or a line holds no valid episode or repeats an earlier one.
     """
     try:
         found, problems = played.read_with_problems(Path(path))

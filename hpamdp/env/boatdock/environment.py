@@ -420,7 +420,7 @@ class BoatDockEnv(PAMDPEnv):
         """Refuse controllers, keymaps and outcomes that do not exist.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a number is invalid.
         """
         super().check_env_state(columns)
         limits = {"controller": (-1, len(self.rules.names)), "outcome": (0, len(physics.OUTCOMES))}

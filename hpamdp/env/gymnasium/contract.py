@@ -57,7 +57,7 @@ class ContractCheck(gymnasium.Wrapper):
         )
 
     def close(self) -> None:
-        """Close the environment; what ends the program there is told, and the run goes on."""
+        """Close the environment; if it calls `sys.exit`, warn and let the run go on."""
         try:
             self.env.close()
         except SystemExit as error:
@@ -65,7 +65,10 @@ class ContractCheck(gymnasium.Wrapper):
 
 
 def checked(env: gymnasium.Env) -> gymnasium.Env:
-    """Put a ContractCheck around the environment and, inside its wrappers, around what they unpack the values of."""
+    """Put a ContractCheck around the environment and, if it has wrappers, around the environment inside them.
+
+    Wrappers unpack the values of the inner environment before the outer check sees them.
+    """
     outer = env
     while isinstance(outer, gymnasium.Wrapper):
         if not isinstance(outer.env, gymnasium.Wrapper):

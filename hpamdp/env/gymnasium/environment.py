@@ -30,7 +30,7 @@ from hpamdp.env.gymnasium.values import flag
 from hpamdp.messages import one_line
 
 _SUCCESS = "success"
-# Of an info, the first one counts.
+# If an info has both entries, the first one counts.
 _SUCCESS_ENTRIES = ("is_success", "success")
 _SEED = "seed"
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
@@ -55,19 +55,19 @@ class GymnasiumEnv(PAMDPEnv):
         entry_point: instead of `id`, a class or function `package.module:name` that returns the environment. An
             environment that is no `gymnasium.Env` must have the four-value interface of `gym`: see `FourValueEnv`.
         kwargs: passed to the environment's constructor.
-        max_steps: steps after which an episode is truncated; None: the environment's own time limit, see `with_limit`.
+        max_steps: steps after which an episode is truncated. If None, the environment's own limit: see `with_limit`.
         parameter_dims: how many parameters each discrete action takes of one box for all; None: each takes the whole
             box.
         option_key: the option's name in a `Dict` of actions, or its number in a `Tuple`; None: the entry `option`, if
             there is one.
         action_mask: where the environment says which discrete actions it forbids, and which options, as K numbers that
             are 0 where one is: `info`: as `action_mask` and `option_mask` in the info of every reset and step;
-            `ignore`: what it says is ignored; None: in the observation, a `Dict`, if it has these entries. A mask in
-            another place, such as a method `action_masks`, is refused.
+            `ignore`: masks are ignored; None: in the observation, a `Dict`, if it has these entries. Unless masks are
+            ignored, a mask in another place, such as a method `action_masks`, is refused.
         observation_keys: of a `Tuple` (numbers from 0) or `Dict` (names) of observations, the entries to keep, in this
             order; None: all but masks.
         observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
-        out_of_bounds: what becomes of observed numbers outside the bounds of their `Box`: `refuse` ends the run,
+        out_of_bounds: what happens to observed numbers outside the bounds of their `Box`: `refuse` ends the run,
             `clip` moves them to the bound, `allow` keeps them.
         device: of the tensors.
         seed: of the episodes, see above.
@@ -210,7 +210,7 @@ class GymnasiumEnv(PAMDPEnv):
             raise ValueError(f"{self._name}: {one_line(error)}") from error
         except (TypeError, ValueError) as error:
             cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
-            # A constructor may pass on what it does not know itself.
+            # A constructor may pass unknown arguments on to another one, which then raises the error.
             is_unknown = any(f"unexpected keyword argument '{name}'" in str(cause) for name in kwargs)
             if not (is_unknown or _is_about_the_call(cause)):
                 raise
@@ -322,7 +322,7 @@ class GymnasiumEnv(PAMDPEnv):
         return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device, torch.float32))
 
     def _read_success(self, info: Mapping[str, Any]) -> bool:
-        """Return what the info of a step says of success; False if it says nothing."""
+        """Return whether the info of a step reports success; False if it has no such entry."""
         for name in _SUCCESS_ENTRIES:
             if name in info:
                 self._reports_success = True

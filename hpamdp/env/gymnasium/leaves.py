@@ -1,4 +1,4 @@
-"""The spaces inside an observation space: each one's values are checked against it, then flattened."""
+"""The spaces inside an observation space. Values are checked against their space, then flattened."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ OutOfBounds = Literal["refuse", "clip", "allow"]
 
 # Units in the last place beyond a bound that count as rounding.
 _ROUNDING = 4.0
-# Of the agent's observations.
+# The dtype of the agent's observations.
 _OBSERVED = np.dtype(np.float32)
 
 
@@ -24,14 +24,15 @@ class Leaf:
     """A `Box`, `Discrete`, `MultiDiscrete` or `MultiBinary` inside an observation space.
 
     A value must have the space's shape; a `Discrete` also takes an array of one number. Integers and booleans must be
-    whole numbers within the space. Floats are rounded to the space's dtype. They are compared with the bounds in the
-    space's dtype or, if it is less precise, in the value's own; a few units in the last place count as rounding.
+    whole numbers within the space. Floats are rounded to the space's dtype. They are compared with
+    the bounds in the space's dtype, or in the value's dtype if this is less precise. Differences of a few units in the
+    last place count as rounding.
 
     Args:
-        space: of the leaf.
+        space: the leaf's space.
         path: the entries of `Tuple` and `Dict` spaces that lead to it, from the outermost on.
         lengths: for each entry of the path, the number of entries beside it if it is one of a `Tuple`, else None.
-        out_of_bounds: what becomes of finite numbers of a `Box` outside its bounds: they are refused, moved to the
+        out_of_bounds: what happens to finite numbers of a `Box` outside its bounds: they are refused, moved to the
             bound, or kept as they are.
 
     Attributes:
@@ -57,7 +58,7 @@ class Leaf:
         """Return the leaf's part of an observation as a vector, float64; discrete values are one-hot.
 
         Args:
-            observation: of the whole space.
+            observation: an observation of the whole space.
             cure: what to add to the message about a discrete value outside its space.
 
         Raises:
@@ -115,11 +116,11 @@ class Leaf:
         return values.astype(self._own).astype(np.float64) if self._is_float else values
 
     def _within_bounds(self, values: np.ndarray, dtype: np.dtype) -> np.ndarray:
-        """Return numbers that are not all plainly inside, as `out_of_bounds` says.
+        """Treat numbers of which some may be outside the bounds as `out_of_bounds` says.
 
         Args:
             values: the numbers.
-            dtype: in which the environment gave them.
+            dtype: the dtype in which the environment gave them.
         """
         self._refuse_where(~np.isfinite(values), values, "which is not finite")
         if not self._is_float:
@@ -178,7 +179,7 @@ def leaves(
     """Yield the leaves of a space, in the order of its flattened vector.
 
     Raises:
-        ValueError: `out_of_bounds` is none of its values.
+        ValueError: `out_of_bounds` has no allowed value.
     """
     if out_of_bounds not in get_args(OutOfBounds):
         raise ValueError(f"out_of_bounds={out_of_bounds}, but must be one of {', '.join(get_args(OutOfBounds))}")
@@ -191,7 +192,7 @@ def leaves(
 
 
 def children(space: spaces.Space) -> dict[int | str, spaces.Space]:
-    """Return the entries of a Tuple or Dict; none of another space."""
+    """Return the entries of a Tuple or Dict; an empty dictionary for any other space."""
     entries: dict[int | str, spaces.Space] = {}
     if isinstance(space, spaces.Tuple):
         entries.update(enumerate(space.spaces))

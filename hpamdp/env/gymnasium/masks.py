@@ -1,4 +1,4 @@
-"""Which discrete actions and options a Gymnasium environment forbids, and other places where it may say so."""
+"""The masks of the discrete actions and options that a Gymnasium environment forbids; masks elsewhere are found."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from hpamdp.env.gymnasium.values import as_numbers, shown
 MaskSource = Literal["info", "ignore"]
 
 _DEPTH = 4  # of nested dictionaries that are searched
-# What an environment may call its masks, or lists of what it allows or forbids, in lower case without punctuation.
+# Names of masks, and of lists of allowed or forbidden choices, in lower case without punctuation.
 _VERBS = "(?:get|compute|current)?"
 _ADJECTIVES = "(?:avail|available|legal|valid|allowed|permitted|possible|feasible|invalid|illegal|forbidden)"
 _MEANINGS = {
     keys.ACTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}actions?(?:masks?)?|actions?masks?|masks?actions?)",
     keys.OPTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}options?(?:masks?)?|options?masks?|masks?options?)",
 }
-# These may also be something else, so the values decide.
+# These names may also mean something else, so the values decide.
 _VAGUE = ("mask", "masks")
 
 
 class Masks:
-    """The masks of the copies of an environment, and a check that it has none in a place that is not read.
+    """The masks of the copies of an environment, with a check for masks in places that are not read.
 
     Args:
         env: one of the copies.
-        num_envs: how many there are.
-        sizes: of `action_mask` and `option_mask`; 0: there is nothing to choose.
+        num_envs: number of copies.
+        sizes: lengths of `action_mask` and `option_mask`. If 0, there is nothing to choose.
         source: `info`: masks come with the info of every reset and step; `ignore`: they are ignored; None: they are
             entries of the observation, a `Dict`, if it has them.
 
@@ -68,7 +68,7 @@ class Masks:
         Args:
             row: the copy's number.
             observation: as the environment gives it.
-            info: the same.
+            info: as the environment gives it.
 
         Raises:
             ProblemError: a mask is not made of 0 and 1 for each choice, or is in a place that is not read.
@@ -88,7 +88,7 @@ class Masks:
             self._refuse([*_in_mapping("info", info), *_in_mapping("observation", observation)], ProblemError)
 
     def check_attributes(self, env: gymnasium.Env) -> None:
-        """Check the attributes that a copy has got since it was made.
+        """Check the attributes that a copy has set since it was made.
 
         Raises:
             ProblemError: one of them is a mask.
@@ -99,7 +99,7 @@ class Masks:
     def _refuse(
         self, places: list[tuple[str, str, Any]], error: type[ValueError], unread: Mapping[str, int] | None = None
     ) -> None:
-        """Raise an error about the first of these places, names and values that is a mask which is not read."""
+        """Raise an error about the first mask that is not read, among candidates of a place, a name and a value."""
         unread = self._unread if unread is None else unread
         for place, entry, value in places:
             name = _meaning(entry)
@@ -107,7 +107,7 @@ class Masks:
                 continue
             raise error(
                 f"gave an {name} as {place}, which is not read; give it as {name} in a Dict of observations, or in the "
-                "info of every reset and step with env.action_mask=info; env.action_mask=ignore goes on without"
+                "info of every reset and step with env.action_mask=info; env.action_mask=ignore ignores it"
             )
 
 
@@ -123,7 +123,7 @@ def _in_mapping(place: str, values: Any, depth: int = _DEPTH) -> Iterator[tuple[
     if not isinstance(values, Mapping) or depth == 0:
         return
     for entry, value in values.items():
-        if isinstance(entry, str) and _meaning(entry) is not None and not _says_nothing(value):
+        if isinstance(entry, str) and _meaning(entry) is not None and not _cannot_be_mask(value):
             yield f"{place}[{entry!r}]", entry, value
         yield from _in_mapping(f"{place}[{entry!r}]", value, depth - 1)
 
@@ -133,7 +133,7 @@ def _in_attributes(env: Any, *, is_new: bool) -> Iterator[tuple[str, str, Any]]:
 
     Args:
         env: the outermost wrapper.
-        is_new: whether to look at the attributes of classes, too, which do not change.
+        is_new: whether to look at the attributes of classes, too. They never change, so one look is enough.
     """
     layer: Any = env
     while layer is not None:
@@ -141,7 +141,7 @@ def _in_attributes(env: Any, *, is_new: bool) -> Iterator[tuple[str, str, Any]]:
             if attribute.startswith("_") or _meaning(attribute) is None:
                 continue
             value = inspect.getattr_static(layer, attribute, None)
-            if not _says_nothing(value):
+            if not _cannot_be_mask(value):
                 kind = "method" if callable(value) else "attribute"
                 yield f"the {kind} {type(layer).__name__}.{attribute}", attribute, value
         layer = getattr(layer, "__dict__", {}).get("env")
@@ -149,7 +149,7 @@ def _in_attributes(env: Any, *, is_new: bool) -> Iterator[tuple[str, str, Any]]:
 
 @cache
 def _meaning(entry: str) -> str | None:
-    """Return which mask an entry may be by its name, if any."""
+    """Return the mask that the name of an entry suggests, if any."""
     letters = re.sub(r"[^a-z]", "", entry.lower())
     if letters in _VAGUE:
         return keys.ACTION_MASK
@@ -167,6 +167,6 @@ def _is_like_mask(value: Any, size: int) -> bool:
     return numbers is not None and numbers.shape == (size,) and bool(((numbers == 0) | (numbers == 1)).all())
 
 
-def _says_nothing(value: Any) -> bool:
-    """Return whether a value is no mask whatever its name: a flag, a count, a text or none."""
+def _cannot_be_mask(value: Any) -> bool:
+    """Return whether a value is no mask, whatever its name: a flag, a number, a text or None."""
     return value is None or isinstance(value, str | bool | int | float | np.generic)

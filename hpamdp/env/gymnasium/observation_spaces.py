@@ -35,7 +35,7 @@ class ObservationSpace:
             they are; `running` normalises to mean 0 and standard deviation 1 over all observations so far and clips to
             [-10, 10]; `none` changes nothing.
         entries: of a `Tuple` (numbers from 0) or `Dict` (names), the ones to keep, in this order; None: all.
-        out_of_bounds: what becomes of numbers of a `Box` outside its bounds: `refuse`, `clip` or `allow`; see `Leaf`.
+        out_of_bounds: what happens to numbers of a `Box` outside its bounds: `refuse`, `clip` or `allow`; see `Leaf`.
 
     Attributes:
         dim: length of the vectors.
@@ -94,7 +94,7 @@ class ObservationSpace:
         )
 
     def _cure(self, leaf: Leaf) -> str:
-        """Return the setting that leaves out the leaf's entry, in words; nothing if there is no other entry."""
+        """Return how to leave out the leaf's entry, as the end of a message; empty if there is no other entry."""
         others = [name for name in self._names if leaf.path and name != leaf.path[0]]
         return f"; env.observation_keys={others} leaves the entry out" if others else ""
 
@@ -149,7 +149,7 @@ class RunningStatistics(RunningMeanStd):
         """Continue from saved `columns`.
 
         Raises:
-            ValueError: they are of vectors of another length, or hold numbers that make no sense.
+            ValueError: they are of vectors of another length, or hold invalid numbers.
         """
         for name, column in self.columns().items():
             if name not in columns or columns[name].shape != column.shape:

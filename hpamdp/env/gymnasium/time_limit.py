@@ -14,8 +14,8 @@ def with_limit(env: gymnasium.Env, max_steps: int | None) -> tuple[gymnasium.Env
     """Return the environment with its time limit applied, and the number of steps after which it truncates.
 
     Args:
-        env: its limit is the lowest of the TimeLimit wrappers around it. If there is none, it is that of its spec.
-        max_steps: the limit to apply; None: the environment's own.
+        env: its own limit is the lowest one of its TimeLimit wrappers. Without such a wrapper, its spec has the limit.
+        max_steps: the limit to apply. If None, the environment's own.
 
     Raises:
         ValueError: the environment has no valid limit of its own, and none is given.
@@ -42,7 +42,7 @@ def _applied_limits(env: gymnasium.Env) -> list[int]:
 def _limit_of_spec(env: gymnasium.Env) -> int:
     limit = getattr(env.unwrapped.spec, "max_episode_steps", None)
     is_whole = isinstance(limit, numbers.Integral) and not isinstance(limit, bool)
-    if limit is None or (is_whole and limit == -1):  # -1 is none, too, for `gymnasium.make`
+    if limit is None or (is_whole and limit == -1):  # `gymnasium.make` takes -1 as no limit
         raise ValueError("has no time limit of its own; set env.max_steps")
     if not is_whole or limit < 1:
         raise ValueError(

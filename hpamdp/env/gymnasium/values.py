@@ -1,4 +1,4 @@
-"""Numbers and flags that somebody else's environment returns, checked before any conversion can change them."""
+"""Numbers and flags that a third-party environment returns, checked before any conversion can change them."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _LONGEST = 200
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
-    """Return a value as an array of real numbers in its own dtype; None if it is something else.
+    """Return a value as an array of real numbers in its own dtype; None if it is anything else.
 
     Text, None, complex numbers, dates, arrays of objects, ragged lists, integers beyond 64 bits and arrays with masked
-    entries are something else.
+    entries give None.
     """
     try:
         array = np.asarray(value)

@@ -102,7 +102,7 @@ class MetaCritic(Selector):
         return {"critics": self.optimizer, "buffer": self.buffer}
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return what the buffer would hold if every step of a batch `[*B, T]` ended an option."""
+        """Return the rows that the buffer would store if every step of a batch `[*B, T]` ended an option."""
         return {"buffer": self._rows(batch.flatten())}
 
     def portable(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class MetaCritic(Selector):
         return is_worse | (torch.rand(is_worse.shape, device=is_worse.device, dtype=torch.float32) < random_share)
 
     def decisions_to_update(self) -> dict[str, int]:
-        """Return the lengths of the warm-up and of an update's share of decisions."""
+        """Return the length of the warm-up and the number of decisions for one update."""
         share = first_multiple(self.updates_per_decision)
         return {"warmup_decisions": self.warmup_decisions, "updates_per_decision": share}
 

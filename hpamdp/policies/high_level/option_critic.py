@@ -122,7 +122,7 @@ class OptionCritic(Selector):
         return {**self.optimizers, "buffer": self.buffer}
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return what the buffer would hold of a batch `[*B, T]`."""
+        """Return the rows that the buffer would store of a batch `[*B, T]`."""
         return {"buffer": self._rows(batch).flatten()}
 
     @property
@@ -156,7 +156,7 @@ class OptionCritic(Selector):
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
 
     def decisions_to_update(self) -> dict[str, int]:
-        """Return the lengths of the warm-up and of an update's share of steps; this selector learns from steps."""
+        """Return the length of the warm-up and the number of steps for one update; this selector learns from steps."""
         return {"warmup_steps": self.warmup_steps, "updates_per_step": first_multiple(self.updates_per_step)}
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:

@@ -6,7 +6,7 @@ Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, Artificial Intellig
 `end_values`, whose value is that of a random member of its ensemble when exploring, makes it posterior sampling over
 options: Osband, Russo and Van Roy 2013, arXiv 1306.0940.
 
-While exploring, options whose learner has made no update come first, in random order: nothing is known of them.
+While exploring, options whose learner has made no update come first, in random order: their values are unknown.
 """
 
 from __future__ import annotations

@@ -401,7 +401,7 @@ class DLPA(ReplayLearner):
         self.buffer[:]["successor"][previous[follows]] = place[follows]
 
     def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse rows that do not make sense, and links to steps and environments that do not exist."""
+        """Refuse invalid rows, and links to steps or environments that do not exist."""
         super().check_rows(rows, example)
         limits = {"successor": len(rows), "environment": int(example["environment"].max()) + 1}
         for name, limit in limits.items():

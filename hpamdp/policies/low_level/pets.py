@@ -379,7 +379,7 @@ class PETSPolicy(TensorDictModuleBase):
     """The first action of a plan; exploring, of one with the member that the environment follows in this episode.
 
     Acts uniformly at random until the stored steps differ in their rewards or in whether they terminate: before, all
-    plans are alike. Nothing is planned for finished episodes: their action is random, too, and is ignored.
+    plans have the same value. In finished episodes the action is random, too, and is ignored.
     """
 
     is_trained: Tensor
@@ -464,8 +464,8 @@ class PETSPolicy(TensorDictModuleBase):
         """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
 
         Greedily that is by the mean of all members, and `caution`; exploring by posterior sampling, by a random member
-        for each observation, or else by the mean and `optimism`, so that what members disagree on is tried. As long as
-        nothing is planned, the value is that of the one known reward at every step, and infinite if exploring.
+        for each observation, or else by the mean and `optimism`, so that what members disagree on is tried. Before
+        the policy plans, the value assumes the only known reward at every step; while exploring, it is infinite.
         """
         num = len(observation)
         if not bool(self.is_trained):
@@ -736,8 +736,8 @@ class PETS(ReplayLearner):
         return self.end_values.of_own(observation[..., self.entries])
 
     def explore(self, frames: int) -> None:
-        """Let the policy plan, from when there are different rewards, terminations or end values to plan for."""
-        if self.policy.is_trained:  # later data may be alike because the plans are good
+        """Let the policy plan once stored rewards or terminations differ, or at once if there are end values."""
+        if self.policy.is_trained:  # later steps may be the same because the plans are good
             return
         stored = self.buffer[:]
         differ = [(stored[name] != stored[name][0]).any() for name in ("reward", "terminated")]

@@ -170,8 +170,8 @@ class SarsaLambda(SizedByData):
             w: weights `[num_discrete, num_features]`.
             rows: `[N, T]` with `phi` and `next_phi` `[N, T, num_features]`, and `discrete`, `reward`, `terminated`,
                 `done` and `mask` `[N, T]`; only the rows in `mask` count. `next_allowed` `[N, T, num_discrete]`: the
-                discrete actions that may be taken in the next states, if not all. `is_first` `[N, T]`: whether a row
-                begins an episode, if that is known; the episode before it may have been abandoned.
+                discrete actions that may be taken in the next states, if not all. `is_first` `[N, T]`, if known:
+                whether a row begins an episode; the episode before it may have been abandoned.
             temperature: of the softmax policy, `[]`.
             step_scale: factors on the steps of the features' weights, `[num_features]`.
 
@@ -488,7 +488,7 @@ class QPAMDP(Learner):
         """Refuse sizes that do not fit together, and phases that do not exist.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: the state is invalid.
         """
         num_features = []
         for name, weights in (("phi", state["policy.w"]), ("psi", state["policy.theta"])):

@@ -75,14 +75,14 @@ class FourierBasis(SizedByData):
         self.coefficients = fourier_coefficients(len(inputs), self.order, self.max_coupled).to(low)
 
     def check_state(self, state: Mapping[str, Tensor], observation_dim: int) -> None:
-        """Refuse buffers that `fit` does not set.
+        """Refuse buffers that `fit` cannot have set.
 
         Args:
             state: the buffers by name.
             observation_dim: length of the observations.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: a buffer is invalid.
         """
         inputs, width = state["inputs"], state["width"]
         num = len(inputs)

@@ -183,7 +183,7 @@ class Bandit(Selector):
         """Refuse negative counts and decisions for options that do not exist.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: the state is invalid.
         """
         for name, value in state.items():
             if name.endswith(("counts", "squares")) and (value < 0.0).any():

@@ -1,4 +1,4 @@
-"""The dtype of numbers for which library code names none."""
+"""The default dtype for library code that names none."""
 
 from __future__ import annotations
 

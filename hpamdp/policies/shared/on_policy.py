@@ -56,14 +56,14 @@ class OnPolicy(nn.Module):
         self.waiting = [TensorDict(rows).auto_batch_size_(1) for rows in state]
 
     def empty_rows(self) -> dict[str, Tensor]:
-        """Return the columns of the rows that an update needs, without a row, `[0, ...]` each."""
+        """Return the columns of the rows that an update needs, each empty `[0, ...]`."""
         raise NotImplementedError
 
     def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse waiting rows of other columns than `empty_rows`, or of numbers that make no sense.
+        """Refuse waiting rows with other columns than `empty_rows` has, or with invalid numbers.
 
         Raises:
-            ValueError: with what is wrong.
+            ValueError: the rows are invalid.
         """
         waiting, columns = state["_extra_state"], self.empty_rows()
         if not isinstance(waiting, list) or not all(isinstance(rows, dict) for rows in waiting):

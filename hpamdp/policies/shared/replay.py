@@ -114,7 +114,7 @@ class ReplayLearner(Learner):
             self.store(batch, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Make updates from the stored transitions; none if a data set has nothing for this learner."""
+        """Make updates from the stored transitions; none if a data set has no transitions for this learner."""
         if len(self.buffer) == 0:
             return {}
         if int(self.frames) == int(self.updates) == 0:
@@ -136,7 +136,7 @@ class ReplayLearner(Learner):
         return int(self.updates) == 0
 
     def steps_to_update(self) -> dict[str, int]:
-        """Return the lengths of the warm-up and of an update's share of steps."""
+        """Return the length of the warm-up and the number of steps for one update."""
         needed = {"warmup_frames": self.warmup_frames}
         if self.updates_per_frame > 0.0:
             needed["updates_per_frame"] = first_multiple(self.updates_per_frame)
@@ -154,7 +154,7 @@ class ReplayLearner(Learner):
         self.buffer.extend(rows)
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return what the buffer would hold of a batch `[*B, T]`."""
+        """Return the rows that the buffer would store of a batch `[*B, T]`."""
         own = self.buffer
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(batch.numel(), device=self.frames.device))
         try:

@@ -1,4 +1,7 @@
-"""Check rows of a checkpoint: choices index tables and networks' outputs, and numbers must be finite."""
+"""Check the stored rows of a checkpoint.
+
+Numbers must be finite. Choices must exist, because they index tables and the outputs of networks.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +14,23 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def check_choices(rows: Mapping[str, Tensor], specs: PAMDPSpecs) -> None:
-    """Refuse rows whose `discrete`, `option` or `next_option` does not exist; names that are missing are left out.
+    """Refuse rows whose `discrete`, `option` or `next_option` does not exist; missing columns are skipped.
 
     Raises:
-        ValueError: with the name and the number.
+        ValueError: the message has the column and its numbers.
     """
     limits = {"discrete": specs.num_discrete, "option": specs.num_options, "next_option": specs.num_options}
     for name, limit in limits.items():
         column = rows.get(name)
         if column is not None and column.numel() and not 0 <= int(column.min()) <= int(column.max()) < limit:
-            raise ValueError(f"{name} holds {int(column.min())} to {int(column.max())}, but must be less than {limit}")
+            raise ValueError(f"{name} holds {int(column.min())} to {int(column.max())}, but must be 0 to {limit - 1}")
 
 
 def check_rows(rows: TensorDictBase, specs: PAMDPSpecs, may_be_nan: frozenset[str] = frozenset()) -> None:
     """Refuse stored rows with numbers that are not finite and with choices that do not exist.
 
     Raises:
-        ValueError: with the name of the column.
+        ValueError: the message names the column.
     """
     for name, column in rows.items():
         is_wrong = column.isinf() if name in may_be_nan else ~column.isfinite()

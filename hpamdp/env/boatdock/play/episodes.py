@@ -99,7 +99,7 @@ def check(value: object) -> Episode:
 
 
 def identity(player: object, index: object) -> str:
-    """Return what tells an episode from all others: who played it, and as which of that player's."""
+    """Return a text that no other episode has: the player, and the episode's number among that player's."""
     return f"{player}-{index}"
 
 
@@ -125,7 +125,7 @@ def direction_rows(episodes: Sequence[Episode]) -> Tensor:
 def read(path: Path) -> dict[int, Episode]:
     """Read a file and return its episodes by the numbers of their lines, each checked as by `check`.
 
-    Lines that are no episode are left out, as are episodes that an earlier line has; a warning names them.
+    Lines that hold no episode, or the same episode as an earlier line, are left out. A warning names these lines.
 
     Raises:
         EpisodeError: the file cannot be read, or it has lines but no episode.
@@ -137,7 +137,7 @@ def read(path: Path) -> dict[int, Episode]:
 
 
 def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
-    """Read a file as `read` does; return the episodes, and what is wrong with the lines that were left out.
+    """Return the episodes of a file, as `read` does, and the problem of each line that is left out.
 
     Raises:
         EpisodeError: as `read` does.
@@ -174,7 +174,7 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
 
 @cache
 def _warn_once(message: str) -> None:
-    """Tell what was left out of a file once, however many environments read it."""
+    """Warn once about the lines left out of a file, however many environments read it."""
     warn(message)
 
 
@@ -195,7 +195,7 @@ def _points(points: Sequence[Point]) -> Tensor:
 
 
 def _problems(episodes: Sequence[Episode]) -> list[str | None]:
-    """Return what is wrong with each episode, if anything: whether it can have been played as it says."""
+    """Return the problem of each episode, or None if its key events lead to the presses and the end that it holds."""
     settled = [settle((event.t, event.type, event.key) for event in episode.events) for episode in episodes]
     from_events, from_presses = sail(episodes, settled), sail(episodes)
     problems: list[str | None] = []
