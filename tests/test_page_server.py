@@ -136,7 +136,7 @@ def test_a_file_of_something_else_is_refused(tmp_path):
 def test_a_file_without_an_episode_is_refused_and_left_as_it_is(tmp_path, text, command):
     path = tmp_path / "notes.txt"
     path.write_text(text)
-    with pytest.raises(EpisodeError, match="line 1: no episode, nor is any other line; take another file"):
+    with pytest.raises(EpisodeError, match="no line is an episode; take another file"):
         EpisodeFile(path, BoatPage(seed=0))
     assert path.read_text() == text and [*tmp_path.iterdir()] == [path]
 

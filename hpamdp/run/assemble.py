@@ -210,7 +210,7 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
         demonstrations.check(PAMDPSpecs.from_env(env))
     except DataError as error:
         raise ConfigError(f"{config.data}: {first_line(error)}") from error
-    except RuntimeError as error:  # of tensordict, from the constructor of somebody's own data set
+    except RuntimeError as error:  # raised by tensordict in the constructor of a user's own data set
         if "batch dimension mismatch" not in str(error):
             raise
         raise ConfigError(f"{config.data}: its entries differ in length ({first_line(error)})") from error
@@ -448,10 +448,10 @@ def check_modes(config: Config) -> None:
 
 
 def check_length(config: Config, agent: HierarchicalAgent) -> None:
-    """Refuse a training that is surely over before the first update of the selector or of a learner.
+    """Refuse a training run that must end before the first update of the selector or of a learner.
 
     Raises:
-        ConfigError: with the setting that asks for most steps, and with how many there will be.
+        ConfigError: the message names the setting that requires the most steps, and the number of steps of the run.
     """
     run = config.run
     if run.mode != "train":

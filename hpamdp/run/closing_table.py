@@ -11,7 +11,7 @@ from hpamdp.env.base import Metric
 from hpamdp.messages import duration
 from hpamdp.run.metrics import FRAMES, WALL_SECONDS
 
-WITHOUT_UPDATE = "without_update"  # names of the levels that have learned nothing
+WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
 
 
 def _number(value: float) -> str:

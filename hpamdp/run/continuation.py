@@ -1,4 +1,4 @@
-"""What is left to do in a folder, when the command that started its run is given again."""
+"""Find the rest of a run in its folder when the command that started it is given again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.folder import SUMMARY_NAME, saved_config, saved_summary
 from hpamdp.saved_config import in_todays_form
 
-# Settings that change neither what is learned nor what is scored.
+# Settings that change neither the training nor the score.
 _BOOKKEEPING = (
     "resume",
     "trust",
@@ -28,19 +28,19 @@ _BOOKKEEPING = (
 
 
 class Left(NamedTuple):
-    """What a run has left to do: nothing if it has a score, else everything after its checkpoint."""
+    """The rest of a run: nothing if it has a score, else everything after its checkpoint."""
 
     score: float | None = None
     checkpoint: Path | None = None
 
 
 def left(wanted: Config, folder: Path, name: str = "its folder") -> Left:
-    """Return what is left to do of a run in its folder, which may be new.
+    """Return the rest of a run in its folder, which may be new.
 
     Args:
         wanted: the config of the run.
-        folder: its folder.
-        name: of the folder, for the error.
+        folder: the run's folder.
+        name: the folder's name in the error.
 
     Raises:
         ConfigError: the folder holds the results of another run, and `overwrite` is false.
@@ -64,8 +64,8 @@ def left(wanted: Config, folder: Path, name: str = "its folder") -> Left:
 
 
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
-    """Return in words where two configs differ, bookkeeping aside; nothing if they do not."""
-    # Written and read as the saved one was.
+    """Return in words where two configs differ, except in bookkeeping; empty if they agree."""
+    # Through yaml, as the saved config.
     here, there = _flat(yaml.safe_load(wanted.to_yaml())), _flat(in_todays_form(saved) if saved else {})
     keys = [key for key in {**here, **there} if here.get(key) != there.get(key)]
     keys = [key for key in keys if key.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING]

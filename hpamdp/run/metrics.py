@@ -22,14 +22,14 @@ def read_rows(path: Path) -> list[dict[str, float]]:
     """Read the rows of a `metrics.csv`, each with the columns it has a number for.
 
     A last line without its end was cut off while it was written, and is left out; cells that hold no number too.
-    A missing file has no rows, nor has a file of something else, which a warning names.
+    A missing file has no rows. A file of another kind has none either, and a warning names the file.
     """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     lines = text[: text.rfind("\n") + 1].splitlines()
     try:
         return [dict(_numbers(cells)) for cells in csv.DictReader(lines)]
     except csv.Error as error:
-        warn(f"{path} cannot be read, its rows are left out: {error}")
+        warn(f"{path} cannot be read; its rows are left out: {error}")
         return []
 
 
@@ -49,7 +49,7 @@ class MetricsFile:
         path: the file. It stays as it is until the first row; what an earlier run left there is then kept as
             `<name>.previous`.
         resume_from: the metrics file of the run that is resumed, which may be `path` itself; its rows come first.
-        up_to_frames: leave out the resumed rows from the first one past this many frames on, and that of the stop.
+        up_to_frames: leave out the resumed rows from the first one past this many frames on, and the row of the stop.
     """
 
     def __init__(self, path: Path, resume_from: Path | None = None, up_to_frames: float = math.inf) -> None:

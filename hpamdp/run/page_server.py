@@ -31,7 +31,7 @@ EPISODES = "/episodes"
 _MAX_FILE = 1 << 28  # bytes
 _PATIENCE = 10.0  # s that a connection may keep silent
 _LOCK_PATIENCE = 4.0  # s that an episode waits for the file's lock
-_NAME_LENGTH = 200  # letters of the file's name in that of its lock
+_NAME_LENGTH = 200  # letters of the file's name in the name of its lock
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -64,7 +64,7 @@ class EpisodeFile:
         page: knows which episodes are the same.
 
     Raises:
-        EpisodeError: the file is not one of episodes, it cannot be written, or its folder is missing.
+        EpisodeError: the file holds no episode, it cannot be written, or its folder is missing.
     """
 
     def __init__(self, path: Path, page: Page) -> None:
@@ -105,10 +105,10 @@ class EpisodeFile:
             self._lock.release()
 
     def _append(self, identity: str, line: bytes) -> bool:
-        """Add a line, while both locks are held, unless somebody has added its episode."""
+        """Add a line, unless its episode is already in the file; both locks must be held."""
         with suppress(FileNotFoundError):
             regular_size(self.path)
-        # Without a buffer, what could not be written is not written later, either.
+        # Without a buffer, nothing is left to be written later after an error.
         with self.path.open("a+b", buffering=0) as file:
             size = file.seek(0, os.SEEK_END)
             inode = os.fstat(file.fileno()).st_ino
@@ -137,7 +137,7 @@ class EpisodeFile:
         return True
 
     def _check_file(self) -> None:
-        """Read the file, if it is there, and tell which lines are no episodes.
+        """Read the file, if it exists, and warn about the lines that hold no episode.
 
         Raises:
             EpisodeError: no line is an episode.
@@ -154,7 +154,7 @@ class EpisodeFile:
         lines = [*self._identities(data)]
         problems = {number: "no episode" for number, identity in lines if identity is None}
         if lines and not any(self._is_episode(line) for _, line in lines_of(data)):
-            raise EpisodeError(f"{self.path}, line {lines[0][0]}: no episode, nor is any other line; take another file")
+            raise EpisodeError(f"{self.path}: no line is an episode; take another file")
         if problems:
             warn(f"{self.path}: {left_out(len(lines), problems)}")
         self._known = {identity for _, identity in lines if identity is not None}
@@ -169,7 +169,7 @@ class EpisodeFile:
         return True
 
     def _identities(self, data: bytes) -> Iterator[tuple[int, str | None]]:
-        """Yield the number and the episode's identity of each line; None: it has no episode."""
+        """Yield the number of each line and the identity of its episode, or None if it holds no episode."""
         for number, line in lines_of(data):
             try:
                 yield number, self.page.identity(read_json(line))

@@ -108,8 +108,8 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
 
     Args:
         names: the folders; `none` stands for no agent.
-        config: of the problem that the page shows.
-        settings: the words that made it.
+        config: the config of the problem that the page shows.
+        settings: the words of the command line that made `config`.
 
     Raises:
         ConfigError: no such agent, or one that a page cannot take.
@@ -129,7 +129,7 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
 
 
 def _permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]:
-    """Return the settings of the problem that an agent's own config cannot set unasked, and `trust`."""
+    """Return the words that permit an agent's config what the user has permitted: guarded settings and `trust`."""
     is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
     given = [word.partition("=") for word in settings]
     return [

@@ -91,7 +91,7 @@ class Recorder:
         """Continue from a `state`.
 
         Raises:
-            ValueError: it is of another environment, or holds numbers that make no sense.
+            ValueError: the state is of another environment, or holds invalid numbers.
         """
         saved = checked(_State, state)
         own = self._results(self.parts.env.fake_tensordict()).to_dict()
@@ -115,14 +115,14 @@ class Recorder:
         self._ended.append(self._results(batch)[is_end])
 
     def _results(self, steps: TensorDictBase) -> TensorDictBase:
-        """Return what is noted of steps `[*B]` that end an episode."""
+        """Return the entries of steps `[*B]` that are recorded if the step ends an episode."""
         results = steps.get("next").select(*self.parts.env.result_keys, keys.EPISODE_RETURN, keys.EPISODE_STEPS)
         if keys.OPTION in steps.keys():
             results.set(keys.OPTION, steps.get(keys.OPTION))
         return results
 
     def forget_evaluation(self) -> None:
-        """Evaluate again when the scores are needed next, as the agent may have changed."""
+        """Evaluate again when scores are next needed, because the agent may have changed."""
         self._played = None
 
     def log(self, frames: int, wall_s: float, is_evaluated: bool, *, is_stopped: bool = False) -> dict[str, float]:

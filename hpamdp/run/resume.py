@@ -19,7 +19,7 @@ from hpamdp.shell import setting
 
 # Parts of the config that make the agent what it is.
 _AGENT = ("high", "low", "agent", "experiment", "search", RECIPE)
-# How the saved run began does not matter to one that starts from it.
+# Settings that a run does not take over from the saved run.
 _BEGIN = ("mode", "resume", "checkpoint", "overwrite", "trust")
 # Groups that an evaluation does not take from the saved run: it collects no steps and logs where the command line says.
 _NOT_EVALUATED = ("data", "logger", "collector")
@@ -117,7 +117,7 @@ def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple
     """Return the options that a saved run's agent chose among; none if they are not known."""
     if "option_names" in progress:
         return tuple(progress["option_names"])
-    # A checkpoint of an earlier version lacks the names, which a problem of the package tells without guarded settings.
+    # A checkpoint of an earlier version lacks the names. A problem of this package has them without guarded settings.
     try:
         config = read_saved(progress["config"], {"mode": "train", "resume": None, "checkpoint": None})
         if config.env.cls is None or not config.env.cls.__module__.startswith("hpamdp."):

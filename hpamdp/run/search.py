@@ -1,4 +1,4 @@
-"""Optuna searches whose trials are kept in a storage: a search that is started again goes on."""
+"""Continue an Optuna search whose trials are kept in a storage."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from hpamdp.run.folder import locked
 if TYPE_CHECKING:
     from optuna import Study
 
-# The study's list of trials that were tried again.
+# The study's entry with the numbers of the trials that were repeated.
 _TRIED_AGAIN = "tried_again"
 
 
 def go_on(config: DictConfig) -> int | None:
-    """Set up Hydra's Optuna sweeper to do what is left of a search; return the number of its first job.
+    """Set up Hydra's Optuna sweeper to continue a search; return the number of its first job.
 
-    The search tries again what was stopped or failed, and then proposes new trials until `n_trials` are complete.
+    The search repeats the trials that were stopped or failed, and then proposes new ones until `n_trials` are complete.
     Without a storage, and with another sweeper, the first job has number 0.
 
     Args:
-        config: of the sweep, with its `hydra` part, which is changed.
+        config: the sweep's config, with its `hydra` part, which is changed.
 
     Returns:
-        The number, or None if nothing is left.
+        The number, or None if all trials are complete.
 
     Raises:
         ConfigError: the storage cannot be used.
@@ -64,7 +64,7 @@ def go_on(config: DictConfig) -> int | None:
 
 
 def _load(config: DictConfig) -> Study:
-    """Return the study in the storage, named after the sweep's folder if it has no name; make it if need be."""
+    """Load the study from the storage, or create it; without a name it is named after the sweep's folder."""
     import optuna
     import sqlalchemy
 
@@ -89,7 +89,7 @@ def _load(config: DictConfig) -> Study:
 
 
 def _move(config: DictConfig, before: int, now: int) -> None:
-    """Give the folder of a trial its new number, so that its checkpoint is found, unless a process is at work there."""
+    """Rename a trial's folder to its new number, so that its checkpoint is found, unless a process uses the folder."""
     sweep = config.hydra.sweep
     if sweep._get_node("subdir")._value() != "${hydra.job.num}":
         return

@@ -40,9 +40,9 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Note the signals that stop a run, until the block ends; those that are ignored stay so.
+    """Note the signals that stop a run, until the block ends; ignored signals stay ignored.
 
-    In a thread other than the main one, nothing is noted: signals reach the main thread alone.
+    In another thread than the main one nothing is noted, because signals reach only the main thread.
     """
     request = StopRequest()
     before = {number: signal.getsignal(number) for number in _changeable_signals()}
@@ -68,7 +68,7 @@ def signals_ignored() -> Iterator[None]:
 
 
 def pass_on_signal() -> None:
-    """Give the signal that stopped the last run to who handled it before, such as a launcher that requeues jobs."""
+    """Pass the signal that stopped the last run to its earlier handler, such as a launcher that requeues jobs."""
     number = StopRequest.latest
     if number is not None and signal.getsignal(number) not in (signal.SIG_DFL, signal.default_int_handler):
         os.kill(os.getpid(), number)
@@ -80,17 +80,17 @@ def _changeable_signals() -> tuple[signal.Signals, ...]:
 
 
 class ProgramExitError(RuntimeError):
-    """A call of `sys.exit` in somebody else's code, told in one line."""
+    """A call of `sys.exit` in third-party code, told in one line."""
 
 
 @contextmanager
 def exits_told() -> Iterator[None]:
-    """Turn a call of `sys.exit` inside the block into an error that says where it is.
+    """Turn a call of `sys.exit` inside the block into an error that names its place.
 
-    Calls of argparse stay, and those of submitit, which ends a job that way to requeue it.
+    Calls by argparse are let through. So are calls by submitit, which ends a job this way to requeue it.
 
     Raises:
-        ProgramExitError: there was such a call.
+        ProgramExitError: `sys.exit` was called.
     """
     try:
         yield

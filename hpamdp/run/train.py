@@ -135,7 +135,7 @@ def _run(
 
 
 def _resuming(config: Config, output_dir: Path) -> str:
-    """Return the command that goes on with a run."""
+    """Return the command that continues a run."""
     mode = "" if config.run.mode == "train" else f"mode={config.run.mode} "
     trust = " trust=true" if needs_trust(config) else ""  # the settings came from the user's own command line
     return f"{program()} {mode}{path_setting('resume', output_dir)}{trust}"
@@ -190,7 +190,7 @@ class Trainer:
         self._saved = saved
 
     def start(self, *, is_own: bool) -> None:
-        """Write the config and start the logger: the first writes, after everything was checked and built.
+        """Write the config and start the logger. These are the first writes, so everything must be checked and built.
 
         Args:
             is_own: whether the folder holds the run that is continued. Otherwise an earlier run there is deleted.
