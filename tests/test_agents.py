@@ -66,7 +66,7 @@ def test_those_on_boats_can_be_played_against_and_the_others_are_not_even_built(
 def test_the_networks_of_an_agent_start_a_run(tmp_path):
     words = ["env=goal", "high=none", "low=pdqn", f"low.checkpoint={FOLDER / 'pdqn_goal'}", "total_frames=1024"]
     words += [
-        "eval.layouts=100",
+        "eval.layouts=50",
         "eval.every=0",
         "num_envs=64",
         "low.warmup_frames=1000",

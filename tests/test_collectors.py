@@ -1,7 +1,9 @@
 """Collection beyond one process: the same batches, the learner's weights, and nothing left running."""
 
+import copy
 import importlib
 import importlib.util
+import itertools
 import multiprocessing
 import os
 import pickle
@@ -33,7 +35,6 @@ from hpamdp.run.collection.worker import (
     ShardCollector,
     WorkingDir,
     packed,
-    unpack,
 )
 from hpamdp.run.collection.workers import WorkerCollection
 from hpamdp.run.recorder import Recorder
@@ -195,29 +196,29 @@ def test_a_collection_goes_on_where_another_one_stood(workers, tmp_path):
 
 def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(tmp_path):
     words = ["high=uniform", "collector=multi", "collector.num_workers=1", "collector.ahead=true"]
-    (parts, collection), (others, other) = make(tmp_path, *words), make(tmp_path, *words)
-    with closing(collection), closing(other):
+    parts, collection = make(tmp_path, *words)
+    with closing(collection):
         last = collection.next()
-        before = packed(parts.policy)
+        before = {name: torch.as_tensor(value).clone() for name, value in parts.policy.state_dict().items()}
         as_given = last.clone()
         assert parts.agent.learn(last)
-        state = collection.state()
+        state = copy.deepcopy(collection.state())
         (theirs,) = collection._call("policy.policy.state_dict")
-        unpack(others.policy, before)
-        assert_same_state(others.policy.state_dict(), theirs)
+        assert_same_state(before, theirs)
         assert (last == as_given).all(), "the next batch is written elsewhere"
 
-        unpack(others.policy, packed(parts.policy))
-        other.set_state(state)
-        for _ in range(2):
-            batch, same = collection.next(), other.next()
-            for name in ("observation", ("action", "parameters")):
-                assert torch.equal(batch[name], same[name])
-            is_on = ~last["next", "done"][:, -1, 0]
-            assert torch.equal(last["next", "observation"][:, -1][is_on], batch["observation"][:, 0][is_on])
-            last = batch
+        batches = [last, collection.next(), collection.next()]
+        for one, following in itertools.pairwise(batches):
+            is_on = ~one["next", "done"][:, -1, 0]
+            assert torch.equal(one["next", "observation"][:, -1][is_on], following["observation"][:, 0][is_on])
         collection.state()
         assert_same_state(parts.policy.state_dict(), *collection._call("policy.policy.state_dict"))
+
+        collection.set_state(state)
+        for batch in batches[1:]:
+            same = collection.next()
+            for name in ("observation", ("action", "parameters")):
+                assert torch.equal(batch[name], same[name])
 
 
 def test_the_state_of_another_number_of_environments_is_refused(workers, tmp_path):

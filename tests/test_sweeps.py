@@ -15,6 +15,7 @@ from conftest import CONF, choices, compose_config
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from hpamdp import cli
 from hpamdp.config import ConfigError, component, read
 from hpamdp.messages import warn
 from hpamdp.run import train
@@ -105,12 +106,13 @@ def test_a_sweep_over_experiments_of_one_study_lies_in_its_folder_and_is_told_at
     assert command(*words)[0] == 0 and not jobs
 
 
-def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it(command, jobs, tmp_path):
+def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it(command, jobs, tmp_path, monkeypatch):
     code, out, err = command("experiment=domains", "low=random")
     assert (code, err) == (0, "") and len(jobs) == len(choices("experiment/domains")) == 10
     assert "Job 0: experiment=domains/catch_point low=random\n" in out and "10 jobs: 10 finished\n" in out
-    jobs.clear()
-    assert command("--multirun", "experiment=domains", "low=random", "seed=0,4")[0] == 0 and len(jobs) == 10
+    monkeypatch.setattr(sys, "argv", ["run.py", "--multirun", "experiment=domains", "seed=0,4"])
+    flag, experiments, seeds = cli._folder_written_out(cli._parse(), CONF)[1:]
+    assert (flag, seeds) == ("--multirun", "seed=0,4") and experiments.count(",") == 9
 
 
 def test_a_sweep_over_experiments_with_folders_of_their_own_is_refused_until_one_is_given(command, jobs, tmp_path):
