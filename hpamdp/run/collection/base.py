@@ -17,7 +17,7 @@ from hpamdp.run.checks import SavedPart, check_columns, check_generator, checked
 
 
 class CollectionState(SavedPart):
-    """What `Collection.state` returns."""
+    """The state that `Collection.state` returns."""
 
     env: dict[str, Tensor]
     root: dict[str, Any] | None = None
@@ -26,10 +26,10 @@ class CollectionState(SavedPart):
 
 
 def checked_state(saved: Any, parts: Parts) -> CollectionState:
-    """Return the state of a collection.
+    """Return the state of a collection, checked.
 
     Raises:
-        ValueError: it is of another run, or holds numbers that make no sense.
+        ValueError: the state is of another run, or holds invalid numbers.
     """
     state, env = checked(CollectionState, saved), parts.env
     if state.env:
@@ -49,10 +49,10 @@ def checked_state(saved: Any, parts: Parts) -> CollectionState:
 
 
 def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, parts: Parts) -> None:
-    """Refuse steps other than `[N, *]` of the run.
+    """Refuse saved steps that cannot be steps `[N, *]` of the run.
 
     Raises:
-        ValueError: with the first entry that is wrong.
+        ValueError: the message names the first wrong entry.
     """
     if where == "coming":
         next_steps = saved.get("next")
@@ -65,7 +65,7 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
         if keys.DISCRETE not in TensorDict(saved).keys(include_nested=True):  # before the first step
             example = example.exclude(*parts.policy.out_keys)
     own = example.to_dict()
-    if "collector" in saved:  # the numbers of trajectories, by TorchRL
+    if "collector" in saved:  # TorchRL's numbers of trajectories
         own["collector"] = {"traj_ids": example.get(keys.DONE).squeeze(-1).long()}
     check_columns(where, saved, own)
     steps = TensorDict(saved)
@@ -78,7 +78,7 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
 
 
 class CollectionError(Exception):
-    """Other processes cannot start or go on; told in one line."""
+    """Other processes cannot start or go on; the message is one line."""
 
 
 class WorkerDiedError(CollectionError):
@@ -94,7 +94,7 @@ class Collection:
     """
 
     package: ClassVar[str | None] = None  # an optional package that it needs; also the name of the extra
-    guarded_settings: ClassVar[tuple[str, ...]] = ()  # which can run code, read files or reach servers
+    guarded_settings: ClassVar[tuple[str, ...]] = ()  # settings that can run code, read files or reach servers
     has_workers: ClassVar[bool] = False  # whether other processes step the environments
     cpu_s: float = 0.0  # spent collecting in other processes
 
@@ -103,12 +103,12 @@ class Collection:
         """Collect a batch `[num_envs, steps_per_batch]`.
 
         Raises:
-            CollectionError: another process died, or this machine does not let it go on.
+            CollectionError: another process died, or a limit of this machine stops it.
         """
         raise NotImplementedError
 
     def notices(self) -> list[str]:
-        """Return the lines for the user since the last call, such as of a worker that was replaced."""
+        """Return the messages for the user since the last call, such as about a replaced worker."""
         return []
 
     @abstractmethod
@@ -125,7 +125,7 @@ class Collection:
         """Continue from a `state`.
 
         Raises:
-            ValueError: it is of another run, such as one of another number of environments.
+            ValueError: the state is of another run, for example with another number of environments.
         """
         raise NotImplementedError
 

@@ -1,4 +1,4 @@
-"""Which of this machine's limits keeps other processes from starting or from sharing memory."""
+"""Explain which limit of this machine keeps other processes from starting or from sharing memory."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ import os
 import resource
 
 _SHARED_MEMORY = "/dev/shm"  # where Linux keeps it
-# What Python and torch say of them where they raise no OSError.
+# Messages of Python and torch about these limits if they raise no OSError.
 _NO_FILES = ("Too many open files", "received 0 items of ancdata")
 _NO_PROCESSES = ("can't start new thread", "Resource temporarily unavailable")
 _NO_SPACE = ("No space left on device",)
 
 
 def limit_of(error: BaseException) -> str | None:
-    """Return in words which limit an error is about, and its cure; None if it is about none."""
+    """Return in words which limit an error is about and how to raise it; None if it is about no limit."""
     code = error.errno if isinstance(error, OSError) else None
     text = str(error) if isinstance(error, OSError | RuntimeError) else ""
 
-    def says(signs: tuple[str, ...]) -> bool:
+    def contains(signs: tuple[str, ...]) -> bool:
         return any(sign in text for sign in signs)
 
-    if code in (errno.EMFILE, errno.ENFILE) or says(_NO_FILES):
+    if code in (errno.EMFILE, errno.ENFILE) or contains(_NO_FILES):
         return f"too many open files (ulimit -n is {_soft(resource.RLIMIT_NOFILE)}; raise it, or use fewer workers)"
-    if code == errno.EAGAIN or says(_NO_PROCESSES):
+    if code == errno.EAGAIN or contains(_NO_PROCESSES):
         return f"too many processes (ulimit -u is {_soft(resource.RLIMIT_NPROC)}; raise it, or use fewer workers)"
-    if code in (errno.ENOSPC, errno.EDQUOT) or says(_NO_SPACE):
+    if code in (errno.ENOSPC, errno.EDQUOT) or contains(_NO_SPACE):
         return full_shared_memory()
     return None
 
 
 def full_shared_memory() -> str:
-    """Return in words that shared memory is full, and what to do."""
+    """Return a message that shared memory is full, and how to get more."""
     size = ""
     if os.path.isdir(_SHARED_MEMORY):
         disk = os.statvfs(_SHARED_MEMORY)

@@ -35,7 +35,7 @@ class MultiCollection(WorkerCollection):
     ) -> None:
         num_cpus = len(os.sched_getaffinity(0))
         if num_workers > num_cpus:
-            warn(f"collector.num_workers={num_workers}: more than the {num_cpus} CPUs there are, which they will share")
+            warn(f"collector.num_workers={num_workers}: more than the {num_cpus} CPUs, which the workers will share")
         # multiprocessing unblocks the signals when it starts this helper of its own.
         with modules_here_last():
             resource_tracker.ensure_running()

@@ -45,7 +45,7 @@ class RayCollection(WorkerCollection):
         max_restarts: NonNegativeInt = 0,
         address: str | None = None,
     ) -> None:
-        # It misses weights to send; `collect` is there for them.
+        # RayCollector warns that it has no weights to send; `collect` sends them.
         for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
             warnings.filterwarnings("ignore", message=warning)
         _connect(address, num_workers)
@@ -116,7 +116,7 @@ def _connect(address: str | None, num_workers: int) -> None:
     os.environ.setdefault("RAY_worker_niceness", "0")
     # Its C++ part prints a line a second while it waits for a cluster.
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "error")
-    # A local Ray has as many CPUs as it is told; with fewer than actors these would wait for ever.
+    # A local Ray takes `num_cpus` as given; with fewer CPUs than actors some actors would wait for ever.
     init: dict[str, Any] = {"address": "local", "num_cpus": num_workers, "include_dashboard": False}
     if address is not None:
         _check_answers(address)
@@ -124,12 +124,12 @@ def _connect(address: str | None, num_workers: int) -> None:
     on_sigterm = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     working_dir = os.getcwd()
     try:
-        # Ray has its workers search the working directory before all packages.
+        # Ray lets its workers look for modules in the working directory first, so leave it.
         os.chdir(Path(__file__).parents[3])
         # Ray ends its own processes by SIGTERM.
         with children_without(*(number for number in STOP_SIGNALS if number != signal.SIGTERM)):
             ray.init(**init, log_to_driver=False, logging_level="warning")
-    except Exception as error:  # of many classes
+    except Exception as error:  # Ray raises many classes of errors
         what = "does not start" if address is None else "does not answer"
         raise CollectionError(f"{_named(address)}: Ray {what} ({first_line(error)})") from error
     finally:
@@ -142,10 +142,10 @@ def _connect(address: str | None, num_workers: int) -> None:
 
 
 def _check_answers(address: str) -> None:
-    """Check that there is something at an address of the form `HOST:PORT` or `ray://HOST:PORT`.
+    """Check that a server answers at an address of the form `HOST:PORT` or `ray://HOST:PORT`.
 
     Raises:
-        CollectionError: there is nothing.
+        CollectionError: no server answers.
     """
     place = re.fullmatch(r"(?:ray://)?\[?([^\[\]/]+?)\]?:(\d+)", address)
     if place is None:

@@ -62,10 +62,10 @@ class SingleCollection(Collection):
         """Continue from a `state`.
 
         Raises:
-            ValueError: it is of another run, such as one of another number of environments.
+            ValueError: the state is of another run, for example with another number of environments.
         """
         saved = checked_state(state, self._parts)
-        if saved.env:  # else the episodes that the collector has just begun go on
+        if saved.env:  # else the collector continues the episodes that it has just begun
             self.env.set_env_state(saved.env)
         if saved.root is not None and self.env.keeps_episodes:
             root = self._collector._carrier

@@ -78,7 +78,7 @@ class ShardCollector(Collector):
     """TorchRL's collector of a worker's shard."""
 
     def __bool__(self) -> bool:
-        """Return True: Ray asks for it when it passes on an error, and an endless collector has no length."""
+        """Return True; without this method Ray would ask for the length, which an endless collector does not have."""
         return True
 
     def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
@@ -89,14 +89,14 @@ class ShardCollector(Collector):
 
         Raises:
             ProblemError: the problem broke its contract.
-            MemoryError: memory does not suffice.
+            MemoryError: the memory is too small.
             RemoteError: any other error of the environment.
         """
         try:
             return self.policy.receive(policy), self.next()
         except (ProblemError, MemoryError) as error:
             raise type(error)(str(error)) from None
-        except Exception as error:  # which may be of a class that the learner's process does not have
+        except Exception as error:  # the learner's process may not have its class
             summary = one_line(f"{type(error).__name__}: {error}")
             raise RemoteError(f"{summary}\n\nIn a worker:\n{traceback.format_exc()}") from None
 
@@ -107,7 +107,7 @@ class SharedMemoryCollector(ShardCollector):
     _is_shared = False
 
     def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
-        """Collect as a `ShardCollector`. Only the first batch is returned, then None: all are written to its memory."""
+        """Collect as a `ShardCollector`; return None after the first batch, whose memory holds all later batches."""
         cpu_s, batch = super().collect(policy)
         if self._is_shared or batch is None:
             return cpu_s, None
@@ -158,10 +158,10 @@ class EnvShard:
 
 
 class WorkingDir:
-    """A working directory, which a process that unpickles this object enters.
+    """A working directory, which a process enters by unpickling this object.
 
-    Classes of the user's own are then found there, after all installed packages, as in the run's process. On another
-    machine there may be no such directory.
+    The process then finds the user's own classes there, after all installed packages, as the run's process does. The
+    directory may be missing on another machine.
     """
 
     def __init__(self, path: str) -> None:
@@ -184,7 +184,7 @@ class RemoteShard:
     """An `EnvShard` for a process that does not share this one's working directory and search path.
 
     Attributes:
-        working_dir: comes first, since it is entered before the classes that the shard needs are looked for.
+        working_dir: the first attribute, so that the process enters it before it imports the classes of the shard.
         shard: the environments.
     """
 

@@ -23,7 +23,7 @@ from hpamdp.run.collection.limits import limit_of
 from hpamdp.run.collection.worker import EnvShard, RemoteError, packed
 from hpamdp.search_path import protect_children, unprotect_children
 
-_PATIENCE_S = 2.0  # for workers in the middle of a batch that nobody waits for any more
+_PATIENCE_S = 2.0  # for workers in the middle of a batch that is no longer needed
 
 _Returned = TypeVar("_Returned")
 
@@ -39,17 +39,16 @@ class WorkerCollection(Collection):
     learned from that one. What is collected does not depend on how long either takes. A batch that is on its way when
     the run is saved is saved with it.
 
-    Each worker has a collector of TorchRL's and a thread that waits for it. If a worker dies, the others keep their
-    episodes and what they have collected. Its replacement begins new episodes, with seeds of its own, and collects its
-    part of the batch from their beginning.
+    Each worker has a TorchRL collector and a thread that waits for it. If a worker dies, the others keep their episodes
+    and their part of the batch. Its replacement begins new episodes, with new seeds, and collects the missing part.
 
-    A subclass starts a worker in `_start`, and says in `_death` how it died.
+    A subclass starts a worker in `_start`, ends it in `_kill`, and explains its death in `_death`.
 
     Args:
         config, parts, frames: as for any collection.
-        num_workers: how many processes there are.
+        num_workers: number of processes.
         ahead: whether workers collect while the agent learns.
-        max_restarts: how many workers that died are replaced.
+        max_restarts: how many dead workers are replaced over the whole run.
     """
 
     has_workers: ClassVar[bool] = True
@@ -91,21 +90,21 @@ class WorkerCollection(Collection):
 
     @abstractmethod
     def _start(self, shard: EnvShard) -> Any:
-        """Start a worker and return TorchRL's collector of it, whose class is a `ShardCollector`."""
+        """Start a worker and return its TorchRL collector, which runs a `ShardCollector` there."""
         raise NotImplementedError
 
     @abstractmethod
     def _kill(self, worker: Any) -> None:
-        """End a worker in the middle of whatever it does."""
+        """End a worker at once."""
         raise NotImplementedError
 
     @abstractmethod
     def _death(self, worker: Any | None, error: Exception) -> str | None:
-        """Return in words how a worker died, if that is what an error of a call to it means.
+        """Return in words how a worker died; None if an error of a call to it has another cause.
 
         Args:
-            worker: TorchRL's collector; None while it starts.
-            error: that was raised.
+            worker: the worker's TorchRL collector; None while it starts.
+            error: the error that was raised.
         """
         raise NotImplementedError
 
@@ -113,11 +112,11 @@ class WorkerCollection(Collection):
         """Return the environments of a worker.
 
         Args:
-            worker: its number.
-            restart: 0 at first; for a replacement, the number of the restart.
+            worker: the worker's number.
+            restart: 0 for a first worker; the number of the restart for a replacement.
         """
         seed, first = self._config.run.seed, worker * self._size
-        # Other numbers than before if a run goes on, and those of no other worker.
+        # Each worker has its own random numbers, and other ones if a run is resumed.
         source = (seed, first, self._frames, restart) if restart else (seed, first, self._frames)
         exploration_seed, env_seed = map(int, np.random.SeedSequence(source).generate_state(2))
         return EnvShard(
@@ -131,11 +130,11 @@ class WorkerCollection(Collection):
             self._raise_explained(number, error)
 
     def _raise_explained(self, number: int, error: Exception) -> NoReturn:
-        """Raise an error of a worker: a death or a limit of the machine in one line, anything else as it is.
+        """Raise an error of a worker; a death or a limit of the machine gets a message of one line.
 
         Raises:
             WorkerDiedError: the worker died.
-            CollectionError: the machine does not let it go on.
+            CollectionError: a limit of the machine stops the worker.
         """
         if isinstance(error, ProblemError | MemoryError | RemoteError):
             raise error
@@ -151,7 +150,7 @@ class WorkerCollection(Collection):
         """Return what a call to a worker returns; if the worker dies, replace it and call again.
 
         Raises:
-            CollectionError: it died and may not be replaced, or this machine does not let it go on.
+            CollectionError: the worker died and is not replaced, or a limit of this machine stops it.
         """
         while True:
             try:
@@ -169,10 +168,10 @@ class WorkerCollection(Collection):
             self._raise_explained(number, error)
 
     def _count_restart(self, number: int, death: WorkerDiedError) -> None:
-        """Count the restart of a worker that died, and drop what is left of it.
+        """Count the restart of a worker that died, and remove its remains.
 
         Raises:
-            WorkerDiedError: there were as many restarts as are allowed.
+            WorkerDiedError: no more restarts are allowed.
         """
         with self._restarting:
             if self._restarts >= self._max_restarts:
@@ -185,21 +184,21 @@ class WorkerCollection(Collection):
         self._cpu_s[number] = 0.0
 
     def _on_all(self, call: Callable[[int], _Returned]) -> list[_Returned]:
-        """Call a function for each worker's number at the same time; return what it returns in their order."""
+        """Call a function with the number of every worker at the same time; return its results in their order."""
         futures = [self._threads.submit(call, number) for number in range(len(self._workers))]
         wait(futures)
         return [future.result() for future in futures]
 
     def notices(self) -> list[str]:
-        """Return a line for each worker that was replaced since the last call."""
-        told, self._notices = self._notices, []
-        return told
+        """Return a message for each worker that was replaced since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
 
     def next(self) -> TensorDictBase:
         """Send the policy's state, then collect a batch; with `ahead`, hand out the one on its way and begin another.
 
         Raises:
-            CollectionError: a worker died and may not be replaced, or this machine does not let it go on.
+            CollectionError: a worker died and is not replaced, or a limit of this machine stops it.
         """
         self._is_idle = False
         policy = packed(self._policy)
@@ -226,10 +225,6 @@ class WorkerCollection(Collection):
         assert collected is not None
         return collected
 
-    def _call(self, method: str) -> list[Any]:
-        """Return what a method of each worker's collector returns."""
-        return self._on_all(lambda number: self._on(number, lambda worker: _call(worker, method)))
-
     def state(self) -> dict[str, Any]:
         """Return the workers' states side by side; if one failed, the last ones that are known.
 
@@ -240,7 +235,7 @@ class WorkerCollection(Collection):
             return self._state
         try:
             states = self._on_all(lambda number: self._on(number, self._state_of))
-        except CollectionError:  # which the next batch will tell
+        except CollectionError:  # the next batch will raise it again
             return self._state
         state: dict[str, Any] = {"generators": [each["generator"] for each in states]}
         for name in states[0].keys() & {"env", "root"}:
@@ -265,7 +260,7 @@ class WorkerCollection(Collection):
             first = number * self._size
 
             def send_to(worker: Any) -> None:
-                if saved.env:  # else the episodes that the worker has just begun go on
+                if saved.env:  # else the worker continues the episodes that it has just begun
                     _call(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
                 if saved.root is not None and self._keeps_episodes:
                     _call(worker, "_carrier.update", _sliced(saved.root, first, self._size))
@@ -281,7 +276,7 @@ class WorkerCollection(Collection):
             self._coming = [_done(rows) for rows in coming.split(self._size)]
 
     def close(self) -> None:
-        """End the workers, after the batch that is on its way unless that takes long."""
+        """End the workers; wait a short time for the batch that is on its way."""
         _, running = wait(self._coming, _PATIENCE_S)
         self._max_restarts = 0
         for part, worker in zip(self._coming, self._workers, strict=False):
@@ -305,7 +300,7 @@ def _call(worker: Any, method: str, *arguments: Any) -> Any:
 
 
 def _done(batch: TensorDictBase) -> Future[TensorDictBase]:
-    """Return a batch as one that has been waited for."""
+    """Return a batch as a finished future."""
     future: Future[TensorDictBase] = Future()
     future.set_result(batch)
     return future
