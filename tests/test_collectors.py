@@ -36,7 +36,7 @@ from hpamdp.run.collection.worker import (
     WorkingDir,
     packed,
 )
-from hpamdp.run.collection.workers import WorkerCollection
+from hpamdp.run.collection.workers import WorkerCollection, _call
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
@@ -68,6 +68,10 @@ def share(folder, *overrides, first_env=0, num_envs=8, low=None):
 
 def leaves(batch):
     return {name: (leaf.shape, leaf.dtype) for name, leaf in batch.items(True, True)}
+
+
+def policies_of_workers(collection):
+    return collection._on_all(lambda number: _call(collection._workers[number], "policy.policy.state_dict"))
 
 
 def assert_same_state(one, other):
@@ -120,7 +124,7 @@ def test_what_was_learned_reaches_the_workers_before_their_next_batch(workers):
     now = parts.policy.state_dict()
     assert any(not torch.equal(value, now[name]) for name, value in before.items())
     collection.next()
-    for theirs in collection._call("policy.policy.state_dict"):
+    for theirs in policies_of_workers(collection):
         # A worker's selector has counted its own choices since.
         pending = {name: value for name, value in now.items() if name.endswith("pending")}
         assert_same_state(now, {**theirs, **pending})
@@ -203,7 +207,7 @@ def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(tmp_pa
         as_given = last.clone()
         assert parts.agent.learn(last)
         state = copy.deepcopy(collection.state())
-        (theirs,) = collection._call("policy.policy.state_dict")
+        (theirs,) = policies_of_workers(collection)
         assert_same_state(before, theirs)
         assert (last == as_given).all(), "the next batch is written elsewhere"
 
@@ -212,7 +216,7 @@ def test_batches_ahead_are_made_by_the_policy_from_before_the_last_update(tmp_pa
             is_on = ~one["next", "done"][:, -1, 0]
             assert torch.equal(one["next", "observation"][:, -1][is_on], following["observation"][:, 0][is_on])
         collection.state()
-        assert_same_state(parts.policy.state_dict(), *collection._call("policy.policy.state_dict"))
+        assert_same_state(parts.policy.state_dict(), *policies_of_workers(collection))
 
         collection.set_state(state)
         for batch in batches[1:]:
