@@ -68,7 +68,7 @@ _COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play"}
 # What Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
 _GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE"
-# What no change of the settings helps against: a full disk, limits of the process, a medium that is read only.
+# Errors that no other setting can avoid: a full disk, limits of the process, a medium that is read only.
 _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EROFS)
 _SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
 
@@ -123,7 +123,7 @@ def _main() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # TorchRL logs every replay buffer that it fills.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
-    # Hydra warns of a folder that is not there, which `read` refuses.
+    # Hydra warns about a missing folder, but `read` refuses it anyway.
     warnings.filterwarnings("ignore", message="provider=hydra.searchpath")
     try:
         _check_surroundings()
@@ -151,7 +151,7 @@ def _main() -> None:
 
 @contextmanager
 def _limits_told() -> Iterator[None]:
-    """Exit with 1 and one line if the process has too few files or too little memory, whichever library finds it."""
+    """Exit with 1 and one line if the process runs out of files or memory, whichever library raises the error."""
     try:
         yield
     except ConfigError:
@@ -167,7 +167,7 @@ def _limits_told() -> Iterator[None]:
 
 
 def _limit(error: BaseException) -> str | None:
-    """Return which limit of the process an error is about, if it is about one."""
+    """Return in words which limit of the process an error is about; None if it is about no limit."""
     text = str(error)
     if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE) or "Too many open files" in text:
         return "more open files, see ulimit -n"
@@ -182,14 +182,14 @@ def _check_surroundings() -> None:
     try:
         os.getcwd()
     except OSError as error:
-        raise ConfigError(f"the working directory is gone ({error.strerror}); cd to one that is there") from error
+        raise ConfigError(f"the working directory is gone ({error.strerror}); cd to another one") from error
     for word in sys.argv[1:]:
         if "\0" in word or word != word.encode(errors="ignore").decode():
             raise ConfigError(f"{word!r}: not written in UTF-8")
 
 
 def _completed(arguments: argparse.Namespace, conf: Path) -> argparse.Namespace:
-    """Add to the command line what it stands for: the choices of a saved run, a sweep's experiments and folder."""
+    """Complete the command line: the choices of a saved run, the experiments of a folder, the folder of their sweep."""
     _check_groups(arguments.overrides, conf)
     saved = _saved_choices(arguments, conf)
     if saved:
@@ -235,7 +235,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _LostOutputError(Exception):
-    """Text that the user asked for did not arrive, for the reason that is the cause."""
+    """Some text that the user asked for was not written; the cause is the stream's error."""
 
 
 def _check_shown() -> None:
@@ -378,7 +378,7 @@ def _saved_choices(arguments: argparse.Namespace, conf: Path) -> list[str]:
     if where == "checkpoint" and values.get("mode") != "eval":
         return []  # which is refused
     if arguments.multirun or (where == "resume" and source == AUTO):
-        return []  # the run is known by its words
+        return []  # the command line alone describes the run
     from hpamdp.run.resume import saved_choices  # takes seconds, which --help need not wait for
 
     given = {override.key_or_group for override in overrides}
@@ -455,8 +455,8 @@ def _is_choice(value: object) -> bool:
 def _run_job(cfg: DictConfig, start: str) -> float | None:
     """Run one job; return its score if it is one of a sweep."""
     put_working_directory_last()  # in a worker of a launcher, too
-    with suppress(OSError):  # whoever needs it will say so
-        resource_tracker.ensure_running()  # a process of Python's own, which starts while it is protected
+    with suppress(OSError):  # its first user reports the error
+        resource_tracker.ensure_running()  # a helper process of Python, started while children are protected
     unprotect_children()
     job = HydraConfig.get()
     if job.job.chdir:
@@ -490,7 +490,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
 
 
 def _go_on(cfg: DictConfig, output_dir: Path) -> int:
-    """Do what is left of the run in its folder, or start it there; return the exit code.
+    """Continue the run in its folder, or start it there; return the exit code.
 
     Raises:
         ConfigError: the folder holds the results of another run.
@@ -551,7 +551,7 @@ def _not_understood(word: str) -> str:
 
 
 def _as_text(word: str) -> str:
-    """Return `KEY=VALUE` as one types it where the value is a text."""
+    """Return `KEY=VALUE` quoted for the shell and Hydra, so that the value is a text."""
     key, _, value = word.partition("=")
     return setting(key, value)
 
@@ -563,7 +563,7 @@ def _missing_plugin(group: str, name: str, installed: Sequence[str]) -> str:
 
 
 def _first_lines(error: Exception, words: Sequence[str]) -> str:
-    """Return where a yaml file is wrong, or in a line what an error and its cause say."""
+    """Return in one line the place of an error in a yaml file, or the messages of an error and its cause."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
     if isinstance(error, UnicodeDecodeError):  # which does not name the file

@@ -8,7 +8,7 @@ import shlex
 import sys
 from pathlib import Path
 
-# Texts that neither Hydra's grammar nor a shell reads as something else.
+# Texts that Hydra's grammar and a shell read as they are.
 _PLAIN = re.compile(r"(?=.*/|[A-Za-z])[A-Za-z0-9_./-]+")
 _NO_TEXT = ("null", "true", "false", "inf", "nan")
 
@@ -23,13 +23,13 @@ def program() -> str:
 
 
 def setting(name: str, text: str) -> str:
-    """Return `name=text` as a word for the shell, whatever letters the text has."""
+    """Return `name=text` as one word for the shell; the text may have any letters."""
     is_plain = _PLAIN.fullmatch(text) and text.lower() not in _NO_TEXT
     return f"{name}={text}" if is_plain else for_shell(f"{name}={_for_hydra(text)}")
 
 
 def path_setting(name: str, path: Path) -> str:
-    """Return `name=path` as a word for the shell; a leading ~ does not stand for the home folder."""
+    """Return `name=path` as a word for the shell; a leading ~ is part of the name."""
     return setting(name, f"./{path}" if str(path).startswith("~") else str(path))
 
 

@@ -1,9 +1,9 @@
-"""Read what `torch.save` wrote: no code runs, and no more memory is taken than the file has bytes.
+"""Read files of `torch.save` without running code, and without taking more memory than the file has bytes.
 
 `torch.load(weights_only=True)` runs no code either. But it allocates the sizes that a file claims, decompresses members
 without a limit, and before torch 2.10 trusts the length of a storage. Here a file is first read as a description:
-nested values in which each tensor is a `SavedTensor`. The caller compares these with what it expects, and reads the
-tensors then.
+nested values with a `SavedTensor` in the place of each tensor. The caller checks the description before it reads the
+tensors.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-# How often the bytes of a storage may be used by tensors. A state dict names each shared weight several times.
+# How often tensors may use the bytes of a storage. A state dict names each shared weight several times.
 _MAX_USES = 16
 _DTYPES = {
     "DoubleStorage": torch.float64,
@@ -41,11 +41,11 @@ _MAX_DIMS = 16
 
 @dataclass(frozen=True)
 class SavedTensor:
-    """A tensor that has not been read yet: what it is, and where its numbers lie.
+    """The description of a tensor that has not been read yet.
 
     Attributes:
-        dtype, shape, stride, offset: as of a tensor.
-        record: the member of the archive with its storage.
+        dtype, shape, stride, offset: the tensor's.
+        record: the member of the archive that holds the tensor's numbers.
     """
 
     dtype: torch.dtype
@@ -63,7 +63,7 @@ class _Storage:
 
 
 def stored_members(file: IO[bytes], num_bytes: int) -> zipfile.ZipFile:
-    """Open a zip archive of `num_bytes` whose members are stored as they are.
+    """Open a zip archive of `num_bytes` whose members are stored without compression.
 
     Raises:
         ValueError: a member is compressed, has the name of another one, or is larger than the file.
@@ -112,7 +112,7 @@ class MemberFile(io.RawIOBase):
         return self._place
 
     def readinto(self, buffer: Any) -> int:
-        """Read into a buffer, and return how many bytes there were."""
+        """Read into a buffer, and return the number of bytes read."""
         self._file.seek(self._start + self._place)
         data = self._file.read(min(len(buffer), max(0, self.num_bytes - self._place)))
         buffer[: len(data)] = data
@@ -121,18 +121,18 @@ class MemberFile(io.RawIOBase):
 
 
 class TensorArchive:
-    """What `torch.save` wrote.
+    """An archive that `torch.save` wrote.
 
     Args:
         file: the archive.
-        num_bytes: of the file.
+        num_bytes: size of the file.
 
     Attributes:
-        state: what was saved, with a `SavedTensor` in the place of each tensor.
+        state: the saved value, with a `SavedTensor` in the place of each tensor.
 
     Raises:
-        ValueError, or another error of a damaged file: it is not what `torch.save` writes of dicts, lists, tuples,
-            strings, numbers and plain tensors.
+        ValueError, or another error of a damaged file: the file holds more than the dicts, lists, tuples, strings,
+            numbers and plain tensors that `torch.save` writes.
     """
 
     def __init__(self, file: IO[bytes], num_bytes: int) -> None:
@@ -149,7 +149,7 @@ class TensorArchive:
         """Read a tensor.
 
         Raises:
-            ValueError: it is bool with other bytes than 0 and 1.
+            ValueError: a bool tensor has other bytes than 0 and 1.
         """
         data = bytearray(self._archive.read(saved.record))
         dtype = torch.uint8 if saved.dtype == torch.bool else saved.dtype
@@ -176,8 +176,8 @@ class _Reader:
 
     Args:
         script: the instructions.
-        folder: of the archive's members.
-        sizes: bytes of each member.
+        folder: the folder of the archive's members.
+        sizes: number of bytes of each member.
     """
 
     def __init__(self, script: bytes, folder: str, sizes: Mapping[str, int]) -> None:
@@ -190,10 +190,10 @@ class _Reader:
         self._memo: dict[int, Any] = {}
 
     def read(self) -> Any:
-        """Return what was saved.
+        """Return the saved value.
 
         Raises:
-            ValueError: an instruction is not one of those, or a value is none that the archive has.
+            ValueError: an instruction is unknown, or a value does not fit the archive.
         """
         for instruction, argument, _ in pickletools.genops(self._script):
             self._follow(instruction.name, argument)
@@ -263,7 +263,7 @@ class _Reader:
         self._stack[-1].update(zip(values[::2], values[1::2], strict=True))
 
     def _again(self, number: int) -> Any:
-        """Return a value that occurs again, but no container, or the contents could grow exponentially."""
+        """Return a value that occurs again; refuse a container, because contents could grow exponentially."""
         value = self._memo[number]
         parts = value if isinstance(value, tuple) else ()
         if isinstance(value, dict | list) or not all(type(part) is int for part in parts):

@@ -18,7 +18,7 @@ from hpamdp.config import ConfigError
 from hpamdp.files import remove_link, replacing
 from hpamdp.shell import path_setting
 
-# The value of `resume` that goes on in the run's own folder, or starts there.
+# The value of `resume` that continues the run in its own folder, or starts it there.
 AUTO = "auto"
 # Files of a run that others read.
 CHECKPOINT_NAME = "checkpoint.zip"
@@ -30,7 +30,7 @@ METRICS_NAME = "metrics.csv"
 TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
 # Names of the pictures in the folder, which the environment chooses.
 FIGURES_NAME = ".figures"
-# The rest of what a run writes.
+# All other files that a run writes.
 DIVERGED_NAME = "checkpoint.diverged.zip"
 EVALUATION_NAME = "evaluation.npz"
 FILM_NAME = "episodes.gif"
@@ -88,10 +88,10 @@ def check_no_link(folder: Path) -> None:
 
 
 def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
-    """Refuse a folder that holds a run, unless it may be overwritten, or files that no run has written.
+    """Refuse a folder that holds files which no run has written, or a run, unless this may be overwritten.
 
     Raises:
-        ConfigError: it holds them.
+        ConfigError: the folder is refused.
     """
     marks = [name for name in _MARKS if (folder / name).exists()]
     if marks and not may_overwrite:
@@ -110,10 +110,10 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
 
 
 def check_no_training(folder: Path) -> None:
-    """Refuse to write an evaluation into a folder that holds a training.
+    """Refuse to write an evaluation into a folder that holds a training run.
 
     Raises:
-        ConfigError: it does.
+        ConfigError: the folder holds a training run.
     """
     names = (CHECKPOINT_NAME, POLICY_NAME, METRICS_NAME)
     if any((folder / name).exists() for name in names) or saved_config(folder).get("mode", "eval") != "eval":
@@ -123,7 +123,7 @@ def check_no_training(folder: Path) -> None:
 
 
 def saved_config(folder: Path) -> dict[str, Any]:
-    """Return the config of the run in a folder; an empty one if there is none, or none that can be read."""
+    """Return the config of the run in a folder; empty if it is missing or cannot be read."""
     try:
         config = yaml.safe_load((folder / CONFIG_NAME).read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
@@ -132,16 +132,16 @@ def saved_config(folder: Path) -> dict[str, Any]:
 
 
 def saved_summary(folder: Path) -> dict[str, Any]:
-    """Return the summary of the run in a folder; an empty one if there is none, or none that can be read."""
+    """Return the summary of the run in a folder; empty if it is missing or cannot be read."""
     try:
         summary = json.loads((folder / SUMMARY_NAME).read_text())
-    except (OSError, ValueError):  # not there, or cut off in the middle
+    except (OSError, ValueError):  # missing, or cut off in the middle
         return {}
     return summary if isinstance(summary, dict) else {}
 
 
 def mark_unfinished(folder: Path) -> None:
-    """Let the summary of a run that goes on in its own folder no longer say that the run is finished."""
+    """Set `finished` to false in the summary of a run that is continued in its own folder."""
     summary = saved_summary(folder)
     if summary.get("finished"):
         with replacing(folder / SUMMARY_NAME) as partial:
@@ -188,8 +188,8 @@ def _bring_back(folder: Path) -> None:
 def is_about_folder(error: OSError, folder: Path) -> bool:
     """Return whether the run's folder cannot be made or written to, or is gone.
 
-    An error of a write to an open file names no file. What processes share is no file of the run, and its errors are
-    told by the collection.
+    An error of a write to an open file names no file, so its number decides. The collection itself reports errors of
+    the memory that processes share.
     """
     if error.filename is not None:
         return Path(str(error.filename)).is_relative_to(folder)
@@ -197,7 +197,7 @@ def is_about_folder(error: OSError, folder: Path) -> bool:
 
 
 def written_by_a_run(folder: Path) -> list[Path]:
-    """Return what a run has written into its folder, with the files first that show that it is one."""
+    """Return the paths that a run has written into its folder; the files that mark a run come first."""
     names = [*_MARKS, *_OTHERS]
     with suppress(OSError, UnicodeDecodeError):
         listed = (folder / FIGURES_NAME).read_text().splitlines()

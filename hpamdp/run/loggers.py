@@ -70,8 +70,8 @@ class Guarded:
     """Passes everything to a logger until the logger raises an error; then warns once and drops the rest.
 
     Args:
-        name: of the logger, for the warning.
-        start: makes the logger. Its `ValueError` is a user's mistake and passes.
+        name: the logger's name, for the warning.
+        start: a function that makes the logger. Its `ValueError` is a user's mistake, and is raised.
     """
 
     def __init__(self, name: str, start: Callable[[], Logger]) -> None:
@@ -151,8 +151,8 @@ class CSVLogger:
 class TensorboardLogger:
     """Log to a TensorBoard event file.
 
-    The file is complete after each row, and its times are those of training. A resumed run writes its earlier rows
-    again, in place of the old events, which may go past the checkpoint that the run continues from. torch's
+    The file is complete after each row, and has the times of training. A resumed run deletes the old events, which may
+    go past its checkpoint, and writes its earlier rows again. torch's
     `SummaryWriter` is not used: it writes in a thread, whose errors are printed with a traceback.
 
     Args:
@@ -291,7 +291,7 @@ class WandbLogger:
                 resume="allow" if run_id is not None and chosen == "online" else None,
                 dir=str(output_dir),
                 config=config,
-                # A job of a sweep may have failed before it finished its run, which `init` would return otherwise.
+                # If an earlier job of a sweep failed before it finished its run, `init` would return that run.
                 reinit="finish_previous",
                 settings=wandb_settings,
             )

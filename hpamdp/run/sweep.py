@@ -68,7 +68,7 @@ class SweepDir(Callback):
 
 
 def _check_output_subdir(config: DictConfig) -> None:
-    """Exit if Hydra is to write its own files: it would do so before the run's folder is checked."""
+    """Exit if Hydra should write its own files, because it would write before the run's folder is checked."""
     given = config.hydra.output_subdir
     if given is not None:
         warn(f"hydra.output_subdir={given}: must be null; config.yaml in a run's folder has every value of the run")
@@ -82,7 +82,7 @@ class JobConfigs(ConfigLoaderImpl):
 
     Args:
         search_path: where the yaml files are.
-        first_job: number of the first job, which a search that goes on does not count from 0.
+        first_job: number of the first job; not 0 if a search is continued.
     """
 
     def __init__(self, search_path: ConfigSearchPath, first_job: int) -> None:
@@ -101,9 +101,9 @@ class JobConfigs(ConfigLoaderImpl):
 
 
 def _job_folder() -> Path:
-    """Return the current job's folder, and let Hydra's own settings have it and the job's number, too."""
+    """Return the current job's folder; write the folder and the job's number into Hydra's own settings, too."""
     hydra: Any = HydraConfig.get()
-    whole = hydra._get_root()  # in which the folder's name is resolved
+    whole = hydra._get_root()  # the folder's name is resolved in it
     number = hydra.job.num + hydra.sweep.first_job
     for settings in (whole.hydra, hydra):
         with read_write(settings):
@@ -186,7 +186,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))
         with suppress(OSError):
-            folder.rmdir()  # it stays if there is something in it
+            folder.rmdir()  # it stays if it is not empty
     except Exception as error:
         job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
         if isinstance(error, OSError) and is_about_folder(error, folder):
