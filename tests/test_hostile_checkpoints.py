@@ -21,7 +21,8 @@ from hpamdp.run import checkpoint
 from hpamdp.run.archive import TensorArchive
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.single import SingleCollection
-from hpamdp.run.train import Trainer, run
+from hpamdp.run.players import load_player
+from hpamdp.run.train import DivergedError, Trainer, run
 
 TINY = ["num_envs=4", "steps_per_batch=4", "total_frames=192", "eval.layouts=2", "eval.every=0", "log_every=1000"]
 # A learner with waiting rows under a selector with a replay.
@@ -39,7 +40,7 @@ class Opener:
 
     def __init__(self, words, folder):
         assert run(compose_config([*words, "checkpoint_every=64"]), folder, words) == 0
-        self.file = folder / "hostile.zip"
+        self.folder, self.file = folder, folder / "hostile.zip"
         with zipfile.ZipFile(folder / "checkpoint.zip") as archive:
             self.members = {name: archive.read(name) for name in archive.namelist()}
         self.manifest = json.loads(self.members.pop("manifest.json"))
@@ -169,7 +170,7 @@ def is_harmless(place, change):
     if place[-1] in ("foreach", "fused", "capturable", "differentiable", "decoupled_weight_decay"):
         return change in ("gone", "None")
     if place[0] == "root":  # counters, and what the next action replaces
-        return change in ("gone", "huge", "negative", "inf", "nan")
+        return change in ("gone", "huge", "negative", "inf", "nan") or (place, change) == (("root",), "None")
     optional = {"held", "scalars", "ended", "option_names", "last_score", "rows", "env", "frames", "cpu_s", "wall_s"}
     return bool({*place} & {*optional, "episode", "steps", "presses", "pending", "has_gauss"}) or change == "empty"
 
@@ -212,7 +213,11 @@ def test_other_contents_are_refused_in_one_line_and_change_nothing(opener):
     assert_all_refused(opener, step=97)
 
 
-KINDS = [["low=qpamdp", "high=linucb"], ["low=pets", "high=exp3"], ["low=hyar", "high=option_critic"]]
+KINDS = [
+    ["low=qpamdp", "high=linucb"],
+    ["low=pets", "high=exp3"],
+    ["low=hyar", "high=option_critic", "high.warmup_steps=16"],
+]
 OTHERS = [[f"low={low}", "high=ucb"] for low in TRAINED]
 
 
@@ -361,3 +366,38 @@ def test_an_archive_reads_what_torch_saved():
     data = packed(state)
     archive = TensorArchive(io.BytesIO(data), len(data))
     assert same(archive.filled(archive.state), state)
+
+
+def test_learners_are_taken_over_as_a_whole_or_not_at_all(opener):
+    """The second learner of `low.checkpoint` is wrong: the first one stays as it is, too."""
+    name = next(name for name in opener.states["agent.pt"] if name.startswith("learners.1.critic"))
+    changed = {**opener.states["agent.pt"], name: torch.zeros(3, 3)}
+    with pytest.raises(ConfigError, match="does not fit"):
+        opener.resume(agent=changed)
+    before = opener.all_of_agent()
+    with pytest.raises(ConfigError, match=r"^low\.checkpoint=.*of another class or size than low") as error:
+        checkpoint.load_learners(opener.file, opener.parts.agent, opener.parts.device)
+    assert "\n" not in str(error.value)
+    assert same(opener.all_of_agent(), before)
+
+
+@pytest.mark.parametrize("entry", ["frames", "wall_s", "last_score", "config", "option_names"])
+@pytest.mark.parametrize("value", ["text", [1], math.inf, {"a": 1}, True])
+def test_a_policy_with_other_progress_is_refused(entry, value, opener, tmp_path):
+    if (entry, value) == ("config", {"a": 1}):
+        return
+    saved = torch.load(opener.folder / "policy.pt", weights_only=True)
+    saved["progress"] = json.dumps({**json.loads(saved["progress"]), entry: value})
+    torch.save(saved, tmp_path / "policy.pt")
+    with pytest.raises(ConfigError, match="damaged, or not a checkpoint") as error:
+        load_player(str(tmp_path / "policy.pt"), [])
+    assert "\n" not in str(error.value)
+
+
+def test_weights_that_overflowed_are_not_saved(opener):
+    weight = next(opener.parts.agent.parameters())
+    with torch.no_grad():
+        weight.view(-1)[0] = torch.inf
+    with pytest.raises(DivergedError, match="is inf"):
+        opener.trainer.save(opener.collection)
+    opener.resume()

@@ -372,8 +372,8 @@ class HierarchicalAgent(nn.Module):
         return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
 
     @torch.no_grad()
-    def replay_rows(self, name: str, steps: TensorDictBase) -> TensorDictBase:
-        """Return the rows `[N]` that a replay buffer would store of some steps.
+    def replay_rows(self, name: str, steps: TensorDictBase) -> TensorDictBase | None:
+        """Return the rows `[N]` that a replay buffer would store of some steps; None if its owner does not say.
 
         Args:
             name: the buffer's name in `stateful`.
@@ -384,11 +384,11 @@ class HierarchicalAgent(nn.Module):
             batch = self.next_options.with_ends(batch)
         owner, _, part = name.partition("_")
         if owner == "selector":
-            return self._level(owner).replay_rows(batch)[part]
+            return self._level(owner).replay_rows(batch).get(part)
         for i, (_, learner, seen, _) in enumerate(self._shares(batch)):
             if owner == f"learner{i}":
-                return learner.replay_rows(seen)[part]
-        raise KeyError(name)
+                return learner.replay_rows(seen).get(part)
+        return None
 
     def check_rows(self, name: str, rows: TensorDictBase, example: TensorDictBase) -> None:
         """Refuse invalid saved rows of a replay buffer.

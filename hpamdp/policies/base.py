@@ -245,7 +245,8 @@ class Selector(TensorDictModuleBase):
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by name.
 
-        Each value is an optimizer or a TorchRL `ReplayBuffer`. If there is a buffer, `replay_rows` returns its rows.
+        Each value is an optimizer, a TorchRL `ReplayBuffer`, or has a `state_dict` of constant names and shapes. For a
+        buffer, override `replay_rows`, too.
         """
         return {}
 
@@ -267,7 +268,8 @@ class Selector(TensorDictModuleBase):
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
         """Return the rows `[N]` that each replay buffer of `stateful` would store of a collected batch `[*B, T]`.
 
-        The rows of a checkpoint must have the same names, shapes and dtypes.
+        The rows of a checkpoint must have the same names, shapes and dtypes. If a buffer has no entry here, its saved
+        rows are not compared.
         """
         return {}
 

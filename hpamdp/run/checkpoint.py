@@ -41,6 +41,7 @@ from hpamdp.run.checks import (
     SavedPart,
     check_form,
     check_generator,
+    check_like,
     check_moments,
     check_names,
     check_optimizer,
@@ -237,7 +238,6 @@ def load(
     """
     misfit = f"{file}: does not fit this agent, whose sizes env sets"
     states: dict[str, dict[str, Any]] = {}
-    optimizers: dict[str, dict[str, Any]] = {}
     replays: dict[str, _Replay] = {}
     with _Opened(file) as opened:
         stateful = agent.stateful() if with_training else {}
@@ -247,9 +247,7 @@ def load(
             raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
         with _named(misfit):
             networks = opened.state("agent", opened.part("agent"), agent, device)
-            for name, part in stateful.items():
-                if name not in buffers:
-                    optimizers[name] = opened.optimizer(name, part, device)
+            others = {name: opened.other(name, stateful[name], device) for name in stateful.keys() - buffers.keys()}
             for name in opened.names & {*buffers}:
                 replays[name] = opened.replay(name, buffers[name], agent, steps)
         with _named(f"{file}: damaged, or not a checkpoint of this program"):
@@ -259,7 +257,7 @@ def load(
             generators = Generators.of(opened.filled("rng")) if with_training else None
         progress = opened.progress
     agent.load_state_dict(networks)
-    for name, state in optimizers.items():
+    for name, state in others.items():
         stateful[name].load_state_dict(state)
     for name, buffer in buffers.items():
         if name in replays:
@@ -422,6 +420,18 @@ class _Opened:
                 part.check_state({key.removeprefix(start): state[key] for key in state if key.startswith(start)})
         return state
 
+    def other(self, name: str, part: Any, device: torch.device) -> dict[str, Any]:
+        """Return a state dict that a part of `stateful` other than a replay buffer can load.
+
+        Raises:
+            ValueError: it is of another part, or holds numbers that make no sense.
+        """
+        if isinstance(part, torch.optim.Optimizer):
+            return self.optimizer(name, part, device)
+        saved = self.part(name)
+        check_like(name, saved, part.state_dict())
+        return _strings(self._parts[name].filled(saved, device))
+
     def optimizer(self, name: str, optimizer: torch.optim.Optimizer, device: torch.device) -> dict[str, Any]:
         """Return a state dict that an optimizer can load.
 
@@ -450,6 +460,8 @@ class _Opened:
             return _Replay(None, writer)
         assert steps is not None
         example = agent.replay_rows(name, steps)
+        if example is None:  # whose owner does not say what it stores
+            return _Replay(TensorDict(self.filled(name, steps.device)["rows"], [saved.num_rows]), writer)
         check_rows(f"{name}.rows", saved.rows, example.to_dict(), saved.num_rows)
         rows = TensorDict(self._parts[name].filled(saved.rows, example.device), batch_size=[saved.num_rows])
         agent.check_rows(name, rows, example)

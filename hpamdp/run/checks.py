@@ -154,6 +154,21 @@ def check_columns(where: str, saved: Any, own: Mapping[str, Any], *, any_rows: b
             check_form(f"{where}.{name}", saved[name], value, any_rows=any_rows)
 
 
+def check_like(where: str, saved: Any, own: Any) -> None:
+    """Refuse nested values of other names, types or shapes than those of a part of the run.
+
+    Raises:
+        ValueError: with the first one.
+    """
+    if isinstance(own, Tensor):
+        check_form(where, saved, own)
+    elif isinstance(own, Mapping):
+        for name, value in check_names(saved, own).items():
+            check_like(f"{where}.{name}", value, own[name])
+    elif type(saved) is not type(own):
+        raise ValueError(f"{where} is {type(saved).__name__}, but must be {type(own).__name__}")
+
+
 def check_names(saved: object, own: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return a state dict of the same names as another one.
 

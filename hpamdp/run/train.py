@@ -337,8 +337,11 @@ class Trainer:
         """Write the checkpoint and the networks alone.
 
         Raises:
-            DivergedError: a weight is not a number.
+            DivergedError: a weight is not finite, or another number NaN.
         """
+        for name, weight in self.parts.agent.named_parameters():
+            if not weight.isfinite().all():
+                raise DivergedError(f"{name} is {'NaN' if weight.isnan().any() else 'inf'}")
         for name, value in self.parts.agent.state_dict().items():
             if isinstance(value, torch.Tensor) and value.is_floating_point() and value.isnan().any():
                 raise DivergedError(f"{name} is NaN")
