@@ -146,7 +146,7 @@ def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained
         make(make_config([*SMALL, *words.split(), f"low.checkpoint={trained}"]), tmp_path)
     line = str(error.value)
     assert line.startswith(f"low.checkpoint={trained / 'checkpoint.zip'}: ")
-    assert "it holds 2 learners, but this agent has 1" in line or "of another class or size than low: " in line
+    assert "it holds 2 learners, but this agent has 1" in line or "of another class or size than low (" in line
     assert "\n" not in str(error.value)
 
 

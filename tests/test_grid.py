@@ -153,13 +153,14 @@ def test_an_agent_reloaded_from_a_checkpoint_goes_on_as_if_it_had_never_stopped(
     parts.agent.learn(collected)
     file = tmp_path / checkpoint.FILE_NAME
     states = {"collection": {"env": parts.env.env_state()}, "recorder": {}}
-    checkpoint.save(file, parts.agent, states, {"frames": 320, "config": {}})
+    progress = {"frames": 320, "config": {}, "wall_s": 1.0, "cpu_s": 1.0, "last_score": None}
+    checkpoint.save(file, parts.agent, states, progress)
 
     other = make(high, low, tmp_path)
     torch.manual_seed(99)
     saved = checkpoint.load(file, other.agent, other.device, with_training=True)
     other.env.set_env_state(saved.states["collection"]["env"])
-    assert checkpoint.progress_of(file) == {"frames": 320, "config": {}}
+    assert checkpoint.progress_of(file) == progress
     results = []
     for one in (other, parts):
         torch.manual_seed(5)
