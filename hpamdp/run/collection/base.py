@@ -63,7 +63,7 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
     else:
         example = example.exclude("next")
         if keys.DISCRETE not in TensorDict(saved).keys(include_nested=True):  # before the first step
-            example = example.exclude(*parts.policy.out_keys)
+            example = example.exclude(*parts.policy.out_keys).filter_empty_()
     own = example.to_dict()
     if "collector" in saved:  # TorchRL's numbers of trajectories
         own["collector"] = {"traj_ids": example.get(keys.DONE).squeeze(-1).long()}
