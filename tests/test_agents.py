@@ -91,7 +91,7 @@ def test_the_words_of_eval_take_the_agent_from_its_folder():
     assert file == FOLDER / "linucb_hppo" / "policy.pt"
 
 
-def test_the_summary_of_somebody_else_gives_a_score_or_none(tmp_path):
+def test_a_foreign_summary_gives_a_score_or_none(tmp_path):
     player = SimpleNamespace(agent=SimpleNamespace(portable=dict), config=make_config(["high=none"]))
     for text in ('{"score": NaN}', '{"score": "<b>"}', "[1]", "{}", "[" * 99_999, '{"score": null}', '{"score": true}'):
         (tmp_path / "summary.json").write_text(text)

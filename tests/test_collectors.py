@@ -394,7 +394,7 @@ def test_an_error_in_a_workers_environment_is_no_death(error, kind, text, tmp_pa
         (ValueError("No space left on device"), None),
     ],
 )
-def test_a_limit_of_the_machine_is_told_with_its_cure(error, words, tmp_path, monkeypatch):
+def test_a_limit_of_the_machine_is_reported_with_its_cure(error, words, tmp_path, monkeypatch):
     assert limit_of(error) is None if words is None else words in limit_of(error)
     if words is not None:
         monkeypatch.setattr(Mortal, "_start", lambda self, shard: (_ for _ in ()).throw(error))
@@ -406,7 +406,7 @@ def test_a_limit_of_the_machine_is_told_with_its_cure(error, words, tmp_path, mo
 @pytest.mark.parametrize(
     "address", ["127.0.0.1:1", "ray://127.0.0.1:1", "no.such.host.invalid:6379", "localhost:99999"]
 )
-def test_a_cluster_that_does_not_answer_is_told_in_one_line(address):
+def test_a_cluster_that_does_not_answer_is_reported_in_one_line(address):
     with pytest.raises(CollectionError, match=f"^collector.address={address}: does not answer") as raised:
         _check_answers(address)
     assert "\n" not in str(raised.value)
@@ -524,7 +524,7 @@ def test_a_run_goes_on_after_its_workers_deaths_if_it_may(collector, way, mortal
 
 @pytest.mark.slow
 @pytest.mark.parametrize("collector", WORKERS)
-def test_a_problem_in_a_worker_is_told_in_one_line_and_what_was_learned_is_saved(collector, mortal, tmp_path):
+def test_a_problem_in_a_worker_is_reported_in_one_line_and_what_was_learned_is_saved(collector, mortal, tmp_path):
     with pytest.raises(ConfigError, match=r"^env: GymnasiumEnv: mortal:Mortal: environment \d: gave an observation"):
         run(compose_config([*mortal("problem"), f"collector={collector}", "total_frames=6400"]), tmp_path / "run")
     assert checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] == 544

@@ -139,7 +139,7 @@ def test_all_problems_come_in_one_line():
         ("low", "hpamdp.policies.shared.replay.ReplayLearner", "low=hyar: ReplayLearner is abstract; choose one of "),
     ],
 )
-def test_a_class_that_is_none_of_the_kind_is_told_in_one_line(group, target, complaint):
+def test_a_class_of_another_kind_is_refused_in_one_line(group, target, complaint):
     cfg = compose_config([])
     cfg[group]._target_ = target
     with pytest.raises(ConfigError) as error:
@@ -154,7 +154,7 @@ class NotToBeSet(Random):
         raise AssertionError(freeze)
 
 
-def test_an_argument_called_as_a_value_of_the_run_in_its_group_is_refused_in_one_line():
+def test_an_argument_with_the_name_of_a_value_of_the_run_is_refused_in_one_line():
     cfg = compose_config(["low=random"])
     cfg.low._target_ = f"{__name__}.NotToBeSet"
     with pytest.raises(
@@ -171,7 +171,7 @@ def test_an_argument_called_as_a_value_of_the_run_in_its_group_is_refused_in_one
         (["hydra.searchpath=[/nowhere]"], "hydra.searchpath=/nowhere: there is no such folder"),
     ],
 )
-def test_what_hydra_leaves_out_in_silence_is_refused_in_one_line(words, complaint):
+def test_a_missing_recipe_or_folder_is_refused_in_one_line(words, complaint):
     with pytest.raises(ConfigError) as error:
         make_config(words)
     assert str(error.value).startswith(complaint) and "\n" not in str(error.value)

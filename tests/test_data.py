@@ -207,7 +207,7 @@ def masked(row, name=keys.ACTION_MASK):
         (masked(3, ("next", keys.ACTION_MASK)), MASKED, "row 3: next.action_mask[0] is false, but must be true for"),
     ],
 )  # fmt: skip
-def test_a_wrong_value_in_a_data_set_is_told_with_its_row(rows, specs, said):
+def test_a_wrong_value_in_a_data_set_is_refused_with_its_row(rows, specs, said):
     with pytest.raises(DataError) as refused:
         Demonstrations(rows).check(specs)
     assert said in str(refused.value) and "\n" not in str(refused.value)
@@ -262,7 +262,7 @@ def test_right_rows_pass_the_check():
     Demonstrations(masked([])).check(MASKED)
 
 
-def test_wrong_decisions_are_told_with_their_row():
+def test_wrong_decisions_are_refused_with_their_row():
     rows = with_option(0, 0, 1, 1, 1)
     given = with_option_sums(rows)[rows["next", keys.DONE].squeeze(-1)]
     Demonstrations(rows, decisions=given).check(WITH_OPTIONS)
@@ -393,9 +393,7 @@ SPOILS = {
 
 
 @pytest.mark.parametrize("said", SPOILS)
-def test_a_minari_data_set_of_somebody_else_runs_nothing_and_is_refused_in_a_line(
-    workshop_id, tmp_path, monkeypatch, said
-):
+def test_a_foreign_minari_data_set_runs_no_code_and_is_refused_in_one_line(workshop_id, tmp_path, monkeypatch, said):
     pytest.importorskip("minari")
     SPOILS[said](exported(tmp_path, monkeypatch, workshop_id))
     with pytest.raises(DataError) as refused:

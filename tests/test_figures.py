@@ -199,7 +199,7 @@ def spoil_compressed(folder):
         (lambda folder: (folder / "summary.json").symlink_to("/dev/zero"), "is a device"),
     ],
 )
-def test_files_of_somebody_else_run_nothing_and_leave_their_figures_out(tmp_path, capsys, spoil, said):
+def test_foreign_files_run_no_code_and_their_figures_are_left_out(tmp_path, capsys, spoil, said):
     spoil(tmp_path)
     assert names(tmp_path) == []
     warning = capsys.readouterr().err

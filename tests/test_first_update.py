@@ -51,7 +51,7 @@ def test_the_last_batch_counts_as_a_whole(tmp_path):
         (["high=meta_critic", "high.warmup_decisions=60", "high.updates_per_decision=0.1", "low=random"], ["high"]),
     ],
 )
-def test_a_run_names_what_has_made_no_update(words, without, tmp_path, capsys):
+def test_a_run_names_the_parts_without_an_update(words, without, tmp_path, capsys):
     given = [*TINY, "total_frames=128", *words]
     assert run(compose_config(given), tmp_path, given) == 0
     assert json.loads((tmp_path / "summary.json").read_text())["without_update"] == without
@@ -59,7 +59,7 @@ def test_a_run_names_what_has_made_no_update(words, without, tmp_path, capsys):
     assert lines == ([f"no update was made: {', '.join(without)}"] if without else [])
 
 
-def test_optimizers_tell_whether_they_have_stepped_if_they_can():
+def test_optimizers_with_a_state_show_whether_they_have_stepped():
     weight = torch.nn.Parameter(torch.ones(1))
     adam, plain = torch.optim.Adam([weight]), torch.optim.SGD([weight])
     assert have_stepped({}) and have_stepped({"plain": plain}) and not have_stepped({"adam": adam, "plain": plain})

@@ -110,7 +110,7 @@ class Misplaced(Masked):
 @pytest.mark.parametrize(
     "where", ["info", "nested info", "late info", "attribute", "attribute at reset", "nested observation"]
 )
-def test_a_mask_in_a_place_that_is_not_read_is_told_in_one_line(where, name):
+def test_a_mask_in_a_place_that_is_not_read_is_reported_in_one_line(where, name):
     kind = "option_mask" if name == "option_masks" else "action_mask"
     expected = rf"^GymnasiumEnv: .*gave an {kind} as .*{name}.*, which is not read; give it as {kind} in a Dict of obs"
     with pytest.raises(ValueError, match=expected):
@@ -128,7 +128,7 @@ def with_method() -> gymnasium.Env:
     return gymnasium.wrappers.OrderEnforcing(Methods(Masked(source="none")))
 
 
-def test_a_method_that_gives_a_mask_is_told_in_one_line_unless_masks_are_ignored():
+def test_a_method_that_gives_a_mask_is_reported_in_one_line_unless_masks_are_ignored():
     gymnasium.register("with-method-v0", entry_point=with_method)
     for options in ({}, {"id": "with-method-v0", "entry_point": None}):
         arguments = {"entry_point": f"{__name__}:with_method", "max_steps": 5, **options}
@@ -160,7 +160,7 @@ def test_a_mask_that_allows_nothing_is_told_in_one_line():
         (["slow", "slow", "fast"], "has a name twice: slow, slow, fast"),
     ],
 )
-def test_names_of_options_that_are_no_list_of_names_are_told_in_one_line(names, said, monkeypatch):
+def test_names_of_options_that_are_no_list_of_names_are_reported_in_one_line(names, said, monkeypatch):
     monkeypatch.setattr(Masked, "option_names", names)
     with pytest.raises(ValueError, match=re.escape(f"Masked: option_names {said}")):
         make(form="dict")

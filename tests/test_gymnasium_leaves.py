@@ -68,7 +68,7 @@ PARTS = spaces.Dict(a=spaces.Box(-9, 9, (2,)), b=spaces.Dict(c=spaces.Box(-9, 9,
         (spaces.Tuple([UNIT, UNIT]), "ab", "without its entry 0"),
     ],
 )  # fmt: skip
-def test_what_a_space_does_not_hold_is_refused_in_a_line_that_names_the_leaf(space, value, complaint):
+def test_a_value_outside_its_space_is_refused_in_a_line_that_names_the_leaf(space, value, complaint):
     with warnings.catch_warnings(), pytest.raises(ProblemError, match=complaint) as raised:
         warnings.simplefilter("error")
         ObservationSpace(space, "bounds").flat(value)
@@ -94,7 +94,7 @@ def test_what_a_space_does_not_hold_is_refused_in_a_line_that_names_the_leaf(spa
         (spaces.Box(-1.0, 1.0, ()), np.float64(0.5), [0.5]),
     ],
 )
-def test_what_a_space_holds_is_taken_whatever_its_dtype(space, value, vector):
+def test_a_value_inside_its_space_is_accepted_in_any_dtype(space, value, vector):
     assert ObservationSpace(space, "none").flat(value).tolist() == list(vector)
 
 

@@ -98,14 +98,14 @@ def test_the_limit_of_a_spec_is_applied_if_no_wrapper_does_so(options, length):
 
 
 @pytest.mark.parametrize(("limits", "given", "length"), [([3], None, 3), ([5, 2], None, 2), ([3], 5, 3), ([3], 2, 2)])
-def test_of_several_limits_the_lowest_counts(limits, given, length, monkeypatch):
+def test_the_lowest_of_several_limits_counts(limits, given, length, monkeypatch):
     monkeypatch.setattr(sys.modules[__name__], "made", lambda: wrapped(*limits), raising=False)
     assert episode_length(GymnasiumEnv(entry_point=f"{__name__}:made", max_steps=given)) == length
 
 
 @pytest.mark.parametrize("limit", [0, -5, "ten", 10.0, True, float("nan"), [3]])
 @pytest.mark.parametrize("name", ["Limited", "OldLimited"])
-def test_a_limit_that_is_no_number_of_steps_is_told_in_one_line(name, limit):
+def test_a_limit_that_is_no_number_of_steps_is_reported_in_one_line(name, limit):
     expected = (
         r"imited: its spec has max_episode_steps=.*, which must be a whole number of at least 1; set env.max_steps$"
     )
@@ -114,12 +114,12 @@ def test_a_limit_that_is_no_number_of_steps_is_told_in_one_line(name, limit):
 
 
 @pytest.mark.parametrize("limit", [None, -1])
-def test_no_limit_is_asked_for(limit):
+def test_without_a_limit_the_line_asks_for_one(limit):
     with pytest.raises(ValueError, match=r"has no time limit of its own; set env\.max_steps"):
         GymnasiumEnv(entry_point=f"{__name__}:Limited", kwargs={"limit": limit})
 
 
-def test_a_registered_limit_that_is_no_number_of_steps_is_told_in_one_line():
+def test_a_registered_limit_that_is_no_number_of_steps_is_reported_in_one_line():
     gymnasium.register("Wrongly-v0", entry_point=Toy, max_episode_steps=0)
     try:
         with pytest.raises(ValueError, match=r"^GymnasiumEnv: Wrongly-v0: .*max_episode_steps"):
@@ -129,7 +129,7 @@ def test_a_registered_limit_that_is_no_number_of_steps_is_told_in_one_line():
 
 
 @pytest.mark.parametrize("where", ["constructor", "option_names", "import"])
-def test_an_environment_that_ends_the_program_while_it_is_built_is_told_in_one_line(where, tmp_path, monkeypatch):
+def test_an_environment_that_ends_the_program_while_it_is_built_is_reported_in_one_line(where, tmp_path, monkeypatch):
     words = [*WORDS, f"env.kwargs={{where:{where}}}"]
     if where == "import":
         (tmp_path / "leaving_at_once.py").write_text("import sys\nsys.exit(0)\n")
@@ -141,14 +141,14 @@ def test_an_environment_that_ends_the_program_while_it_is_built_is_told_in_one_l
     assert line.endswith("called sys.exit(0), which stopped the run") and ".py, line " in line and "\n" not in line
 
 
-def test_a_reward_of_an_evaluation_that_is_not_finite_is_told_in_one_line(tmp_path, monkeypatch):
+def test_a_reward_of_an_evaluation_that_is_not_finite_is_reported_in_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(Toy, "step", lambda self, action: (self._observation(), float("nan"), False, False, {}))
     words = [word for word in WORDS if "entry_point" not in word]
     with pytest.raises(ConfigError, match=r"^env: GymnasiumEnv: .*: the return of evaluation episode 0 is nan$"):
         run(compose_config([*words, "env.entry_point=toy_environments:Toy"]), tmp_path)
 
 
-def test_an_environment_that_ends_the_program_later_is_told_in_one_line(capsys):
+def test_an_environment_that_ends_the_program_later_is_reported_in_one_line(capsys):
     for where in ("reset", "step", "close"):
         env = GymnasiumEnv(2, entry_point=f"{__name__}:Leaving", kwargs={"where": where}, max_steps=3)
         if where == "close":

@@ -238,7 +238,7 @@ def test_a_download_replaces_a_link_that_leads_nowhere_and_writes_through_none(s
         (lambda path: path.mkdir(), "is a folder, but must be a regular file"),
     ],
 )
-def test_a_place_that_is_no_file_is_told_in_a_line_before_anything_is_fetched(server, tmp_path, capsys, make, said):
+def test_a_place_that_is_no_file_is_reported_in_a_line_before_anything_is_fetched(server, tmp_path, capsys, make, said):
     target = tmp_path / "people.mat"
     make(target)
     assert said in error_of(capsys, "download", "--url", address(server), "--to", target)

@@ -233,7 +233,7 @@ def test_replay_buffer_made_once_is_found_again(path, tmp_path):
         (lambda folder: nan(folder / "observation.memmap"), r"row 0: observation\[0\] is nan, but must be finite"),
     ],
 )
-def test_a_folder_of_rows_from_somebody_else_runs_nothing_and_is_refused_in_a_line(path, tmp_path, spoil, said):
+def test_a_foreign_folder_of_rows_runs_no_code_and_is_refused_in_one_line(path, tmp_path, spoil, said):
     checksum = hashlib.sha256(path.read_bytes()).hexdigest()
     arguments = dict(path=path, root=tmp_path, checksum=checksum, best_people=1, successes=True)
     folder = HumanExperienceReplay(4, **arguments).data_path

@@ -160,7 +160,7 @@ def test_two_servers_store_an_episode_once(tmp_path):
     assert len(path.read_text().splitlines()) == 1 and len((tmp_path / "kept.jsonl").read_text().splitlines()) == 2
 
 
-def test_a_lock_that_is_held_is_told_in_time_and_the_episode_can_be_sent_again(tmp_path, monkeypatch):
+def test_a_lock_that_is_held_is_reported_in_time_and_the_episode_can_be_sent_again(tmp_path, monkeypatch):
     monkeypatch.setattr(page_server, "_LOCK_PATIENCE", 0.2)
     with serving(tmp_path / "a.jsonl") as server:
         with FileLock(tmp_path / ".a.jsonl.lock"):
@@ -169,7 +169,7 @@ def test_a_lock_that_is_held_is_told_in_time_and_the_episode_can_be_sent_again(t
         assert send(server, EPISODES[0])[0] == 201
 
 
-def test_links_in_a_folder_of_somebody_else_empty_no_file(tmp_path):
+def test_links_in_a_foreign_folder_empty_no_file(tmp_path):
     (tmp_path / "mine").write_text("precious")
     (tmp_path / ".a.jsonl.lock").symlink_to("mine")
     with pytest.raises(EpisodeError, match=r"\.a\.jsonl\.lock: is a link; remove it"):
@@ -180,7 +180,7 @@ def test_links_in_a_folder_of_somebody_else_empty_no_file(tmp_path):
     assert (tmp_path / "mine").read_text() == "precious"
 
 
-def test_a_place_that_cannot_be_written_to_is_told_at_the_start(tmp_path, monkeypatch):
+def test_a_place_that_cannot_be_written_to_is_reported_at_the_start(tmp_path, monkeypatch):
     monkeypatch.setattr(page_server.os, "access", lambda path, mode: False)
     with pytest.raises(EpisodeError, match="cannot be written to"):
         EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))

@@ -552,7 +552,7 @@ def test_the_scale_of_a_single_step_or_of_equal_ones_is_the_lower_bound():
         assert scale_of(torch.full((num, 2), 5.0)).tolist() == pytest.approx([0.01, 0.01])
 
 
-def test_while_nothing_is_planned_the_value_is_that_of_the_one_known_reward():
+def test_before_planning_the_value_assumes_the_only_known_reward():
     learner = make()
     learn(learner, random_batch(64, reward=-torch.ones(64), terminated=torch.zeros(64, dtype=torch.bool)))
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -561,7 +561,7 @@ def test_while_nothing_is_planned_the_value_is_that_of_the_one_known_reward():
 
 
 @pytest.mark.parametrize(("reward", "is_good"), [(1.0, False), (-1.0, True)])
-def test_it_plans_to_survive_or_to_reach_an_end_although_every_reward_is_the_same(reward, is_good):
+def test_plans_avoid_or_reach_terminations_if_every_reward_is_the_same(reward, is_good):
     """Action 1 ends the episode if its first parameter is above the state's first entry; nothing else does."""
     torch.manual_seed(0)
     learner = make(warmup_frames=64, lr=5e-3)

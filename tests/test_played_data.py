@@ -195,7 +195,7 @@ def changed(episode, **fields):
         (lambda path: os.truncate(os.open(path, os.O_CREAT | os.O_WRONLY), 2**33), "may have at most"),
     ],
 )
-def test_what_is_no_file_of_episodes_is_refused_in_a_line_and_blocks_nobody(tmp_path, make, said):
+def test_a_path_that_is_no_file_of_episodes_is_refused_in_one_line_and_never_blocks(tmp_path, make, said):
     path = tmp_path / "a.jsonl"
     make(path)
     page = BoatPage(seed=0)

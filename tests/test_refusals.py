@@ -158,7 +158,7 @@ def test_what_no_run_can_have_is_refused_in_one_line(words, line, tmp_path):
     assert line in str(raised.value) and "\n" not in str(raised.value)
 
 
-def test_a_project_name_that_wandb_refuses_is_told_in_one_line(tmp_path):
+def test_a_project_name_that_wandb_refuses_is_reported_in_one_line(tmp_path):
     with pytest.raises(
         ConfigError, match=r"^logger: project=a/b#c: Invalid project name 'a/b#c': cannot contain "
     ) as raised:

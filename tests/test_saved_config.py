@@ -190,7 +190,7 @@ def test_classes_come_from_the_yaml_files_even_with_trust(of_toy, bait, command,
     assert not bait()
 
 
-def test_guarded_settings_are_taken_if_they_are_said_again_or_the_file_is_trusted(of_toy, command):
+def test_guarded_settings_are_accepted_if_repeated_or_if_the_file_is_trusted(of_toy, command):
     evaluation = ["mode=eval", f"checkpoint={of_toy}"]
     code, _, err = command(*evaluation)
     line = 'env.entry_point="toy_environments:Toy", env.kwargs={"length": 4}: set by '
@@ -205,7 +205,7 @@ def test_guarded_settings_are_taken_if_they_are_said_again_or_the_file_is_truste
     assert "has no pictures" in command("watch", str(of_toy), *said)[2]
 
 
-def test_play_takes_a_guarded_setting_of_an_agent_if_it_is_said_again_or_the_file_is_trusted(command, tmp_path):
+def test_play_accepts_a_guarded_setting_if_repeated_or_if_the_file_is_trusted(command, tmp_path):
     policy = torch.load(AGENTS / "hppo_congruent/policy.pt", weights_only=True)
     progress = json.loads(policy["progress"])
     progress["config"]["env"]["recording"] = "gone.jsonl"
@@ -223,7 +223,7 @@ def test_no_file_gives_itself_trust(of_toy, command, tmp_path):
     assert code == 2 and "trust=true" in err
 
 
-def test_the_page_names_every_setting_that_needs_the_word_of_the_user():
+def test_the_page_names_every_setting_that_needs_consent():
     page = (AGENTS.parent / "docs/opening-files.md").read_text()
     table = {
         word for line in page.splitlines() if line.startswith("|") for word in re.findall(r"`(\w+\.[\w=]+)`", line)
@@ -236,7 +236,7 @@ def test_the_page_names_every_setting_that_needs_the_word_of_the_user():
     assert guarded == {word for word in table if word.partition(".")[0] in GROUPS}
 
 
-def test_the_command_that_goes_on_with_a_run_has_trust_if_it_needs_it():
+def test_the_command_that_continues_a_run_has_trust_if_needed():
     assert needs_trust(make_config([*TOY, "high=none", "low=random"])) and not needs_trust(make_config([]))
 
 
@@ -291,7 +291,7 @@ def nested(depth: int) -> dict:
         lambda config: config.update(hydra={"run": {"dir": "/"}}),
     ],
 )
-def test_a_config_that_is_none_is_told_in_one_short_line(change):
+def test_a_config_of_another_form_is_refused_in_one_short_line(change):
     values = saved(make_config(["low=random"]))
     change(values)
     with pytest.raises(ConfigError) as error:

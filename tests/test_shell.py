@@ -55,7 +55,7 @@ FOLDERS = [
 ]
 
 
-def test_a_setting_that_is_told_reads_as_the_same_text_when_it_is_pasted():
+def test_a_printed_setting_is_read_as_the_same_text_when_pasted():
     words = [path_setting("resume", Path(folder)) for folder in FOLDERS]
     assert not [word for word in words if "\n" in word] and words[0] == "resume=sweep"
     pasted = subprocess.run(
@@ -68,7 +68,7 @@ def test_a_setting_that_is_told_reads_as_the_same_text_when_it_is_pasted():
         assert Path(os.path.expanduser(read)) == Path(folder), override.input_line
 
 
-def test_a_text_that_the_grammar_does_not_take_is_told_as_it_is_typed(command):
+def test_a_text_outside_the_grammar_is_printed_as_it_must_be_typed(command):
     for text in ("my runs/lr=0.1,seed=1", "a(b)", "a,b", "[32]", "{a: b}", "7", "true", "it's"):
         for name in ("resume", "low.checkpoint"):
             code, _, err = command(f"{name}={text}")
@@ -121,7 +121,7 @@ LAUGHS = "".join(f"  l{i}: &l{i} [{', '.join([f'*l{i - 1}' if i else '1'] * 9)}]
         ("hydra: {run: {dir: " + "x" * 300 + "}}\n", "File name too long"),
     ],
 )
-def test_a_yaml_that_no_one_can_read_is_told_in_one_line(command, tmp_path, text, line):
+def test_an_unreadable_yaml_is_refused_in_one_line(command, tmp_path, text, line):
     code, _, err = command(*written_yaml(tmp_path, text))
     assert code == 2 and err.count("\n") == 1 and line in err
 
@@ -165,12 +165,12 @@ ODD_WORDS = [
 
 
 @pytest.mark.parametrize("words", ODD_WORDS, ids=[" ".join(words)[:30] for words in ODD_WORDS])
-def test_an_odd_word_is_told_in_one_line(command, words):
+def test_an_odd_word_is_reported_in_one_line(command, words):
     code, out, err = command(*words)
     assert (code, out) == (2, "") and err.count("\n") == 1 and err.strip()
 
 
-def test_a_setting_with_dashes_is_told_without_them(command):
+def test_a_setting_with_dashes_is_reported_without_them(command):
     code, _, err = command("--seed=1", "low=hppo")
     assert (code, err) == (2, "--seed=1: settings have no dashes, write seed=1; a wandb sweep ${args_no_hyphens}\n")
 
@@ -217,7 +217,7 @@ def test_letters_that_a_terminal_cannot_show_are_replaced(tmp_path, monkeypatch,
     assert text.count("\\u03a9") == 2 and "1 jobs: 1 finished" in text and "Traceback" not in err.read_text()
 
 
-def test_a_working_directory_that_is_gone_is_told_in_one_line(command, tmp_path):
+def test_a_working_directory_that_is_gone_is_reported_in_one_line(command, tmp_path):
     (tmp_path / "gone").mkdir()
     os.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
@@ -275,9 +275,7 @@ def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_pat
     assert sys.path == [root, "/packages", str(tmp_path)]
 
 
-def test_relative_paths_count_from_where_the_user_stands_though_hydra_changes_the_directory(
-    command, tmp_path, monkeypatch
-):
+def test_relative_paths_count_from_the_working_directory_even_if_hydra_changes_it(command, tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(train, "run", lambda cfg, folder, *_, **__: seen.append((os.getcwd(), str(folder))) or 0)
     words = ["hydra.job.chdir=true", "low.checkpoint=nowhere"]
@@ -318,7 +316,7 @@ def test_a_limit_of_the_size_of_files_is_a_full_disk(tmp_path, monkeypatch):
         (ImportError("lib.so: failed to map segment from shared object"), "more memory, see ulimit -v\n"),
     ],
 )
-def test_a_limit_of_the_process_is_told_in_one_line_wherever_a_library_finds_it(command, monkeypatch, error, line):
+def test_a_limit_of_the_process_is_reported_in_one_line_wherever_a_library_finds_it(command, monkeypatch, error, line):
     def run(*_, **__):
         try:
             raise error
@@ -345,7 +343,7 @@ def test_the_commands_of_the_recording_tell_a_full_device_too(tmp_path, capsys, 
     assert (tmp_path / "err.txt").read_text() == "stdout: No space left on device\n"
 
 
-def test_the_command_that_is_told_goes_on_when_it_is_pasted(command, tmp_path, monkeypatch):
+def test_the_printed_command_continues_the_run_when_pasted(command, tmp_path, monkeypatch):
     folder = "my runs/lr=0.1,seed=[1] it's $5"
     small = ["high=fixed", "low=random", "num_envs=2", "steps_per_batch=2", "eval.layouts=2", "film=false"]
     assert command(*small, "total_frames=4", f"hydra.run.dir={_for_hydra(folder)}")[0] == 0

@@ -98,7 +98,7 @@ def test_stopped_runs_are_left_out_and_named(tmp_path, capsys):
     assert capsys.readouterr().err == f"{tmp_path / 'b'}: was stopped, left out\n"
 
 
-def test_linked_folders_count_once_and_what_cannot_be_read_is_named(tmp_path, capsys):
+def test_linked_folders_count_once_and_unreadable_runs_are_named(tmp_path, capsys):
     for seed, folder in enumerate(["study/a", "elsewhere/b", "elsewhere/deep/c"]):
         leave_run(tmp_path / folder, seed=seed)
     study = tmp_path / "study"

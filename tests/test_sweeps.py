@@ -156,7 +156,7 @@ def test_the_results_of_another_config_stay_as_they_are(command, jobs, tmp_path)
     assert {file: file.read_bytes() for file in (tmp_path / "sweep/0").iterdir()} == before
 
 
-def test_with_overwrite_a_job_replaces_the_results_of_another_config_alone(command, jobs):
+def test_with_overwrite_a_job_replaces_only_the_results_of_another_config(command, jobs):
     command("-m", "seed=4,0", "hydra.sweep.dir=sweep")
     assert command("-m", "seed=7,0", "overwrite=true", "hydra.sweep.dir=sweep")[0] == 0
     assert jobs == [(4, None), (0, None), (7, None)]

@@ -109,8 +109,8 @@ def check_actions(rows: TensorDictBase, specs: PAMDPSpecs) -> None:
     """Check that transitions `[N]`, which `check_transitions` accepted, fit an environment.
 
     Raises:
-        DataError: the observation or the parameters have another length, or a row has an action or an option that the
-            environment does not have, or forbids.
+        DataError: the observation or the parameters have another length, or the environment lacks or forbids a row's
+            action or option.
     """
     what = "the transitions"
     _check_length(what, rows, keys.PARAMETERS, specs.num_parameters)

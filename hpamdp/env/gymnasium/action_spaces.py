@@ -12,9 +12,9 @@ entry, with any names, and a `OneOf` of K boxes. The `Discrete` may have any `st
   whole. Without, each discrete action takes the whole box: the vector holds one copy for each, and the chosen action's
   copy is passed.
 
-Boxes hold floats with finite bounds, in any shape. An agent's parameters are float32. If float32 cannot resolve a
-parameter of a more precise Box to a millionth of its width, as with times in seconds since 1970, the agent's parameter
-lies in [-1, 1] instead. It is mapped to the Box in float64.
+Boxes hold floats with finite bounds, in any shape. An agent's parameters are float32. In some more precise Boxes
+float32 cannot resolve a millionth of the width, as with times in seconds since 1970. The agent's parameter then lies in
+[-1, 1], and is mapped to the Box in float64.
 
 A space may have one more entry, a `Discrete`: the option, which the agent chooses less often than the action. It is the
 entry `option` of a `Dict`, or the entry that `option_key` names. What is left without it has one of the forms above, or
