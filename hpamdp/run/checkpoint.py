@@ -2,9 +2,10 @@
 
 A checkpoint is a zip archive: `manifest.json` with the run's progress and the checksums of the other members, and one
 member for each component, written by `torch.save`. Opening somebody else's file runs none of its code, see `archive`.
-It changes nothing of an agent unless the whole file fits it, see `checks`. TorchRL's `Checkpoint` is not used: it reads
-a replay buffer's prefetch queue with pickle, stores replay buffers at full capacity, and moves the old file away before
-the new one is in place.
+Loading changes an agent only if the whole file fits, see `checks`.
+
+TorchRL's `Checkpoint` is not used. It reads a replay buffer's prefetch queue with pickle, and stores replay buffers at
+full capacity. It also moves the old file away before the new one is in place.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ def find(path: str | Path, where: str) -> Path:
         ConfigError: there is no checkpoint.
     """
     path = Path(os.path.expanduser(path))  # `Path` takes "./" away, with which ~ is a name
-    is_folder = os.path.isdir(path)  # unlike `Path.is_dir` for any text
+    is_folder = os.path.isdir(path)  # `Path.is_dir` would fail for some texts
     file = path / FILE_NAME if is_folder else path
     if where != "resume" and is_folder and not file.is_file() and (path / POLICY_NAME).is_file():
         file = path / POLICY_NAME
@@ -107,7 +108,7 @@ def find(path: str | Path, where: str) -> Path:
 
 @dataclass(frozen=True)
 class Saved:
-    """What `load` returns; the agent itself is filled in place.
+    """The parts of a run that `load` returns; the agent itself is filled in place.
 
     Attributes:
         file: the checkpoint.
@@ -122,12 +123,12 @@ class Saved:
     generators: Generators | None
 
     def set_statistics(self, env: PAMDPEnv) -> None:
-        """Have an environment scale its observations as that of the saved run did.
+        """Let an environment scale its observations as in the saved run.
 
         Raises:
-            ConfigError: they are of another environment.
+            ConfigError: the saved statistics are of another environment.
         """
-        with _named(f"{self.file}: does not fit env"):
+        with _explained(f"{self.file}: does not fit env"):
             env.set_statistics(_strings(self.states.get("collection", {}).get("env", {})))
 
 
@@ -179,7 +180,7 @@ def save_policy(path: Path, agent: HierarchicalAgent, progress: Mapping[str, Any
 
 
 def progress_of(file: Path) -> dict[str, Any]:
-    """Return what `save` was given as `progress`.
+    """Return the `progress` that `save` was given.
 
     Raises:
         ConfigError: the file is damaged or not a checkpoint of this program.
@@ -197,7 +198,7 @@ def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) ->
         ConfigError: the checkpoint is damaged or of other learners.
     """
     prefix = "learners."
-    with _Opened(file) as opened, _named(f"low.checkpoint={file}: of another class or size than low"):
+    with _Opened(file) as opened, _explained(f"low.checkpoint={file}: of another class or size than low"):
         saved = _strings(opened.part("agent"))
         own = {name.removeprefix(prefix): value for name, value in saved.items() if name.startswith(prefix)}
         saved_num, num = len({name.partition(".")[0] for name in own}), len(agent.learners)
@@ -228,9 +229,9 @@ def load(
 
     Args:
         file: the checkpoint.
-        agent: to fill.
-        device: its device.
-        with_training: whether the run goes on.
+        agent: the agent to fill.
+        device: the agent's device.
+        with_training: whether the run is continued.
         steps: see `HierarchicalAgent.replay_rows`; with training they must be given.
 
     Raises:
@@ -245,12 +246,12 @@ def load(
         missing = ({"agent", "rng", *STATES, *stateful} if with_training else {"agent"}) - {*buffers} - opened.names
         if missing:
             raise ConfigError(f"{file}: does not fit this agent: it lacks {', '.join(sorted(missing))}")
-        with _named(misfit):
+        with _explained(misfit):
             networks = opened.state("agent", opened.part("agent"), agent, device)
             others = {name: opened.other(name, stateful[name], device) for name in stateful.keys() - buffers.keys()}
             for name in opened.names & {*buffers}:
                 replays[name] = opened.replay(name, buffers[name], agent, steps)
-        with _named(f"{file}: damaged, or not a checkpoint of this program"):
+        with _explained(f"{file}: damaged, or not a checkpoint of this program"):
             for name in STATES if with_training else STATES[:1]:
                 if name in opened.names:
                     states[name] = _strings(opened.filled(name, device))
@@ -268,8 +269,8 @@ def load(
 
 
 @contextmanager
-def _named(what: str) -> Iterator[None]:
-    """Report whatever is wrong with the bytes or the values of a file in one line that begins with `what`.
+def _explained(what: str) -> Iterator[None]:
+    """Turn errors about the bytes or the values of a file into one line that begins with `what`.
 
     Raises:
         ConfigError: instead of the error.
@@ -281,8 +282,8 @@ def _named(what: str) -> Iterator[None]:
     except _DAMAGE as error:
         if isinstance(error, ConfigError):
             raise
-        told = first_line(error) if type(error) is ValueError else f"{type(error).__name__}: {first_line(error)}"
-        raise ConfigError(f"{what} ({told:.160})") from error
+        reason = first_line(error) if type(error) is ValueError else f"{type(error).__name__}: {first_line(error)}"
+        raise ConfigError(f"{what} ({reason:.160})") from error
 
 
 def _strings(values: Any) -> dict[str, Any]:
@@ -313,11 +314,11 @@ class _Opened:
     """A checkpoint or policy file that is being read: its members are described first, and read when they fit.
 
     Args:
-        file: the path.
+        path: the file.
 
     Attributes:
-        names: of the members.
-        progress: of the run.
+        names: names of the members.
+        progress: progress of the run.
 
     Raises:
         ConfigError: the file is damaged or not a checkpoint of this program.
@@ -333,7 +334,7 @@ class _Opened:
         self._stack = ExitStack()
 
     def __enter__(self) -> _Opened:
-        with _named(self._damaged):
+        with _explained(self._damaged):
             file = self._stack.enter_context(self.path.open("rb"))
             num_bytes = os.fstat(file.fileno()).st_size
             try:
@@ -365,9 +366,9 @@ class _Opened:
         self.progress = checked(Progress, progress).model_dump(exclude_unset=True)
 
     def part(self, name: str) -> Any:
-        """Return what a member holds, with a `SavedTensor` in the place of each tensor."""
+        """Return the contents of a member, with a `SavedTensor` in the place of each tensor."""
         if name not in self._parts:
-            with _named(self._damaged):
+            with _explained(self._damaged):
                 info = self._infos[f"{name}.pt"]
                 if _checksum(MemberFile(self._file, info)) != self._checksums[name]:
                     raise ValueError(f"the checksum of {name} is wrong")
@@ -375,7 +376,7 @@ class _Opened:
         return self._parts[name].state
 
     def filled(self, name: str, device: torch.device | None = None) -> Any:
-        """Return what a member holds."""
+        """Return the contents of a member, with its tensors."""
         state = self.part(name)
         return self._parts[name].filled(state, device)
 
@@ -385,12 +386,12 @@ class _Opened:
         Args:
             name: the member.
             saved: the state dict, not yet read.
-            module: it is for.
-            device: of the tensors.
+            module: the module that will load the state.
+            device: the device of the returned tensors.
 
         Raises:
-            ValueError: it is of another module, or holds numbers that make no sense.
-            ConfigError: it holds NaN or inf.
+            ValueError: the state is of another module, or holds invalid numbers.
+            ConfigError: the state holds NaN or inf.
         """
         archive = self._parts[name]
         own = module.state_dict(keep_vars=True)
@@ -424,7 +425,7 @@ class _Opened:
         """Return a state dict that a part of `stateful` other than a replay buffer can load.
 
         Raises:
-            ValueError: it is of another part, or holds numbers that make no sense.
+            ValueError: the state is of another part, or holds invalid numbers.
         """
         if isinstance(part, torch.optim.Optimizer):
             return self.optimizer(name, part, device)
@@ -436,7 +437,7 @@ class _Opened:
         """Return a state dict that an optimizer can load.
 
         Raises:
-            ValueError: it is of another optimizer, or holds numbers that make no sense.
+            ValueError: the state is of another optimizer, or holds invalid numbers.
         """
         own = stepped(optimizer)
         saved = self.part(name)
@@ -452,7 +453,7 @@ class _Opened:
         """Return the contents of a replay buffer.
 
         Raises:
-            ValueError: they are of another buffer, or hold numbers that make no sense.
+            ValueError: the contents are of another buffer, or hold invalid numbers.
         """
         saved = check_replay(name, self.part(name), buffer)
         writer = saved.writer.model_dump(by_alias=True)
@@ -460,7 +461,7 @@ class _Opened:
             return _Replay(None, writer)
         assert steps is not None
         example = agent.replay_rows(name, steps)
-        if example is None:  # whose owner does not say what it stores
+        if example is None:  # its owner does not override `replay_rows`
             return _Replay(TensorDict(self.filled(name, steps.device)["rows"], [saved.num_rows]), writer)
         check_rows(f"{name}.rows", saved.rows, example.to_dict(), saved.num_rows)
         rows = TensorDict(self._parts[name].filled(saved.rows, example.device), batch_size=[saved.num_rows])
@@ -527,10 +528,10 @@ class Generators(SavedPart):
 
     @classmethod
     def of(cls, saved: Any) -> Generators:
-        """Return the states, after trying them on generators that nobody uses.
+        """Return the states, after a trial on generators that are used for nothing else.
 
         Raises:
-            ValueError: they are no states of generators.
+            ValueError: a value is no state of a generator.
         """
         states = checked(cls, saved)
         for model, values in ((_PythonState, states.python), (_NumpyState, states.numpy)):
@@ -547,7 +548,7 @@ class Generators(SavedPart):
 
 
 def set_generators(generators: Generators) -> None:
-    """Restore the random generators; those of devices that this machine lacks are left out, with a warning."""
+    """Restore the random generators; warn about generators of devices that this machine lacks, and leave them out."""
     states = {name: state for name, state in generators if state is not None}
     if "torch_cuda" in states:
         num = torch.cuda.device_count() if torch.cuda.is_available() else 0

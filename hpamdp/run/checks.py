@@ -1,4 +1,4 @@
-"""Compare what a checkpoint holds with the part of a run that it is for, before anything of the run is changed."""
+"""Compare the contents of a checkpoint with a run, before anything of the run changes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hpamdp.run.archive import SavedTensor
 _MOST = 2**53
 Count = Annotated[int, Field(ge=0, le=_MOST)]
 Amount = Annotated[FiniteFloat, Field(ge=0.0)]
-# Settings of an optimizer that training changes, and those that say only how a step is computed.
+# Settings of an optimizer that training changes, and settings that only say how a step is computed.
 _SCHEDULED, _IMPLEMENTATION = ("lr", "weight_decay"), ("foreach", "fused", "capturable", "differentiable")
 # Settings that earlier versions of torch lack.
 _MAY_LACK = (*_IMPLEMENTATION, "decoupled_weight_decay")
@@ -33,7 +33,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class SavedPart(BaseModel):
-    """What a file holds, by name; a value of another type is refused."""
+    """Contents of a file by their names; a value of another type is refused."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
@@ -71,7 +71,7 @@ def checked(model: type[Model], values: Any) -> Model:
     """Return values as a model.
 
     Raises:
-        ValueError: with the first value that is wrong, in one line.
+        ValueError: the message names the first wrong value in one line.
     """
     try:
         return model.model_validate(values)
@@ -93,17 +93,17 @@ def _first_wrong(error: ValidationError) -> str:
 
 
 def check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False, any_rows: bool = False) -> None:
-    """Refuse what is no tensor of the dtype and shape of another one; float16 may stand for float32.
+    """Refuse a value that is no tensor with the dtype and shape of `own`; float16 is accepted for float32.
 
     Args:
-        where: name for the error.
-        saved: read or not.
-        own: the other one.
-        any_size: whether only the number of dimensions counts.
+        where: the value's name in the error.
+        saved: the value, read or not.
+        own: the tensor of the run.
+        any_size: whether only the number of dimensions must be the same.
         any_rows: whether the first dimension may differ.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the value is refused.
     """
     if not isinstance(saved, Tensor | SavedTensor):
         raise ValueError(f"{where} is {type(saved).__name__}, but must be a tensor")
@@ -119,10 +119,10 @@ def _form(tensor: Tensor | SavedTensor) -> str:
 
 
 def check_values(where: str, value: Tensor, own: Tensor) -> None:
-    """Refuse numbers that are not finite, unless the other tensor has such numbers, and counts below -1.
+    """Refuse NaN and inf, unless `own` has them, and integers below both -1 and the smallest one in `own`.
 
     Raises:
-        ValueError: with what is wrong.
+        ValueError: a number is invalid.
     """
     if value.is_floating_point():
         if value.isnan().any() and not own.isnan().any():
@@ -137,10 +137,10 @@ def check_values(where: str, value: Tensor, own: Tensor) -> None:
 
 
 def check_columns(where: str, saved: Any, own: Mapping[str, Any], *, any_rows: bool = False) -> None:
-    """Refuse nested columns of other names, dtypes or shapes than those of a part of the run.
+    """Refuse nested columns whose names, dtypes or shapes differ from `own`.
 
     Raises:
-        ValueError: with the first one.
+        ValueError: the message names the first difference.
     """
     if not isinstance(saved, Mapping):
         raise ValueError(f"{where} is {type(saved).__name__}, but must be a mapping")
@@ -155,10 +155,10 @@ def check_columns(where: str, saved: Any, own: Mapping[str, Any], *, any_rows: b
 
 
 def check_like(where: str, saved: Any, own: Any) -> None:
-    """Refuse nested values of other names, types or shapes than those of a part of the run.
+    """Refuse nested values whose names, types or shapes differ from `own`.
 
     Raises:
-        ValueError: with the first one.
+        ValueError: the message names the first difference.
     """
     if isinstance(own, Tensor):
         check_form(where, saved, own)
@@ -170,17 +170,18 @@ def check_like(where: str, saved: Any, own: Any) -> None:
 
 
 def check_names(saved: object, own: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a state dict of the same names as another one.
+    """Return a state dict if it has the names of another one.
 
     Raises:
-        ValueError: it has others, or is none.
+        ValueError: the names differ, or `saved` is no state dict.
     """
     if not isinstance(saved, Mapping):
         raise ValueError(f"a state dict is {type(saved).__name__}")
     missing, unknown = (sorted(map(str, names)) for names in (own.keys() - saved.keys(), saved.keys() - own.keys()))
     if missing or unknown:
-        told = [f"{word} {', '.join(names[:3])}" for word, names in (("without", missing), ("with", unknown)) if names]
-        raise ValueError(f"a state dict {' and '.join(told)}")
+        both = (("without", missing), ("with", unknown))
+        differences = [f"{word} {', '.join(names[:3])}" for word, names in both if names]
+        raise ValueError(f"a state dict {' and '.join(differences)}")
     return saved
 
 
@@ -201,15 +202,15 @@ def stepped(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
 
 
 def check_optimizer(where: str, saved: Any, own: Mapping[str, Any]) -> None:
-    """Refuse the state of another optimizer, whose tensors may not have been read yet.
+    """Refuse the saved state of another optimizer; its tensors may not have been read yet.
 
     Args:
-        where: name for the error.
-        saved: what was saved.
+        where: the state's name in the error.
+        saved: the saved state.
         own: the optimizer's own state after a step.
 
     Raises:
-        ValueError: with what differs.
+        ValueError: the message names the first difference.
     """
     state = checked(_OptimizerState, saved)
     if len(state.param_groups) != len(own["param_groups"]):
@@ -235,15 +236,15 @@ def _check_setting(where: str, name: str, value: Any, own: Any) -> None:
 
 
 def scheduled(own: Mapping[str, Any], saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of an optimizer with the saved values of those that training changes."""
+    """Return the settings of an optimizer, with saved values for the settings that training changes."""
     return {**own, **{name: saved[name] for name in _SCHEDULED if name in saved}}
 
 
 def check_moments(where: str, state: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """Refuse numbers from which no step can be made.
+    """Refuse moments from which an optimizer cannot make a step.
 
     Raises:
-        ValueError: with what is wrong.
+        ValueError: a number is invalid.
     """
     for number, moments in state.items():
         for name, value in moments.items():
@@ -253,10 +254,10 @@ def check_moments(where: str, state: Mapping[int, Mapping[str, Tensor]]) -> None
 
 
 def check_replay(where: str, saved: Any, buffer: ReplayBuffer) -> _ReplayState:
-    """Return the state of a replay buffer whose rows have not been read yet.
+    """Check the state of a replay buffer before its rows are read, and return it.
 
     Raises:
-        ValueError: it is of another buffer.
+        ValueError: the state is of another buffer.
     """
     state = checked(_ReplayState, saved)
     num, capacity = state.num_rows, buffer._storage.max_size
@@ -268,10 +269,10 @@ def check_replay(where: str, saved: Any, buffer: ReplayBuffer) -> _ReplayState:
 
 
 def check_rows(where: str, saved: Any, own: Mapping[str, Any], num: int) -> None:
-    """Refuse columns that are not `num` rows of the dtypes and shapes of other rows.
+    """Refuse columns that do not have `num` rows, or whose dtypes or shapes differ from `own`.
 
     Raises:
-        ValueError: with the first one.
+        ValueError: the message names the first difference.
     """
     check_columns(where, saved, own, any_rows=True)
     for name, column in saved.items():
@@ -280,10 +281,10 @@ def check_rows(where: str, saved: Any, own: Mapping[str, Any], num: int) -> None
 
 
 def check_generator(state: Tensor) -> None:
-    """Refuse what is no state of torch's generator on the CPU.
+    """Refuse a tensor that is no state of torch's generator on the CPU.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the tensor is no such state.
     """
     own = torch.Generator()
     if state.dtype != torch.uint8 or state.shape != own.get_state().shape:
@@ -296,7 +297,7 @@ def check_generator(state: Tensor) -> None:
 
 @torch.no_grad()
 def example_steps(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
-    """Return steps `[N]` of a run, of which only the names, shapes and dtypes count."""
+    """Return steps `[N]` as a run makes them; only their names, shapes and dtypes matter."""
     steps = env.fake_tensordict()
     for name in (keys.ACTION_MASK, keys.OPTION_MASK):
         for mask in (steps.get(name, None), steps.get(("next", name), None)):
