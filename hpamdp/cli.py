@@ -42,6 +42,7 @@ from hpamdp.config import (
     no_such_option,
 )
 from hpamdp.messages import (
+    file_and_reason,
     first_line,
     lenient_streams,
     lost_output,
@@ -144,7 +145,7 @@ def _main() -> None:
     except _LostOutputError as error:
         if isinstance(error.__cause__, BrokenPipeError):  # the reader has seen enough
             sys.exit(1)
-        _exit_with(f"stdout: {getattr(error.__cause__, 'strerror', None) or first_line(error.__cause__)}", 1)
+        _exit_with(f"stdout: {reason_of(error.__cause__)}", 1)
     except KeyboardInterrupt:
         sys.exit(_INTERRUPTED)
 
@@ -483,7 +484,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
     except OSError as error:
         if not is_about_folder(error, output_dir):
             raise
-        _exit_with(f"{output_dir}: {error.strerror or error}; the run was stopped", 1)
+        _exit_with(f"{output_dir}: {reason_of(error)}; the run was stopped", 1)
     if code:
         sys.exit(code)
     return None
@@ -569,7 +570,7 @@ def _first_lines(error: Exception, words: Sequence[str]) -> str:
     if isinstance(error, UnicodeDecodeError):  # which does not name the file
         return f"a yaml file that was chosen is not written in UTF-8 ({error})"
     if isinstance(error, OSError):
-        return reason_of(error)
+        return file_and_reason(error)
     if isinstance(error, RecursionError | ValueError) and not isinstance(error, OmegaConfBaseException):
         return beginning_of(words) + (NESTED if isinstance(error, RecursionError) else first_line(error))
     causes = [error] if error.__cause__ is None else [error, error.__cause__]

@@ -143,9 +143,14 @@ def _print(text: str, stream: TextIO | None) -> None:
         _finish(lenient)  # else the interpreter fails once more at its end
 
 
-def reason_of(error: OSError) -> str:
-    """Return in one line the file that an error is about, and what went wrong."""
-    reason = error.strerror or first_line(error)
+def reason_of(error: BaseException | None) -> str:
+    """Return in one line what went wrong, without the file that an `OSError` names."""
+    return getattr(error, "strerror", None) or first_line(error)
+
+
+def file_and_reason(error: OSError) -> str:
+    """Return in one line the file that an error is about, if it names one, and what went wrong."""
+    reason = reason_of(error)
     return reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}"
 
 

@@ -126,7 +126,7 @@ def test_a_line_that_was_cut_short_stays_one_line(tmp_path):
 def test_a_file_of_something_else_is_refused(tmp_path):
     path = tmp_path / "notes.txt"
     path.write_text("dear diary\nnothing happened\n")
-    with pytest.raises(EpisodeError, match="line 1: no episode"):
+    with pytest.raises(EpisodeError, match="no line is an episode"):
         EpisodeFile(path, BoatPage(seed=0))
     with pytest.raises(EpisodeError, match="there is no folder"):
         EpisodeFile(tmp_path / "nowhere" / "a.jsonl", BoatPage(seed=0))
@@ -175,7 +175,7 @@ def test_links_in_a_foreign_folder_empty_no_file(tmp_path):
     with pytest.raises(EpisodeError, match=r"\.a\.jsonl\.lock: is a link; remove it"):
         EpisodeFile(tmp_path / "a.jsonl", BoatPage(seed=0))
     (tmp_path / "b.jsonl").symlink_to("mine")
-    with pytest.raises(EpisodeError, match="no episode"):
+    with pytest.raises(EpisodeError, match="no line is an episode"):
         EpisodeFile(tmp_path / "b.jsonl", BoatPage(seed=0))
     assert (tmp_path / "mine").read_text() == "precious"
 

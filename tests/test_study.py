@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -109,11 +110,18 @@ def test_linked_folders_count_once_and_unreadable_runs_are_named(tmp_path, capsy
     (study / "gone").symlink_to(tmp_path / "nowhere")
     leave_run(study / "cut")
     (study / "cut/summary.json").write_text('{"score": 1.')
+    leave_run(study / "nested")
+    (study / "nested/config.yaml").write_text("[" * 9_999)
+    leave_run(study / "pipe")
+    (study / "pipe/summary.json").unlink()
+    os.mkfifo(study / "pipe/summary.json")
     runs = finished([study, study / "a"])
     assert sorted(run.summary["seed"] for run in runs) == [0, 1, 2]
     assert sorted(capsys.readouterr().err.splitlines()) == [
         f"{study / 'cut'}: summary.json is missing or damaged, left out",
         f"{study / 'gone'}: a link to nothing, left out",
+        f"{study / 'nested'}: config.yaml is missing or damaged, left out",
+        f"{study / 'pipe'}: summary.json is missing or damaged, left out",
     ]
 
 

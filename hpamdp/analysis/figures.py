@@ -20,10 +20,8 @@ from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.files import replacing
 from hpamdp.messages import duration, one_line, warn
 from hpamdp.regular_files import read_regular, regular_size
-from hpamdp.run.folder import FIGURES_NAME
+from hpamdp.run.folder import FIGURES_NAME, MAX_TEXT_BYTES
 from hpamdp.run.metrics import EVALUATION, FRAMES, WALL_SECONDS, read_rows
-
-_MAX_SUMMARY_BYTES = 1 << 24
 
 
 def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
@@ -53,7 +51,7 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
 
 def _read_summary(path: Path) -> dict[str, Any]:
     try:
-        summary = json.loads(read_regular(path, _MAX_SUMMARY_BYTES)) if path.exists() else {}
+        summary = json.loads(read_regular(path, MAX_TEXT_BYTES)) if path.exists() else {}
         if not isinstance(summary, dict):
             raise ValueError("it is no JSON object")
     except (ValueError, OSError, RecursionError) as error:

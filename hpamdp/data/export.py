@@ -14,7 +14,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp.data.errors import DataError
-from hpamdp.messages import first_line
+from hpamdp.messages import first_line, reason_of
 
 
 def write_csv(tables: Mapping[str, TensorDict], folder: Path, *, axes: Sequence[str] | None = None) -> None:
@@ -128,4 +128,4 @@ def write_atomically(target: Path, write: Callable[[Path], object]) -> None:
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
-        raise DataError(f"{target}: cannot be written ({error.strerror or error})") from error
+        raise DataError(f"{target}: cannot be written ({reason_of(error)})") from error

@@ -17,6 +17,7 @@ from pydantic_core import from_json
 from tensordict import TensorDict
 
 from hpamdp.data.errors import DataError
+from hpamdp.messages import reason_of
 from hpamdp.regular_files import read_regular, regular_size
 
 _META = "meta.json"
@@ -56,7 +57,7 @@ def load(folder: Path) -> TensorDict:
         _check(folder)
         return TensorDict.load_memmap(folder, allow_pickle=False)
     except OSError as error:
-        raise DataError(f"{error.filename or folder}: {error.strerror or error}") from error
+        raise DataError(f"{error.filename or folder}: {reason_of(error)}") from error
 
 
 def _check(folder: Path, num_rows: int | None = None) -> None:

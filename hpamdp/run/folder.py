@@ -16,6 +16,7 @@ from filelock import FileLock, Timeout
 
 from hpamdp.config import ConfigError
 from hpamdp.files import remove_link, replacing
+from hpamdp.regular_files import read_regular
 from hpamdp.shell import path_setting
 
 # The value of `resume` that continues the run in its own folder, or starts it there.
@@ -35,6 +36,8 @@ DIVERGED_NAME = "checkpoint.diverged.zip"
 EVALUATION_NAME = "evaluation.npz"
 FILM_NAME = "episodes.gif"
 ERROR_NAME = "error.txt"
+# The largest config or summary that is read.
+MAX_TEXT_BYTES = 1 << 24
 # Each of these marks the folder as that of a run.
 _MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME)
 _OTHERS = (
@@ -125,8 +128,8 @@ def check_no_training(folder: Path) -> None:
 def saved_config(folder: Path) -> dict[str, Any]:
     """Return the config of the run in a folder; empty if it is missing or cannot be read."""
     try:
-        config = yaml.safe_load((folder / CONFIG_NAME).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        config = yaml.safe_load(read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES))
+    except (OSError, yaml.YAMLError, RecursionError):
         return {}
     return config if isinstance(config, dict) else {}
 
@@ -134,8 +137,8 @@ def saved_config(folder: Path) -> dict[str, Any]:
 def saved_summary(folder: Path) -> dict[str, Any]:
     """Return the summary of the run in a folder; empty if it is missing or cannot be read."""
     try:
-        summary = json.loads((folder / SUMMARY_NAME).read_text())
-    except (OSError, ValueError):  # missing, or cut off in the middle
+        summary = json.loads(read_regular(folder / SUMMARY_NAME, MAX_TEXT_BYTES))
+    except (OSError, ValueError, RecursionError):  # missing, or cut off in the middle
         return {}
     return summary if isinstance(summary, dict) else {}
 
@@ -200,7 +203,7 @@ def written_by_a_run(folder: Path) -> list[Path]:
     """Return the paths that a run has written into its folder; the files that mark a run come first."""
     names = [*_MARKS, *_OTHERS]
     with suppress(OSError, UnicodeDecodeError):
-        listed = (folder / FIGURES_NAME).read_text().splitlines()
+        listed = read_regular(folder / FIGURES_NAME, MAX_TEXT_BYTES).decode().splitlines()
         names += [name for name in listed if name and Path(name).name == name]
     paths = [folder / name for name in (*names, FIGURES_NAME, CONFIG_NAME)]
     return [path for path in dict.fromkeys(paths) if path.exists() or path.is_symlink()]

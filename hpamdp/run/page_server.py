@@ -23,7 +23,7 @@ from filelock import FileLock
 
 from hpamdp.env.page import EpisodeError, Page
 from hpamdp.json_lines import MAX_LINE_BYTES, LineError, left_out, lines_of, read_json
-from hpamdp.messages import one_line, warn
+from hpamdp.messages import one_line, reason_of, warn
 from hpamdp.regular_files import read_regular, regular_size
 
 DATA_NAME = "data.js"
@@ -84,7 +84,7 @@ class EpisodeFile:
                 raise EpisodeError(f"{lock_path}: is a link; remove it")
             self._check_file()
         except OSError as error:
-            raise EpisodeError(f"{path}: {error.strerror or error}") from error
+            raise EpisodeError(f"{path}: {reason_of(error)}") from error
 
     def add(self, episode: Mapping[str, Any]) -> bool:
         """Add a checked episode and return whether it is new; on return it is on the disk.
@@ -267,7 +267,7 @@ class _Handler(BaseHTTPRequestHandler):
             held = f"another program holds the lock of {file.path.name}"
             return HTTPStatus.SERVICE_UNAVAILABLE, f"the episode was not stored: {held}"
         except OSError as error:
-            return HTTPStatus.INSUFFICIENT_STORAGE, f"the episode was not stored: {error.strerror or error}"
+            return HTTPStatus.INSUFFICIENT_STORAGE, f"the episode was not stored: {reason_of(error)}"
         return HTTPStatus.CREATED if is_new else HTTPStatus.OK, "stored"
 
     def _refusal(self) -> tuple[HTTPStatus, str] | None:

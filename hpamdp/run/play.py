@@ -17,11 +17,10 @@ import torch
 from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
 from hpamdp.env.page import EpisodeError, Page
 from hpamdp.files import replacing
-from hpamdp.messages import first_line, reason_of, say, warn
-from hpamdp.regular_files import read_regular
+from hpamdp.messages import file_and_reason, first_line, reason_of, say, warn
 from hpamdp.run.assemble import make_env
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.folder import POLICY_NAME, SUMMARY_NAME
+from hpamdp.run.folder import POLICY_NAME, saved_summary
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.run.players import Player, load_player, split_words, whole_number
 from hpamdp.run.resume import saved_choices
@@ -35,7 +34,6 @@ Play a problem yourself, beside agents.
   hpamdp play --export site                        the page as files that need no server
 """
 _LOOPBACK = "127.0.0.1"
-_MAX_SUMMARY_BYTES = 1 << 24
 _ONE_EPISODE = ("eval.layouts=1", "film=false")
 
 
@@ -146,11 +144,7 @@ def _agent(path: Path, player: Player) -> dict[str, Any] | None:
     config = player.config
     name = path.name if path.is_dir() else path.parent.name
     title = config.low.name if config.high.cls is None else f"{config.high.name} + {config.low.name}"
-    summary = (path if path.is_dir() else path.parent) / SUMMARY_NAME
-    try:
-        score = json.loads(read_regular(summary, _MAX_SUMMARY_BYTES))["score"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        score = None
+    score: Any = saved_summary(path if path.is_dir() else path.parent).get("score")
     options = json.loads(json.dumps(dict(config.env.options)))
     return {
         "name": name,
@@ -175,7 +169,7 @@ def export(page: Page, data: dict[str, Any], folder: Path) -> None:
         with replacing(folder / DATA_NAME) as partial:
             partial.write_bytes(as_script(data))
     except OSError as error:
-        raise ConfigError(f"--export {folder}: {error.strerror or error}") from error
+        raise ConfigError(f"--export {folder}: {reason_of(error)}") from error
 
 
 def serve(page: Page, data: dict[str, Any], options: argparse.Namespace) -> int:
@@ -185,13 +179,11 @@ def serve(page: Page, data: dict[str, Any], options: argparse.Namespace) -> int:
     except EpisodeError as error:
         raise ConfigError(f"--to {error}") from error
     except OSError as error:
-        raise ConfigError(f"--to {reason_of(error)}") from error
+        raise ConfigError(f"--to {file_and_reason(error)}") from error
     try:
         server = PageServer((options.host, options.port), page, data, episodes)
     except (OSError, TypeError) as error:  # the latter for a name that is too long
-        raise ConfigError(
-            f"--host {options.host} --port {options.port}: {getattr(error, 'strerror', None) or first_line(error)}"
-        ) from error
+        raise ConfigError(f"--host {options.host} --port {options.port}: {reason_of(error)}") from error
     if options.host != _LOOPBACK:
         warn(f"--host {options.host}: others who reach this address can play and add episodes to {options.to}")
     say(f"{server.address}: episodes go to {options.to}; Ctrl-C ends it")

@@ -26,7 +26,7 @@ from omegaconf import DictConfig, open_dict, read_write
 
 from hpamdp.config import ConfigError, job_overrides
 from hpamdp.files import remove_link, replacing
-from hpamdp.messages import one_line, say, warn
+from hpamdp.messages import one_line, reason_of, say, warn
 from hpamdp.run.folder import ERROR_NAME, check_no_link, is_about_folder, locked, saved_summary
 from hpamdp.run.search import go_on
 from hpamdp.run.stopping import exits_told, pass_on_signal
@@ -190,7 +190,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     except Exception as error:
         job.state, job.reason = _FAILED, one_line("".join(traceback.format_exception_only(error)))
         if isinstance(error, OSError) and is_about_folder(error, folder):
-            job.reason = f"its folder cannot be made or written to: {error.strerror or error}"
+            job.reason = f"its folder cannot be made or written to: {reason_of(error)}"
         with suppress(OSError), replacing(folder / ERROR_NAME) as partial:
             partial.write_text(traceback.format_exc())
     records.write(job)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hpamdp.analysis import film
 from hpamdp.config import ConfigError
-from hpamdp.messages import say
+from hpamdp.messages import reason_of, say
 from hpamdp.run.players import load_player, split_words, whole_number
 
 _DESCRIPTION = """\
@@ -60,7 +60,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     except film.FilmError as error:
         raise ConfigError(f"--to {error}") from error
     except OSError as error:
-        raise ConfigError(f"--to {options.to}: {error.strerror or error}") from error
+        raise ConfigError(f"--to {options.to}: {reason_of(error)}") from error
     scores = ", ".join(f"{score:.2f}" for score in played["score"])
     say(f"{options.to}: {len(played['score'])} episodes, scores {scores}")
     return 0

@@ -21,7 +21,15 @@ from hpamdp.data.human.released_file import FILE_NAME, PATH_VARIABLE, QUIRKS, SH
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
-from hpamdp.messages import first_line, lenient_streams, lost_output, one_line, reopen_standard_streams, say, warn
+from hpamdp.messages import (
+    lenient_streams,
+    lost_output,
+    one_line,
+    reason_of,
+    reopen_standard_streams,
+    say,
+    warn,
+)
 
 _USAGE_ERROR = 2
 _INTERRUPTED = 130
@@ -51,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if code or error is None:
             return code
         if not isinstance(error, BrokenPipeError):  # a reader such as `head` has seen enough
-            warn(f"stdout: {getattr(error, 'strerror', None) or first_line(error)}")
+            warn(f"stdout: {reason_of(error)}")
         return 1
 
 

@@ -23,6 +23,7 @@ from hpamdp.data.human.released_file import SHA256, default_path, load_bytes, re
 from hpamdp.data.human.transitions import transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.episode import MAX_PRESSES, ObservationForm, RewardForm
+from hpamdp.messages import reason_of
 from hpamdp.specs import PAMDPSpecs
 
 _FORMAT = 1  # to be raised whenever the transitions of the same file change
@@ -144,7 +145,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         try:
             return self.data_path.exists()
         except OSError as error:
-            raise DataError(f"{self.data_path}: {error.strerror or error}") from error
+            raise DataError(f"{self.data_path}: {reason_of(error)}") from error
 
 
 def _name(**settings: Any) -> str:

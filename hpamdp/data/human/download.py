@@ -11,6 +11,7 @@ import pooch
 
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import SHA256, check_sum, default_path, load_bytes
+from hpamdp.messages import reason_of
 
 
 def download(url: str, target: Path | None = None, *, checksum: str = SHA256) -> Path:
@@ -31,7 +32,7 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
     try:
         is_there = target.exists()
     except OSError as error:
-        raise DataError(f"{target}: {error.strerror or error}") from error
+        raise DataError(f"{target}: {reason_of(error)}") from error
     if is_there:
         check_sum(load_bytes(target), checksum, target)
         return target

@@ -21,6 +21,7 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human import schema
 from hpamdp.data.human.matfile import read_variable
 from hpamdp.env.boatdock import harbour, physics
+from hpamdp.messages import reason_of
 from hpamdp.regular_files import read_regular
 
 FILE_NAME = "BDtrajectory40.mat"
@@ -107,7 +108,7 @@ def load_bytes(path: Path) -> bytes:
             "`python -m hpamdp.data.human download --url URL`"
         ) from error
     except OSError as error:
-        raise DataError(f"{path}: {error.strerror or error}") from error
+        raise DataError(f"{path}: {reason_of(error)}") from error
 
 
 def check_sum(data: bytes, checksum: str, path: Path) -> None:

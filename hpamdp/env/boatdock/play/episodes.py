@@ -22,7 +22,7 @@ from hpamdp.env.boatdock.episode import MAX_PRESSES
 from hpamdp.env.boatdock.play.replay import HELD, Press, Replay, replay, settle
 from hpamdp.env.page import EpisodeError
 from hpamdp.json_lines import left_out, lines_of, read_json
-from hpamdp.messages import warn
+from hpamdp.messages import reason_of, warn
 from hpamdp.regular_files import read_regular
 
 FORMAT = 1
@@ -147,7 +147,7 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
     except FileNotFoundError as error:
         raise EpisodeError(f"{path}: there is no such file; `hpamdp play` writes one") from error
     except OSError as error:
-        raise EpisodeError(f"{path}: {error.strerror or error}") from error
+        raise EpisodeError(f"{path}: {reason_of(error)}") from error
     parsed: dict[int, Episode] = {}
     problems: dict[int, str] = {}
     for number, line in lines_of(data):
