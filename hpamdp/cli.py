@@ -129,7 +129,7 @@ def _main() -> None:
     try:
         _check_surroundings()
         if sys.argv[1:2] and sys.argv[1] in _COMMANDS:
-            with _limits_told():
+            with _limits_explained():
                 sys.exit(_run_command(sys.argv[1], sys.argv[2:]))
         conf = conf_dir()
         arguments = _parse()
@@ -151,7 +151,7 @@ def _main() -> None:
 
 
 @contextmanager
-def _limits_told() -> Iterator[None]:
+def _limits_explained() -> Iterator[None]:
     """Exit with 1 and one line if the process runs out of files or memory, whichever library raises the error."""
     try:
         yield
@@ -258,7 +258,7 @@ def _run_hydra(conf: Path, arguments: argparse.Namespace) -> None:
     def job(cfg: DictConfig) -> float | None:
         nonlocal has_started
         has_started = True
-        with _limits_told():
+        with _limits_explained():
             return _run_job(cfg, start)
 
     protect_children()

@@ -1,4 +1,4 @@
-"""The folder of a run: one process at a time, one run at a time, and no results are overwritten unasked."""
+"""The folder of a run: one process and one run at a time; results are overwritten only if the user says so."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
     values = {key: cfg[key] for key in _BEGIN}
     if config.run.mode == "eval":
         values |= {group: _plain_value(cfg, group) for group in _NOT_EVALUATED}
-    keys = map(_key, _anew(overrides, saved, file, where))
+    keys = map(_key, _changes(overrides, saved, file, where))
     values |= {key: _plain_value(cfg, key) for key in keys if not key.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     return read_saved(saved, values, names, trust=config.run.trust, file=file), file
@@ -76,7 +76,7 @@ def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str
     """
     file = checkpoint.find(source, where)
     saved = checkpoint.progress_of(file)["config"]
-    _anew(overrides, saved, file, where)
+    _changes(overrides, saved, file, where)
     left_out = () if where == "resume" else _NOT_EVALUATED
     return {group: name for group, name in choices_of(saved).items() if group not in left_out}
 
@@ -129,14 +129,14 @@ def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple
     return env.option_names if env.has_choice else ()
 
 
-def _anew(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
-    """Return the words that set something anew: without those that choose for a group what the saved run has."""
+def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
+    """Return the words that change the saved run, without repeated choices of its groups."""
     choices = choices_of(saved)
-    anew = [word for word in overrides if _key(word) not in GROUPS or _choice(word) != choices[_key(word)]]
-    for word in anew:
+    changes = [word for word in overrides if _key(word) not in GROUPS or _choice(word) != choices[_key(word)]]
+    for word in changes:
         if _key(word).split(".")[0] in _AGENT:
             raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")
-    return anew
+    return changes
 
 
 def _key(override: str) -> str:
