@@ -112,12 +112,16 @@ def test_linked_folders_count_once_and_unreadable_runs_are_named(tmp_path, capsy
     (study / "cut/summary.json").write_text('{"score": 1.')
     leave_run(study / "nested")
     (study / "nested/config.yaml").write_text("[" * 9_999)
+    leave_run(study / "aliases")
+    lists = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))
+    (study / "aliases/config.yaml").write_text(f"a0: &a0 [1]\n{lists}")
     leave_run(study / "pipe")
     (study / "pipe/summary.json").unlink()
     os.mkfifo(study / "pipe/summary.json")
     runs = finished([study, study / "a"])
     assert sorted(run.summary["seed"] for run in runs) == [0, 1, 2]
     assert sorted(capsys.readouterr().err.splitlines()) == [
+        f"{study / 'aliases'}: config.yaml is missing or damaged, left out",
         f"{study / 'cut'}: summary.json is missing or damaged, left out",
         f"{study / 'gone'}: a link to nothing, left out",
         f"{study / 'nested'}: config.yaml is missing or damaged, left out",

@@ -60,7 +60,8 @@ def left(wanted: Config, folder: Path, name: str = "its folder") -> Left:
             "folder, or move this one away"
         )
     summary = saved_summary(folder)
-    return Left(summary["score"] if summary.get("finished") else None, file if file.exists() else None)
+    score = summary.get("score") if summary.get("finished") else None
+    return Left(score if isinstance(score, int | float) else None, file if file.exists() else None)
 
 
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:

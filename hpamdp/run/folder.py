@@ -18,6 +18,7 @@ from hpamdp.config import ConfigError
 from hpamdp.files import remove_link, replacing
 from hpamdp.regular_files import read_regular
 from hpamdp.shell import path_setting
+from hpamdp.yaml_files import check_size
 
 # The value of `resume` that continues the run in its own folder, or starts it there.
 AUTO = "auto"
@@ -128,8 +129,10 @@ def check_no_training(folder: Path) -> None:
 def saved_config(folder: Path) -> dict[str, Any]:
     """Return the config of the run in a folder; empty if it is missing or cannot be read."""
     try:
-        config = yaml.safe_load(read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES))
-    except (OSError, yaml.YAMLError, RecursionError):
+        text = read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES)
+        check_size(folder / CONFIG_NAME)
+        config = yaml.safe_load(text)
+    except (OSError, yaml.YAMLError, RecursionError, ConfigError):
         return {}
     return config if isinstance(config, dict) else {}
 

@@ -40,6 +40,8 @@ def checked_state(saved: Any, parts: Parts) -> CollectionState:
                 raise ValueError(f"the state is of {sizes.pop()} environments, but there are {env.num_envs}")
         check_columns("env", state.env, own)
         env.check_env_state(state.env)
+        if env.keeps_episodes and state.root is None:
+            raise ValueError("root is missing, from which the episodes in env go on")
     for generator in state.generators:
         check_generator(generator)
     for name, steps in (("root", state.root), ("coming", state.coming)):
