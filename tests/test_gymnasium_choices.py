@@ -117,6 +117,11 @@ def test_a_mask_in_a_place_that_is_not_read_is_reported_in_one_line(where, name)
         misplaced(where, name, [1, 0])
 
 
+def test_a_mask_in_a_row_of_its_own_is_reported_too():
+    with pytest.raises(ValueError, match="gave an action_mask as"):
+        misplaced("info", "mask", np.array([[1, 0]]))
+
+
 class Methods(gymnasium.Wrapper):
     """Has the method of sb3-contrib, as its ActionMasker does."""
 

@@ -164,7 +164,9 @@ def _is_like_mask(value: Any, size: int) -> bool:
     if callable(value) or isinstance(value, property):
         return True
     numbers = as_numbers(value)
-    return numbers is not None and numbers.shape == (size,) and bool(((numbers == 0) | (numbers == 1)).all())
+    if numbers is None or not numbers.size == size == max(numbers.shape, default=0):
+        return False
+    return bool(((numbers == 0) | (numbers == 1)).all())
 
 
 def _cannot_be_mask(value: Any) -> bool:
