@@ -1,4 +1,4 @@
-"""Try thousands of hostile inputs of all kinds, and list those that end otherwise than they should."""
+"""Try thousands of hostile inputs, and list each one that ends in a wrong way."""
 
 from __future__ import annotations
 

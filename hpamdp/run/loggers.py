@@ -365,7 +365,7 @@ def _wandb_setup(settings: Any) -> Any:
 
 
 def _wandb_id(folder: Path) -> str | None:
-    """Return the id of the wandb run in a run's folder; None if there is none."""
+    """Return the id of the wandb run in a run's folder, or None if the folder has no wandb run."""
     names = sorted(path.name for path in (folder / WANDB_NAME).glob("*run-*"))
     found = [re.fullmatch(r"(?:offline-)?run-\d{8}_\d{6}-(.+)", name) for name in names]
     ids = [match.group(1) for match in found if match]

@@ -75,7 +75,7 @@ def pass_on_signal() -> None:
 
 
 def _changeable_signals() -> tuple[signal.Signals, ...]:
-    """Return the signals whose handlers this thread can set: those that stop a run, in the main thread."""
+    """Return the signals that this thread can handle. Only the main thread can handle any."""
     return STOP_SIGNALS if threading.current_thread() is threading.main_thread() else ()
 
 

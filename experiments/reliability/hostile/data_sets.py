@@ -8,6 +8,7 @@ import os
 import random
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -91,13 +92,13 @@ def _change(value: Any, path: tuple[Any, ...], new: Any) -> None:
         value[path[-1]] = new
 
 
+@dataclass(frozen=True)
 class _Lines:
     """Read a file with one strange line; the right lines must be read, or the file refused."""
 
-    def __init__(self, episodes: list[dict], line: bytes, place: str) -> None:
-        self.episodes = episodes
-        self.line = line
-        self.place = place
+    episodes: list[dict]
+    line: bytes
+    place: str
 
     def __call__(self, folder: Path) -> str:
         right = [json.dumps(episode).encode() for episode in self.episodes]
@@ -113,11 +114,11 @@ class _Lines:
         return ACCEPTED if is_sane else f"{SILENT}: durations that nobody pressed"
 
 
+@dataclass(frozen=True)
 class _Special:
     """Read from a path that is no file of episodes."""
 
-    def __init__(self, path: str) -> None:
-        self.path = path
+    path: str
 
     def __call__(self, folder: Path) -> str:
         path = folder / self.path.replace(" ", "_")
@@ -169,13 +170,13 @@ def _matters(key: Any, change: str) -> bool:
     return is_read
 
 
+@dataclass(frozen=True)
 class _Rows:
     """Make a data set of transitions of which one value is another one."""
 
-    def __init__(self, transitions: Any, key: Any, change: str) -> None:
-        self.transitions = transitions
-        self.key = key
-        self.change = change
+    transitions: Any
+    key: Any
+    change: str
 
     def __call__(self, folder: Path) -> str:
         rows = self.transitions.clone()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -233,15 +234,15 @@ def _written(value: Any) -> str:
     return f"{type(value).__name__} {str(value)[:40]}"
 
 
+@dataclass(frozen=True)
 class _Play:
     """Play some steps; a value that the space holds must be taken."""
 
-    def __init__(self, leaf: spaces.Space, place: str, late: int, returns: dict[str, Any], *, is_fine: bool) -> None:
-        self.leaf = leaf
-        self.place = place
-        self.late = late
-        self.returns = returns
-        self.is_fine = is_fine
+    leaf: spaces.Space
+    place: str
+    late: int
+    returns: dict[str, Any]
+    is_fine: bool
 
     def __call__(self, folder: Path) -> str:
         kwargs = {"leaf": self.leaf, "place": self.place, "late": self.late, "returns": self.returns}
@@ -260,13 +261,13 @@ def _steps(kwargs: dict[str, Any]) -> tuple[GymnasiumEnv, TensorDict]:
     return env, env.rollout(6, break_when_any_done=False)
 
 
+@dataclass(frozen=True)
 class _Masked:
     """Play an environment that forbids the second action; no forbidden one may be taken without a word."""
 
-    def __init__(self, name: str, value: Any, where: str) -> None:
-        self.name = name
-        self.value = value
-        self.where = where
+    name: str
+    value: Any
+    where: str
 
     def __call__(self, folder: Path) -> str:
         name, value, where = self.name, self.value, self.where

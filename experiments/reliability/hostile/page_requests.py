@@ -7,6 +7,7 @@ import random
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +64,11 @@ def _post(body: bytes, *headers: str) -> bytes:
     return "\r\n".join(["POST /episodes HTTP/1.1", *given.values(), "", ""]).encode() + body
 
 
+@dataclass(frozen=True)
 class _Request:
     """Send bytes to a server; it must answer or close, keep its file right, and serve the next one."""
 
-    def __init__(self, text: bytes) -> None:
-        self.text = text
+    text: bytes
 
     def __call__(self, folder: Path) -> str:
         file = folder / "played.jsonl"

@@ -10,6 +10,7 @@ import os
 import random
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -232,13 +233,13 @@ def _without(value: Any, path: tuple[Any, ...]) -> Any:
     return new
 
 
+@dataclass(frozen=True)
 class _Resume:
     """Go on with changed contents, or evaluate them."""
 
-    def __init__(self, agent: Path, way: str, members: Members) -> None:
-        self.agent = agent
-        self.way = way
-        self.members = members
+    agent: Path
+    way: str
+    members: Members
 
     def __call__(self, folder: Path) -> str:
         _write(self.members, folder / "checkpoint.zip")
@@ -340,14 +341,14 @@ def build(*args, **kwargs): return Canary()
 """
 
 
+@dataclass(frozen=True)
 class _OpenConfig:
     """Open a file whose config was changed; nothing that it names may run, and no secret may be written."""
 
-    def __init__(self, agent: Path, way: str, name: str, change: Callable[[dict], None]) -> None:
-        self.agent = agent
-        self.way = way
-        self.name = name
-        self.change = change
+    agent: Path
+    way: str
+    name: str
+    change: Callable[[dict], None]
 
     def __call__(self, folder: Path) -> str:
         (folder / "run").mkdir()
@@ -398,14 +399,14 @@ def _links(agents: dict[str, Path]) -> Iterator[Case]:
                 )
 
 
+@dataclass(frozen=True)
 class _Linked:
     """Run in a folder in which one file is a link to a file elsewhere, which must stay as it is."""
 
-    def __init__(self, agent: Path, name: str, way: str, link: str) -> None:
-        self.agent = agent
-        self.name = name
-        self.way = way
-        self.link = link
+    agent: Path
+    name: str
+    way: str
+    link: str
 
     def __call__(self, folder: Path) -> str:
         here = folder / "theirs"
@@ -449,14 +450,14 @@ BOMBS: dict[str, Callable[[], torch.Tensor]] = {
 }
 
 
+@dataclass(frozen=True)
 class _Bomb:
     """Resume from a file in which one member has a large tensor."""
 
-    def __init__(self, agent: Path, members: Members, member: str, name: str) -> None:
-        self.agent = agent
-        self.members = members
-        self.member = member
-        self.name = name
+    agent: Path
+    members: Members
+    member: str
+    name: str
 
     def __call__(self, folder: Path) -> str:
         # Written by another process, whose memory does not count.
