@@ -11,7 +11,9 @@ from toy_options import Crossing
 
 from hpamdp import keys
 from hpamdp.config import Config, ConfigError
+from hpamdp.env.base import ProblemError
 from hpamdp.env.choice import OptionChoiceEnv
+from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.train import Trainer
@@ -257,3 +259,13 @@ def test_returns_over_frozen_learners_are_discounted_by_the_step_of_the_episode(
     steps = 1 + torch.log(after[keys.REWARD][arrived]) / math.log(0.9)
     assert arrived.any() and (steps >= 3 - 1e-3).all()
     torch.testing.assert_close(steps, steps.round(), atol=1e-3, rtol=0.0)
+
+
+@pytest.mark.parametrize("names", [5, "ab", [1, 2], ("a", "a")])
+def test_names_of_options_that_are_no_list_of_names_are_refused_for_every_environment(names, tmp_path, monkeypatch):
+    for cls, config in ((Crossing, crossing()), (RoomsEnv, make_config([*SMALL, "env=rooms", "low=random"]))):
+        monkeypatch.setattr(cls, "option_names", names)
+        with pytest.raises(
+            ProblemError, match=r"^option_names (is .*, but must be a list of names|has a name twice: a)"
+        ):
+            make(config, tmp_path)

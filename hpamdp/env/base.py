@@ -317,7 +317,12 @@ class PAMDPEnv(EnvBase):
         """Scale observations as the other environment does, now and later, where their scale is learned."""
 
     def make_action_spec(self, low: Tensor, high: Tensor, *, has_option: bool = False) -> Composite:
-        """Return the spec of the action leaves, given the bounds `[num_parameters]` of all parameters."""
+        """Return the spec of the action leaves, given the bounds `[num_parameters]` of all parameters.
+
+        Raises:
+            ProblemError: `option_names` is not a list of different names.
+        """
+        self.option_names = checked_option_names(self.option_names)
         n, device = self.batch_size, self.device
         low, high = (side.to(device, torch.float32).expand(*n, -1) for side in (low, high))
         action = Composite(
@@ -389,3 +394,16 @@ class PAMDPEnv(EnvBase):
         flag = Binary(n=1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
         flags = {name: flag.clone() for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}
         return Composite(flags, shape=self.batch_size, device=self.device)
+
+
+def checked_option_names(given: object) -> tuple[str, ...]:
+    """Return the names of options as a tuple.
+
+    Raises:
+        ProblemError: the value is not a list of names, or a name occurs twice.
+    """
+    if not isinstance(given, list | tuple) or not all(isinstance(name, str) for name in given):
+        raise ProblemError(f"option_names is {given!r:.80}, but must be a list of names")
+    if len({*given}) < len(given):
+        raise ProblemError(f"option_names has a name twice: {', '.join(given)}")
+    return tuple(given)

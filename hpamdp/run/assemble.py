@@ -17,7 +17,7 @@ from torchrl.envs import TransformedEnv
 from hpamdp.config import Component, Config, ConfigError, constructor_arguments
 from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.errors import DataError
-from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.base import PAMDPEnv, checked_option_names
 from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
@@ -105,6 +105,7 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
     if first_env > 0 and "first_env" not in arguments:
         seed = int(np.random.SeedSequence((seed, first_env)).generate_state(1)[0])
     env: PAMDPEnv = config.env.build(num_envs=num_envs, device=device, seed=seed, first_env=first_env, **needs)
+    env.option_names = checked_option_names(env.option_names)
     if config.run.env.options is not None:
         _group_actions(env, config)
     return env

@@ -18,7 +18,7 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
-from hpamdp.env.base import PAMDPEnv, ProblemError
+from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
 from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import checked
 from hpamdp.env.gymnasium.four_value import FourValueEnv
@@ -239,12 +239,10 @@ class GymnasiumEnv(PAMDPEnv):
     def _names_of_options(self) -> tuple[str, ...]:
         num_options = self._options.num_options
         given = getattr(self.envs[0].unwrapped, "option_names", ())
-        given = () if given is None else given
-        if not isinstance(given, list | tuple) or not all(isinstance(name, str) for name in given):
-            raise ValueError(f"{self._name}: option_names is {given!r:.80}, but must be a list of names")
-        names = tuple(given)
-        if len({*names}) < len(names):
-            raise ValueError(f"{self._name}: option_names has a name twice: {', '.join(names)}")
+        try:
+            names = checked_option_names(() if given is None else given)
+        except ProblemError as error:
+            raise ValueError(f"{self._name}: {error}") from error
         return names if num_options and len(names) == num_options else tuple(f"option{i}" for i in range(num_options))
 
     def _make_specs(self) -> None:
