@@ -265,7 +265,5 @@ def test_returns_over_frozen_learners_are_discounted_by_the_step_of_the_episode(
 def test_names_of_options_that_are_no_list_of_names_are_refused_for_every_environment(names, tmp_path, monkeypatch):
     for cls, config in ((Crossing, crossing()), (RoomsEnv, make_config([*SMALL, "env=rooms", "low=random"]))):
         monkeypatch.setattr(cls, "option_names", names)
-        with pytest.raises(
-            ProblemError, match=r"^option_names (is .*, but must be a list of names|has a name twice: a)"
-        ):
+        with pytest.raises((ProblemError, ConfigError), match=r"option_names (is .* a list|has a name twice)"):
             make(config, tmp_path)
