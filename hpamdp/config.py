@@ -22,6 +22,8 @@ import hydra
 import yaml
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import (
@@ -38,6 +40,7 @@ from pydantic import (
 
 from hpamdp.memory import is_about_memory
 from hpamdp.messages import first_line
+from hpamdp.settings import Settings
 
 if TYPE_CHECKING:
     import torch  # takes seconds, and the help page needs this module too
@@ -274,8 +277,9 @@ class Component:
             return None
         accepted = constructor_arguments(self.cls)
         supplied = {name: value for name, value in context.items() if name in accepted}
+        settings = {"options": options_model(self.cls)(**self.options)} if takes_options(self.cls) else self.options
         try:
-            return self.cls(**supplied, **self.options)
+            return self.cls(**supplied, **settings)
         except ValueError as error:
             if not _is_deliberate(error, self.cls):
                 raise
@@ -534,7 +538,7 @@ def component(group: str, name: str, node: Any) -> Component:
             f"{group}={name}: {class_name} has an argument {taken[0]}, but {group}.{taken[0]} is a value of the run; "
             f"rename the argument ({file})"
         )
-    schema = create_model(class_name, __config__=_STRICT) if cls is None else _schema(cls, GROUPS[group])
+    schema = create_model(class_name, __config__=_STRICT) if cls is None else options_model(cls, GROUPS[group])
     model = _validated(schema, options, f"{group}.", f"option of {class_name} ({file})", f"{class_name}, {file}")
     return Component(group, name, cls, {option: getattr(model, option) for option in schema.model_fields})
 
@@ -676,8 +680,23 @@ def plain(node: Any, where: str = "the config") -> dict[str, Any]:
     return {str(name): value for name, value in container.items()}
 
 
-def _schema(cls: type, supplied: Iterable[str]) -> type[BaseModel]:
-    """Return a model with a field for each argument of the constructor that the program does not supply."""
+def takes_options(cls: type) -> bool:
+    """Return whether the constructor takes a model of settings; other classes have a setting for each argument."""
+    return hasattr(cls, "Options") and "options" in constructor_arguments(cls)
+
+
+def options_model(cls: type, supplied: Iterable[str] = ()) -> type[BaseModel]:
+    """Return the model of a class's settings: its `Options`, or one made of its constructor's arguments.
+
+    Args:
+        cls: the class.
+        supplied: arguments of its constructor that are no settings.
+    """
+    if takes_options(cls):
+        model = cls.Options  # type: ignore[attr-defined]
+        if not (inspect.isclass(model) and issubclass(model, Settings)):
+            raise ConfigError(f"{cls.__name__}.Options: must be a subclass of hpamdp.settings.Settings")
+        return model
     hints = get_type_hints(cls.__init__, include_extras=True)  # type: ignore[misc]  # as in `constructor_arguments`
     fields: dict[str, Any] = {}
     for name, argument in constructor_arguments(cls).items():
@@ -689,6 +708,39 @@ def _schema(cls: type, supplied: Iterable[str]) -> type[BaseModel]:
         return create_model(cls.__name__, __config__=_STRICT, **fields)
     except PydanticUserError as error:
         raise ConfigError(f"{cls.__name__}: has an argument that no yaml file can hold: {first_line(error)}") from error
+
+
+def complete_yaml_files() -> None:
+    """Have Hydra add to each yaml file that names a class the defaults of the class's other settings.
+
+    So the composed config has all settings: the command line can override them, `--cfg job` shows them, and other yaml
+    files can refer to them.
+    """
+    sources: list[Any] = [each for each in Plugins.instance().discover(ConfigSource) if each.scheme() == "file"]
+    for source in sources:
+        if not hasattr(source, "load_alone"):
+            source.load_alone = source.load_config
+            source.load_config = _load_complete
+
+
+def _load_complete(source: Any, config_path: str) -> ConfigResult:
+    result: ConfigResult = source.load_alone(config_path)
+    group, cfg = config_path.partition("/")[0], result.config
+    target = cfg.get(TARGET) if group in GROUPS and isinstance(cfg, DictConfig) else None
+    if isinstance(target, str):
+        try:
+            model = options_model(load_class(target), GROUPS[group])
+        except ConfigError:  # which `component` will raise again, with the name of the file
+            return result
+        result.config = OmegaConf.merge(defaults_of(model), cfg)
+    return result
+
+
+def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the default of each setting as yaml holds it; `???` for settings that have none."""
+    fields = model.model_fields
+    defaults = model.model_construct().model_dump(mode="json", warnings=False)
+    return {name: "???" if fields[name].is_required() else defaults[name] for name in fields}
 
 
 def _validated(model: type[BaseModel], values: dict[str, Any], prefix: str, what: str, where: str) -> Any:
@@ -790,3 +842,6 @@ def _is_deliberate(error: ValueError, cls: type) -> bool:
     frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
     is_own = frame.f_globals["__name__"].partition(".")[0] == cls.__module__.partition(".")[0]
     return is_own and linecache.getline(frame.f_code.co_filename, line).lstrip().startswith("raise ")
+
+
+complete_yaml_files()

@@ -26,9 +26,9 @@ from hpamdp.policies.high_level.oracle import Oracle
 from hpamdp.policies.high_level.uniform import Uniform
 from hpamdp.policies.low_level.random import Random
 from hpamdp.policies.random_agent import random_agent
-from hpamdp.policies.shared.fractions import Fraction
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.single import SingleCollection
+from hpamdp.settings import Fraction
 from hpamdp.specs import PAMDPSpecs
 
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
-from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridActor
 from hpamdp.policies.shared.networks import mlp
+from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 RAW = "raw_parameters"  # the parameters as they were sampled, before they are clipped to their bounds

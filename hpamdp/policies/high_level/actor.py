@@ -21,19 +21,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
-from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import masked_logits
 from hpamdp.policies.shared.networks import mlp, sample_index
-from hpamdp.policies.shared.on_policy import OnPolicy
+from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions
+from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 # Of the held option at its decision, float32 [*B] each.
@@ -42,43 +42,42 @@ WEIGHT = "option_weight"  # its probability by the policy over the one with whic
 ALLOWED = "option_allowed"  # the options that could be chosen there, bool [*B, num_options], if not always all of them
 
 
+class ActorOptions(OnPolicyOptions):
+    """Settings of `Actor`; the rows of an update are decisions."""
+
+    hidden_dims: Widths = (128, 128)
+    """Hidden layers of the policy and of the value network."""
+    gamma: PositiveFraction = 1.0
+    """Discount of an environment step, both within an option's return and for the value of the next decision."""
+    epochs: Annotated[int, Field(ge=1, le=1000)] = 4
+    """Passes over the collected decisions in an update."""
+    minibatch_size: PositiveInt = 256
+    """Decisions in an optimisation step, and the least number of decisions that an update waits for."""
+    entropy: NonNegativeFloat = 0.1
+    """Weight of the entropy bonus. With 0.02 the policy settles on the option whose learner improves first."""
+
+
 class Actor(OnPolicy, Selector):
-    """Sample the option from a softmax over the outputs of a network.
+    """Sample the option from a softmax over the outputs of a network."""
 
-    Args:
-        specs: of the problem.
-        device: where the networks live.
-        hidden_dims: of the policy and of the value.
-        gamma: discount of an environment step, of the options' returns and of what follows them.
-        entropy: weight of the entropy bonus.
-        lr: learning rate of Adam.
-        epochs, minibatch_size, clip, max_grad_norm: as in `OnPolicy`, whose rows are decisions here.
-    """
-
+    Options = ActorOptions
     modes: ClassVar[tuple[str, ...]] = ("train",)
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: list[PositiveInt],
-        gamma: PositiveFraction,
-        epochs: PositiveInt,
-        minibatch_size: PositiveInt,
-        clip: PositiveFloat,
-        entropy: NonNegativeFloat,
-        lr: LearningRate,
-        max_grad_norm: PositiveFloat,
+        device: torch.device | str = "cpu",
+        options: ActorOptions | None = None,
+        **settings: Any,
     ) -> None:
-        super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
+        super().__init__(specs)
+        self.options: ActorOptions = ActorOptions.of(options, settings)
         self.out_keys = [*self.out_keys, LOG_PROB, WEIGHT, *([ALLOWED] if specs.has_option_mask else [])]
-        self.gamma = gamma
-        self.entropy = entropy
-        self.logits = mlp(specs.observation_dim, hidden_dims, specs.num_options)
-        self.critic = mlp(specs.observation_dim, hidden_dims, 1)
+        self.gamma = self.options.gamma
+        self.logits = mlp(specs.observation_dim, self.options.hidden_dims, specs.num_options)
+        self.critic = mlp(specs.observation_dim, self.options.hidden_dims, 1)
         self.to(device)
-        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=self.options.lr, eps=1e-5, fused=True)
 
     @torch.no_grad()
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
@@ -112,7 +111,7 @@ class Actor(OnPolicy, Selector):
 
     def decisions_to_update(self) -> dict[str, int]:
         """Return the size of a minibatch."""
-        return {"minibatch_size": self.minibatch_size}
+        return {"minibatch_size": self.options.minibatch_size}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
@@ -154,5 +153,5 @@ class Actor(OnPolicy, Selector):
         surrogate = (rows["weight"] * self.surrogate(log_prob - rows["log_prob"], rows["advantage"])).mean()
         entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
         critic_loss = (rows["weight"] * (self.critic(rows["state"]).squeeze(-1) - rows["target"]).square()).mean()
-        loss = 0.5 * critic_loss - surrogate - self.entropy * entropy
+        loss = 0.5 * critic_loss - surrogate - self.options.entropy * entropy
         return loss, {"critic": critic_loss, "entropy": entropy}

@@ -12,8 +12,8 @@ from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
 from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
-from hpamdp.policies.shared.fractions import Fraction
 from hpamdp.policies.shared.masks import random_choice
+from hpamdp.settings import Fraction
 from hpamdp.specs import PAMDPSpecs
 
 

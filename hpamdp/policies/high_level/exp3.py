@@ -19,8 +19,8 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, RewardStatistics
-from hpamdp.policies.shared.fractions import PositiveFraction
 from hpamdp.policies.shared.masks import masked_values
+from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 PROBABILITY = "option_probability"  # of the held option at its decision, float32 [*B]

@@ -26,11 +26,11 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import masked_values
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
 from hpamdp.policies.shared.portable import portable_ensemble
 from hpamdp.policies.shared.replay import first_multiple, linear_schedule
+from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 

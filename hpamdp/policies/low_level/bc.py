@@ -15,9 +15,9 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.policies.shared.fractions import LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 

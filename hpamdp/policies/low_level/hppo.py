@@ -11,7 +11,7 @@ Differs from the source:
 - the parameters are Gaussian in units where their bounds are [-1, 1]; the ratio is that of the raw sample, which is
   clipped only for execution, because the density of a squashed sample diverges at the bounds;
 - the Gaussian's standard deviation has a lower limit, because the ratios explode where it shrinks faster than the mean
-  moves; this limit, the learning rate and the entropy bonus are annealed over `anneal_frames` steps of the whole run;
+  moves; this limit, the learning rate and the entropy bonus are annealed over `anneal_steps` steps of the whole run;
 - with `vector_products` actors and critic see products of the vectors that the problem declares, too.
 
 The advantages are TorchRL's. Its ClipPPOLoss is not used because it multiplies the ratios of all heads and clips the
@@ -24,25 +24,87 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.objectives.value.functional import generalized_advantage_estimate
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.shared.default_dtype import float32_by_default
-from hpamdp.policies.shared.fractions import Fraction, LearningRate
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
-from hpamdp.policies.shared.on_policy import OnPolicy
+from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions
 from hpamdp.policies.shared.portable import portable_actor
+from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes what the ratios need: the raw sample of the parameters.
 RAW = "raw_parameters"
+
+
+class HPPOOptions(OnPolicyOptions):
+    """Settings of `HPPO`. Standard deviations are in units where the parameters' bounds are [-1, 1]."""
+
+    hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
+    """Hidden layers of the encoder that both actors share."""
+    critic_hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
+    """Hidden layers of the critic."""
+    vector_products: bool = False
+    """Show actors and critic the scalar and cross products of the vectors of the plane that the problem declares."""
+    initial_parameters: InitialParameters = "none"
+    """Initial means: `domain` takes the problem's own initial parameters, if it has any; `none` takes mid-range."""
+    initial_scale: PositiveFloat = 0.5
+    """Standard deviation of the parameters at the start."""
+    min_scale: PositiveFloat = 0.06
+    """Smallest standard deviation at the start."""
+    min_scale_final: PositiveFloat = 0.02
+    """Smallest standard deviation at the end; the limit is annealed from `min_scale` to this value."""
+    max_scale: PositiveFloat = 1.0
+    """Largest standard deviation."""
+    epochs: Annotated[int, Field(ge=1, le=1000)] = 5
+    """Passes over the collected steps in an update."""
+    gamma: Fraction = 0.99
+    """Discount of a step."""
+    gae_lambda: Fraction = 0.95
+    """Lambda of the generalised advantages: 0 bootstraps after one step, 1 at the end of the episode."""
+    lr: LearningRate = 1e-3
+    """Learning rate of actors and critic at the start."""
+    lr_final: Fraction = 1e-4
+    """Learning rate at the end; the rate is annealed from `lr` to this value."""
+    critic_weight: PositiveFloat = 0.5
+    """Weight of the critic's squared error beside the surrogates."""
+    discrete_entropy: NonNegativeFloat = 0.01
+    """Weight of the entropy bonus of the discrete action."""
+    parameter_entropy: NonNegativeFloat = 0.0
+    """Weight of the entropy bonus of the parameters."""
+    entropy_final: Fraction = 0.1
+    """Fraction of both entropy bonuses that is left at the end."""
+    anneal_steps: PositiveInt = 200_000
+    """Steps of the whole run over which learning rate, `min_scale` and entropy bonuses are annealed."""
+    max_grad_norm: PositiveFloat = 1.0
+    """Largest gradient norm, of actors and critic together."""
+    greedy_discrete: Literal["most_probable", "sampled"] = "most_probable"
+    """Discrete action of the greedy policy; its parameters are the means. `sampled` draws it, as in the published code.
+
+    Always taking the same one of two equally good actions may lead nowhere, as turning on the spot does.
+    """
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.min_scale < self.initial_scale < self.max_scale:
+            raise ValueError(
+                f"initial_scale={self.initial_scale}: must lie between min_scale={self.min_scale} and "
+                f"max_scale={self.max_scale}"
+            )
+        if not self.min_scale_final < self.max_scale:
+            raise ValueError(f"min_scale_final={self.min_scale_final}: must be less than max_scale={self.max_scale}")
+        if self.lr_final > self.lr:
+            raise ValueError(f"lr_final={self.lr_final}: must be at most lr={self.lr}")
+        return self
 
 
 class HPPOPolicy(TensorDictModuleBase):
@@ -78,73 +140,38 @@ class HPPOPolicy(TensorDictModuleBase):
 class HPPO(OnPolicy, Learner):
     """Clipped policy-gradient updates of both actors from the steps just collected."""
 
+    Options = HPPOOptions
+
     frames: Tensor
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
-        critic_hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
-        vector_products: bool,
-        initial_parameters: InitialParameters,
-        initial_scale: PositiveFloat,
-        min_scale: PositiveFloat,
-        min_scale_final: PositiveFloat,
-        max_scale: PositiveFloat,
-        epochs: PositiveInt,
-        minibatch_size: PositiveInt,
-        clip: PositiveFloat,
-        gamma: Fraction,
-        gae_lambda: Fraction,
-        lr: LearningRate,
-        lr_final: Fraction,
-        critic_weight: PositiveFloat,
-        discrete_entropy: NonNegativeFloat,
-        parameter_entropy: NonNegativeFloat,
-        entropy_final: Fraction,
-        anneal_frames: PositiveInt,
-        max_grad_norm: PositiveFloat,
-        greedy_discrete: Literal["most_probable", "sampled"],
+        device: torch.device | str = "cpu",
+        options: HPPOOptions | None = None,
+        **settings: Any,
     ) -> None:
-        if not min_scale < initial_scale < max_scale:
-            raise ValueError(f"initial_scale={initial_scale}: must lie between {min_scale=} and {max_scale=}")
-        if not min_scale_final < max_scale:
-            raise ValueError(f"min_scale_final={min_scale_final}: must be less than {max_scale=}")
-        if lr_final > lr:
-            raise ValueError(f"lr_final={lr_final}: must be at most {lr=}")
-        super().__init__(specs, epochs=epochs, minibatch_size=minibatch_size, clip=clip, max_grad_norm=max_grad_norm)
-        self.gamma = gamma
-        self.gae_lambda = gae_lambda
-        self.critic_weight = critic_weight
-        self.discrete_entropy = discrete_entropy
-        self.parameter_entropy = parameter_entropy
-        self.entropy_final = entropy_final
-        self.min_scale = min_scale
-        self.min_scale_final = min_scale_final
-        self.lr = lr
-        self.lr_final = lr_final
-        self.anneal_frames = anneal_frames
-
+        super().__init__(specs)
+        self.options: HPPOOptions = HPPOOptions.of(options, settings)
         self.actor = HybridActor(
             specs,
-            hidden_dims,
-            (min_scale, max_scale),
-            initial_scale,
-            initial_parameters,
-            vector_products=vector_products,
+            self.options.hidden_dims,
+            (self.options.min_scale, self.options.max_scale),
+            self.options.initial_scale,
+            self.options.initial_parameters,
+            vector_products=self.options.vector_products,
         )
         products = [] if self.actor.products is None else [self.actor.products]
+        critic_dims = self.options.critic_hidden_dims
         self.critic = nn.Sequential(
             *products,
-            encoder(self.actor.num_inputs, critic_hidden_dims),
-            nn.Linear(critic_hidden_dims[-1], 1, dtype=torch.float32),
+            encoder(self.actor.num_inputs, critic_dims),
+            nn.Linear(critic_dims[-1], 1, dtype=torch.float32),
         )
-        self.policy = HPPOPolicy(self.actor, specs, samples_when_greedy=greedy_discrete == "sampled")
+        self.policy = HPPOPolicy(self.actor, specs, samples_when_greedy=self.options.greedy_discrete == "sampled")
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.to(device)
-        self.optimizer = torch.optim.Adam(self.parameters(), lr=lr, eps=1e-5, fused=True)
+        self.optimizer = torch.optim.Adam(self.parameters(), lr=self.options.lr, eps=1e-5, fused=True)
 
     def compile_updates(self) -> None:
         """Compile the loss and its gradient, at the first update."""
@@ -161,7 +188,7 @@ class HPPO(OnPolicy, Learner):
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the size of a minibatch."""
-        return {"minibatch_size": self.minibatch_size}
+        return {"minibatch_size": self.options.minibatch_size}
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Gather the rows in `mask` with their advantages; update once `minibatch_size` or more are waiting.
@@ -169,7 +196,7 @@ class HPPO(OnPolicy, Learner):
         Fewer rows, as of an option that is seldom chosen, wait for more; the policy that sampled them does not change
         until then.
         """
-        progress = min(1.0, self.frames.item() / self.anneal_frames)
+        progress = min(1.0, self.frames.item() / self.options.anneal_steps)
         self.frames += batch.numel()
         if not mask.any():
             return {}
@@ -177,13 +204,14 @@ class HPPO(OnPolicy, Learner):
         if rows is None:
             return {}
         for group in self.optimizer.param_groups:
-            group["lr"] = self.lr + progress * (self.lr_final - self.lr)
+            group["lr"] = self.options.lr + progress * (self.options.lr_final - self.options.lr)
         # A tensor, since compiled code would be made anew for another number.
         entropy_weight = torch.tensor(
-            1.0 + progress * (self.entropy_final - 1.0), device=rows.device, dtype=torch.float32
+            1.0 + progress * (self.options.entropy_final - 1.0), device=rows.device, dtype=torch.float32
         )
         scalars = self.make_passes(rows, lambda minibatch: self.minimise(self._loss, minibatch, entropy_weight))
-        self.actor.set_min_scale(self.min_scale * (self.min_scale_final / self.min_scale) ** progress)
+        first, last = self.options.min_scale, self.options.min_scale_final
+        self.actor.set_min_scale(first * (last / first) ** progress)
         return scalars
 
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -201,7 +229,7 @@ class HPPO(OnPolicy, Learner):
             done, terminated = batch.get(("next", keys.DONE)), batch.get(("next", keys.TERMINATED))
             with float32_by_default():
                 advantage, target = generalized_advantage_estimate(
-                    self.gamma, self.gae_lambda, value, next_value, reward, done, terminated
+                    self.options.gamma, self.options.gae_lambda, value, next_value, reward, done, terminated
                 )
         return advantage.squeeze(-1), target.squeeze(-1)
 
@@ -288,9 +316,9 @@ class HPPO(OnPolicy, Learner):
         gain = (discrete_gain + parameter_gain).mean()
 
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
-        bonus = self.discrete_entropy * discrete_entropy + self.parameter_entropy * parameter_entropy
+        bonus = self.options.discrete_entropy * discrete_entropy + self.options.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(rows[keys.OBSERVATION]).squeeze(-1), rows["target"])
-        loss = self.critic_weight * critic_loss - gain - entropy_weight * bonus
+        loss = self.options.critic_weight * critic_loss - gain - entropy_weight * bonus
         return loss, {
             "critic": critic_loss,
             "discrete_entropy": discrete_entropy,
@@ -302,7 +330,7 @@ class HPPO(OnPolicy, Learner):
         }
 
     def _clipped_fraction(self, log_ratio: Tensor) -> Tensor:
-        return (log_ratio.expm1().abs() > self.clip).float().mean()
+        return (log_ratio.expm1().abs() > self.options.clip).float().mean()
 
 
 def kl_estimate(log_ratio: Tensor) -> Tensor:

@@ -34,7 +34,6 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.fractions import LearningRate, PositiveFraction
 from hpamdp.policies.shared.hybrid_actor import HybridDistribution
 from hpamdp.policies.shared.masks import masked_logits, random_choice
 from hpamdp.policies.shared.networks import (
@@ -46,6 +45,7 @@ from hpamdp.policies.shared.networks import (
     polyak_update,
 )
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 

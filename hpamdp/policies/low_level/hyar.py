@@ -55,7 +55,6 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
@@ -70,6 +69,7 @@ from hpamdp.policies.shared.networks import (
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
 from hpamdp.policies.shared.scales import scale_of
+from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random

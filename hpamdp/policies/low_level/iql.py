@@ -25,11 +25,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
-from hpamdp.policies.shared.fractions import Expectile, LearningRate, PositiveFraction
 from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import Expectile, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 

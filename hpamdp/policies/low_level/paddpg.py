@@ -33,7 +33,6 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import masked_values
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
@@ -45,6 +44,7 @@ from hpamdp.policies.shared.networks import (
     with_clipped_noise,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
+from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the scores of the discrete actions, which the critic sees.

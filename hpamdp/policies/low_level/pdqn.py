@@ -43,7 +43,6 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
-from hpamdp.policies.shared.fractions import Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import (
     HybridCritics,
@@ -60,6 +59,7 @@ from hpamdp.policies.shared.networks import (
     with_variations,
 )
 from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
+from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 # Parameters, or values, of the variations that are tried at once: bounds the memory where discrete actions are many.

@@ -48,13 +48,13 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.fractions import Expectile, Fraction, LearningRate, PositiveFraction
 from hpamdp.policies.shared.frame import CanonicalFrame, joined
 from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.networks import EnsembleLinear
 from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, SequenceStep, discounted_return
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.scales import scale_of
+from hpamdp.settings import Expectile, Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 MEMBER = "member"  # which member an environment follows, int64 [*B]

@@ -45,10 +45,10 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
-from hpamdp.policies.shared.fractions import Fraction, PositiveFraction
 from hpamdp.policies.shared.masks import masked_logits, masked_values
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
 from hpamdp.policies.shared.sized_by_data import SizedByData
+from hpamdp.settings import Fraction, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].

@@ -3,43 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field, PositiveFloat, PositiveInt
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
 from hpamdp.policies.shared.stored_rows import check_choices
+from hpamdp.settings import LearningRate, Settings
 from hpamdp.specs import PAMDPSpecs
+
+
+class OnPolicyOptions(Settings):
+    """Settings of proximal policy optimisation."""
+
+    epochs: Annotated[int, Field(ge=1, le=1000)] = 10
+    """Passes over the collected rows in an update."""
+    minibatch_size: PositiveInt = 256
+    """Rows in an optimisation step, and the least number of rows that an update waits for."""
+    clip: PositiveFloat = 0.2
+    """The surrogate stops rewarding probability ratios that are further from 1 than this."""
+    lr: LearningRate = 3e-4
+    """Learning rate of Adam."""
+    max_grad_norm: PositiveFloat = 0.5
+    """Largest gradient norm of an optimisation step; longer gradients are scaled down."""
 
 
 class OnPolicy(nn.Module):
     """Base class for proximal policy optimisation; list it before `Selector` or `Learner` among the bases.
 
-    A subclass creates `optimizer` for its parameters and calls the methods below.
-
-    Args:
-        specs: sizes and bounds of the problem.
-        epochs: passes over the gathered rows in an update.
-        minibatch_size: rows in an optimisation step, and the least number of rows that an update waits for.
-        clip: the surrogate stops rewarding probability ratios further from 1 than this.
-        max_grad_norm: largest gradient norm of an optimisation step; longer gradients are scaled down.
+    A subclass sets `options`, creates `optimizer` for its parameters and calls the methods below.
     """
 
+    options: OnPolicyOptions
     optimizer: torch.optim.Optimizer
     specs: PAMDPSpecs
 
-    def __init__(
-        self, specs: PAMDPSpecs, *, epochs: int, minibatch_size: int, clip: float, max_grad_norm: float
-    ) -> None:
-        if epochs > 1000:
-            raise ValueError(f"epochs={epochs}: must be at most 1000, or an update never ends")
+    def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)
-        self.epochs = epochs
-        self.minibatch_size = minibatch_size
-        self.clip = clip
-        self.max_grad_norm = max_grad_norm
         self.waiting: list[TensorDict] = []
         self.descent = Descent()
 
@@ -80,8 +83,8 @@ class OnPolicy(nn.Module):
                     raise ValueError(f"the waiting rows' {name} is not finite")
             check_choices(rows, self.specs)
             num += lengths.pop()
-        if num >= self.minibatch_size:
-            raise ValueError(f"{num} rows wait, but an update needs {self.minibatch_size}")
+        if num >= self.options.minibatch_size:
+            raise ValueError(f"{num} rows wait, but an update needs {self.options.minibatch_size}")
 
     def gather(self, rows: TensorDict) -> TensorDict | None:
         """Add rows `[N]` to those waiting; once there are `minibatch_size` or more, hand over all of them.
@@ -90,7 +93,7 @@ class OnPolicy(nn.Module):
             All waiting rows `[M]`, after which none wait, or None if there are too few.
         """
         self.waiting.append(rows)
-        if sum(len(waiting) for waiting in self.waiting) < self.minibatch_size:
+        if sum(len(waiting) for waiting in self.waiting) < self.options.minibatch_size:
             return None
         gathered = torch.cat(self.waiting)
         self.waiting = []
@@ -110,10 +113,10 @@ class OnPolicy(nn.Module):
         """
         advantage = rows["advantage"]
         rows["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
-        num_minibatches = len(rows) // self.minibatch_size
+        num_minibatches = len(rows) // self.options.minibatch_size
         columns = dict(rows.items())
         scalars: list[dict[str, Tensor]] = []
-        for _ in range(self.epochs):
+        for _ in range(self.options.epochs):
             order = torch.randperm(len(rows), device=rows.device)
             for indices in order.tensor_split(num_minibatches):
                 scalars.append(update({name: column.index_select(0, indices) for name, column in columns.items()}))
@@ -122,9 +125,9 @@ class OnPolicy(nn.Module):
     def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
         """Return the clipped surrogate `[B]` of one policy head from its log-ratios and the advantages, each `[B]`."""
         ratio = log_ratio.exp()
-        clipped_ratio = ratio.clamp(1.0 - self.clip, 1.0 + self.clip)
+        clipped_ratio = ratio.clamp(1.0 - self.options.clip, 1.0 + self.options.clip)
         return torch.minimum(ratio * advantage, clipped_ratio * advantage)
 
     def minimise(self, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
         """Take one step of the optimizer down the gradient of a loss, see `Descent.step`; return its scalars."""
-        return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=self.max_grad_norm)
+        return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=self.options.max_grad_norm)

@@ -1,0 +1,73 @@
+"""The base of every class's `Options`: the settings of a class, each with its type, bounds, default and meaning.
+
+A class lists its settings once, at the top of its file::
+
+    class UCBOptions(Settings):
+        exploration: NonNegativeFloat = 2.0
+        \"\"\"Width of the confidence bounds, in standard deviations of the rewards.\"\"\"
+
+    class UCB(Selector):
+        Options = UCBOptions
+
+        def __init__(self, specs: PAMDPSpecs, options: UCBOptions | None = None, **settings: Any) -> None:
+            super().__init__(specs)
+            self.options = UCBOptions.of(options, settings)
+
+Then `UCB(specs)`, `UCB(specs, exploration=1.0)` and `UCB(specs, options=UCB.Options(exploration=1.0))` all work. The
+yaml file of the class names it and holds the values that differ from these defaults. The command line, its refusals,
+`--help` and the pages read the same model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, Strict
+from typing_extensions import Self
+
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+PositiveFraction = Annotated[float, Field(gt=0.0, le=1.0)]
+Expectile = Annotated[float, Field(ge=0.5, lt=1.0)]  # 0.5 is the mean
+
+
+def _check_rate(rate: float) -> float:
+    if not 0.0 < rate <= 1.0:
+        raise ValueError("must be above 0 and at most 1")
+    return rate
+
+
+LearningRate = Annotated[float, AfterValidator(_check_rate)]
+# A tuple, so that the model cannot change; from Python a list will do.
+Widths = Annotated[tuple[PositiveInt, ...], Strict(False)]
+
+
+class Settings(BaseModel):
+    """Settings of a class: frozen, flat, without unknown names, infinite numbers or silent conversions."""
+
+    model_config = ConfigDict(
+        strict=True,
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        protected_namespaces=(),
+        use_attribute_docstrings=True,
+    )
+
+    @classmethod
+    def of(cls, options: Self | None, settings: Mapping[str, Any]) -> Self:
+        """Return a constructor's options: the given ones or the defaults, changed by single settings.
+
+        Args:
+            options: the constructor's argument `options`.
+            settings: its other keyword arguments, by the names of settings.
+
+        Raises:
+            ValueError: a setting does not exist, or has a wrong value.
+            TypeError: the options are of another class.
+        """
+        if options is None:
+            return cls(**settings)
+        if not isinstance(options, cls):
+            raise TypeError(f"options: must be {cls.__name__}, not {type(options).__name__}")
+        return cls(**{**dict(options), **settings}) if settings else options
