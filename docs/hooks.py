@@ -1,28 +1,33 @@
-"""What mkdocs needs to make the site of the repository's own files, so that nothing is written twice.
+"""Build the site from the repository's own files, so that nothing is written twice.
 
 - Pages outside docs/ become pages of the site: the README, the changelog, the agents, the studies.
-- Relative links are turned from files into pages. Code that a page links to gets a page of its own. A link that leads
-  nowhere is a warning, and so an error.
-- Directives, which are HTML comments on lines of their own, are filled in:
-  `<!-- settings of conf/low/hppo.yaml -->`, every value with its default and its comment;
-  `<!-- docstring of hpamdp/policies/low_level/hppo.py: Source -->`, the parts of a module's docstring that begin so;
-  `<!-- rows of experiments/table1/README.md, table 2: hppo -->`, the rows of a study's table by their first cell;
-  `<!-- csv experiments/domains/published.csv: domain=platform -->`, the rows of a csv file by a column;
-  `<!-- runs experiments/domains/results.csv: learner=pdqn, pdqn_published -->`, a study's runs by a column, those that
-  differ in their seed alone as mean ± standard deviation.
-- Every module of the package with a public docstring gets a page in the API.
+- Relative links lead from page to page. Code that a page links to gets a page of its own. A broken link is a warning,
+  and warnings are errors.
+- Directives are HTML comments on lines of their own. They are replaced by text:
+  `<!-- settings of conf/low/hppo.yaml -->`: all settings of the yaml's class, with bounds, default and meaning;
+  `<!-- docstring of hpamdp/policies/low_level/hppo.py: Source -->`: the paragraphs of a module's docstring that begin
+  with this word;
+  `<!-- rows of experiments/table1/README.md, table 2: hppo -->`: the rows of a study's table by their first cell;
+  `<!-- csv experiments/domains/published.csv: domain=platform -->`: the rows of a csv file by a column;
+  `<!-- runs experiments/domains/results.csv: learner=pdqn, pdqn_published -->`: a study's runs by a column. Runs that
+  differ only in their seed become one row, mean ± standard deviation.
+- Every module with a docstring gets a page in the API.
 """
 
 from __future__ import annotations
 
 import ast
 import csv
+import json
 import logging
 import posixpath
 import re
 import statistics
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = "docs/"
@@ -36,6 +41,10 @@ LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", "
 PICTURES = {".png", ".gif", ".svg"}
 # The columns of runs that are shown, and their heads.
 MEASURED = {"frames": "steps", "score": "score", "success": "success", "cpu_s": "CPU, s"}
+# How a JSON schema's types and bounds are shown.
+KINDS = {"number": "number", "integer": "whole number", "string": "text", "boolean": "`true`, `false`"}
+KINDS |= {"null": "`null`", "array": "list", "object": "mapping"}
+BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 PAGES = ("*.md", "agents/README.md", "experiments/*/README.md", "docs/**/*.md")
 
 
@@ -162,27 +171,90 @@ def outside_code(text: str, change: Callable[[str], str]) -> str:
 
 
 def settings_of(path: str) -> str:
-    """Return what a yaml says at its head, and a table of its values: name, default, the comment above."""
-    head, section = "", ""
-    comment: list[str] = []
-    rows = ["| setting | default | |", "|---|---|---|"]
-    for line in (ROOT / path).read_text(encoding="utf-8").splitlines():
-        entry = re.match(r"(  )?(\w+):(?: (.+))?$", line)
-        if line.lstrip().startswith("#"):
-            comment.append(line.lstrip()[1:].strip())
-        elif not entry or entry[2] == "_target_":
-            head = head or cell(" ".join(comment))
-            comment = []
-        elif entry[3] is None:
-            section = f"{entry[2]}."
-        else:
-            name = f"{section}{entry[2]}" if entry[1] else entry[2]
-            section = section if entry[1] else ""
-            rows.append(f"| `{name}` | `{cell(entry[3])}` | {cell(' '.join(comment))} |")
-            comment = []
+    """Return what a yaml says at its head, and a table of all settings of its class.
+
+    Names, bounds, defaults and sentences are those of the class's `Options`; a default that the yaml changes is the
+    yaml's. A comment of the yaml explains a setting that the class does not explain.
+    """
+    text = (ROOT / path).read_text(encoding="utf-8")
+    values = yaml.safe_load(text)
+    target = values.pop("_target_", None)
+    head, comments = comments_of(text)
+    rows = ["| setting | values | default | meaning |", "|---|---|---|---|"]
+    fields = fields_of(path, target)
+    for name in [*fields, *(name for name in values if name not in fields)]:
+        allowed, default, sentence = fields.get(name, ("", None, ""))
+        value = values.get(name, default)
+        inner = {f"{name}.{key}": each for key, each in value.items()} if isinstance(value, dict) and value else {}
+        for place, (setting, each) in enumerate((inner or {name: value}).items()):
+            meaning = comments.get(setting) or ("" if place else sentence or comments.get(name, ""))
+            rows.append(f"| `{setting}` | {'' if inner else allowed} | `{cell(as_yaml(each))}` | {cell(meaning)} |")
     if len(rows) == 2:
         return "It has no settings."
-    return "\n".join([head, "", *rows])
+    return "\n".join([cell(head), "", *rows])
+
+
+def fields_of(path: str, target: str | None) -> dict[str, tuple[str, object, str]]:
+    """Return the values, the default and the sentence of each setting of a yaml's class."""
+    if target is None or not target.startswith("hpamdp."):
+        return {}
+    from hpamdp import config
+
+    group = Path(path).parent.name
+    model = config.options_model(config.load_class(target), config.GROUPS.get(group, ()))
+    schema = model.model_json_schema()
+    defaults = config.defaults_of(model)
+    return {
+        name: (
+            allowed_values(schema["properties"][name], schema.get("$defs", {})),
+            defaults[name],
+            " ".join((field.description or "").split()),
+        )
+        for name, field in model.model_fields.items()
+    }
+
+
+def allowed_values(schema: dict[str, Any], definitions: dict[str, Any]) -> str:
+    """Return in words which values a JSON schema allows, such as `number > 0, <= 1`."""
+    if "$ref" in schema:
+        return allowed_values(definitions[schema["$ref"].rpartition("/")[2]], definitions)
+    if "anyOf" in schema:
+        return " or ".join(dict.fromkeys(allowed_values(each, definitions) for each in schema["anyOf"]))
+    choices = schema.get("enum", [schema["const"]] if "const" in schema else [])
+    if choices:
+        return ", ".join(f"`{choice}`" for choice in choices)
+    kind = str(schema.get("type", "any value"))
+    words = KINDS.get(kind, kind)
+    if kind == "array" and isinstance(schema.get("items"), dict) and schema["items"]:
+        words = f"list: {allowed_values(schema['items'], definitions)}"
+    bounds = [f"{sign} {schema[name]}" for name, sign in BOUNDS.items() if name in schema]
+    return cell(" ".join([words, ", ".join(bounds)]).strip())
+
+
+def comments_of(text: str) -> tuple[str, dict[str, str]]:
+    """Return the comment at the head of a yaml, and those above its settings by their names."""
+    head, section, comment, comments = "", "", [], {}
+    for line in text.splitlines():
+        entry = re.match(r"(  )?(\w+):( .+)?$", line)
+        if line.lstrip().startswith("#"):
+            comment.append(line.lstrip()[1:].strip())
+            continue
+        if entry and entry[2] != "_target_":
+            section = section if entry[1] else f"{entry[2]}."
+            comments[f"{section}{entry[2]}" if entry[1] else entry[2]] = " ".join(comment)
+        else:
+            head = head or " ".join(comment)
+        comment = []
+    return head, comments
+
+
+def as_yaml(value: object) -> str:
+    """Return a value as one writes it on the command line."""
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float):
+        return re.sub(r"e([-+])0", r"e\1", repr(value))
+    return json.dumps(value, default=str)
 
 
 def cell(text: str) -> str:

@@ -41,7 +41,7 @@ def test_every_choice_has_a_page_that_names_it_and_shows_its_settings(group, nam
     assert f"- {file.relative_to(DOCS).as_posix()}\n" in (ROOT / "mkdocs.yml").read_text()
     source = f"conf/{group}/{name}.yaml"
     values = yaml.safe_load((ROOT / source).read_text())
-    del values["_target_"]
+    values = {**hooks.fields_of(source, values.pop("_target_")), **values}
     if not values:
         return
     assert source in text
@@ -49,6 +49,7 @@ def test_every_choice_has_a_page_that_names_it_and_shows_its_settings(group, nam
     for key, value in values.items():
         for setting in [f"{key}.{inner}" for inner in value] if isinstance(value, dict) else [key]:
             assert f"| `{setting}` |" in table
+            assert f"| `{setting}` |  |  |" not in table
 
 
 @pytest.mark.parametrize("name", sorted({*choices("env")} - {"gymnasium", "boatdock_released", "hard_goal"}))
@@ -80,7 +81,7 @@ def test_directives_are_filled_in_and_wrong_ones_are_told(hooks, tmp_path, monke
     monkeypatch.setattr(hooks, "ROOT", tmp_path)
     site = hooks.Site()
     text = site.pages["page.md"]
-    assert "| `size` | `3` | The size \\| of it. |\n| `rate` | `0.5` |  |" in text
+    assert "| `size` |  | `3` | The size \\| of it. |\n| `rate` |  | `0.5` |  |" in text
     assert "| m | 1 |" in text and "| n | 2 |" not in text
     assert "| y | 2 |" in text and "| x | 1 |" not in text
     assert "arXiv [1234.56789](https://arxiv.org/abs/1234.56789)." in text
