@@ -212,11 +212,11 @@ def _run_command(name: str, words: list[str]) -> int:
     """Run a command that has options of its own, and return its exit code."""
     command = importlib.import_module(_COMMANDS[name])
     from hpamdp.env.base import ProblemError  # takes seconds, which the other commands need not wait for
-    from hpamdp.run.stopping import ProgramExitError, exits_told
+    from hpamdp.run.stopping import ProgramExitError, exits_explained
 
     parser = _Parser(prog=f"{program()} {name}", formatter_class=argparse.RawDescriptionHelpFormatter)
     try:
-        with exits_told():
+        with exits_explained():
             return command.main(words, parser)
     except ProblemError as error:
         raise ConfigError(f"env: {first_line(error)}") from error
@@ -497,12 +497,12 @@ def _go_on(cfg: DictConfig, output_dir: Path) -> int:
         ConfigError: the folder holds the results of another run.
     """
     from hpamdp.run import train
-    from hpamdp.run.continuation import left
+    from hpamdp.run.continuation import rest_of
     from hpamdp.run.resume import resolve
 
     cfg.resume = None
     words = job_overrides()
-    score, source = left(resolve(cfg, words)[0], output_dir, f"resume=auto: {output_dir}")
+    score, source = rest_of(resolve(cfg, words)[0], output_dir, f"resume=auto: {output_dir}")
     if score is not None:
         say(f"{output_dir}: this run is finished, with score {score:.3f}")
         return 0

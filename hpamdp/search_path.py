@@ -9,7 +9,7 @@ import sys
 _VARIABLE, _OURS = "PYTHONSAFEPATH", "hpamdp"
 
 
-def is_program() -> bool:
+def is_command_line() -> bool:
     """Return whether this package is being imported to run its command line."""
     started = sys.argv[0] if sys.argv else ""
     if started == "-m":  # until Python has found the module

@@ -92,7 +92,7 @@ def test_the_words_of_eval_take_the_agent_from_its_folder():
 
 
 def test_a_foreign_summary_gives_a_score_or_none(tmp_path):
-    player = SimpleNamespace(agent=SimpleNamespace(portable=dict), config=make_config(["high=none"]))
+    player = SimpleNamespace(agent=SimpleNamespace(exported=dict), config=make_config(["high=none"]))
     for text in ('{"score": NaN}', '{"score": "<b>"}', "[1]", "{}", "[" * 99_999, '{"score": null}', '{"score": true}'):
         (tmp_path / "summary.json").write_text(text)
         agent = _agent(tmp_path, player)

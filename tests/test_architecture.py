@@ -14,6 +14,7 @@ FILES = {
 }
 LOW, HIGH = "hpamdp.policies.low_level", "hpamdp.policies.high_level"
 LEARNERS = [module for module in FILES if module.startswith(f"{LOW}.")]
+TORCH = ("torch", "torchrl", "tensordict")
 # The rooms that know boats; everything else is generic.
 BOATS = ("hpamdp.env.boatdock", "hpamdp.env.boatdock_released", "hpamdp.data.human")
 BOAT_WORDS = re.compile(r"boat|\bpress|_press|harbou?r|\bdock|_dock|controller|congruent|\bfuel|_fuel", re.IGNORECASE)
@@ -32,6 +33,36 @@ def imports(module: str) -> list[str]:
     return names
 
 
+@cache
+def loaded_with(module: str) -> frozenset[str]:
+    """Return the dotted names that importing a module imports, by itself or through others of ours."""
+    names, waiting = set[str](), [module]
+    while waiting:
+        for name in imported_at_once(waiting.pop()) - names:
+            names.add(name)
+            parts = name.split(".")
+            # Importing a.b.c also imports a and a.b.
+            waiting += [one for i in range(len(parts)) if (one := ".".join(parts[: i + 1])) in FILES]
+    return frozenset(names)
+
+
+@cache
+def imported_at_once(module: str) -> set[str]:
+    """Return what a module imports when it is imported itself, so neither within functions nor for types alone."""
+    names, waiting = set[str](), list[ast.AST](ast.parse(FILES[module].read_text()).body)
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            waiting += node.orelse
+        elif not isinstance(node, ast.FunctionDef | ast.Lambda):
+            waiting += ast.iter_child_nodes(node)
+    return names
+
+
 def is_in(name: str, package: str) -> bool:
     return f"{name}.".startswith(f"{package}.")
 
@@ -45,7 +76,7 @@ def test_the_modules_are_found():
     assert "hpamdp.policies.base" in {name.rpartition(".")[0] for name in imports(f"{LOW}.random")}
 
 
-@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.messages", "hpamdp.regular_files", "hpamdp.env.streams"])
+@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.messages", "hpamdp.files", "hpamdp.env.streams"])
 def test_the_foundations_import_nothing_of_ours(module):
     assert not [name for name in imports(module) if is_in(name, "hpamdp")]
 
@@ -57,7 +88,13 @@ def test_the_physics_imports_only_the_constants_of_the_task():
 
 def test_what_a_boat_for_gymnasium_runs_through_imports_no_torch():
     for module in ("task", "layouts", "kernel", "fleet", "numpy_boats", "gymnasium_faces"):
-        assert not [name for name in imports(f"hpamdp.env.boatdock.{module}") if is_in(name, "torchrl")], module
+        loaded = loaded_with(f"hpamdp.env.boatdock.{module}")
+        assert not [name for name in loaded if any(is_in(name, library) for library in TORCH)], module
+
+
+def test_imports_through_other_modules_are_found():
+    assert "torch" in loaded_with("hpamdp.env.boatdock.environment")
+    assert any(is_in(name, "numba") for name in loaded_with("hpamdp.env.boatdock.gymnasium_faces"))
 
 
 GENERIC = [module for module in FILES if not any(is_in(module, room) for room in BOATS)]
@@ -91,7 +128,7 @@ def test_a_problem_knows_no_other_but_the_released_boats_the_boats():
 
 
 def test_the_data_knows_the_environments_and_nobody_below_knows_the_data():
-    allowed = ("data", "env", "files", "json_lines", "keys", "messages", "regular_files", "specs")
+    allowed = ("data", "env", "files", "json_lines", "keys", "messages", "specs")
     known = {name for module in FILES if is_in(module, "hpamdp.data") for name in imports(module)}
     assert not [n for n in known if is_in(n, "hpamdp") and not any(is_in(n, f"hpamdp.{room}") for room in allowed)]
     assert not importers("hpamdp.data", inside="hpamdp.env") | importers("hpamdp.data", inside="hpamdp.policies")
@@ -100,6 +137,21 @@ def test_the_data_knows_the_environments_and_nobody_below_knows_the_data():
 def test_environments_and_policies_know_nothing_of_a_run():
     for room in ("hpamdp.run", "hpamdp.config", "hpamdp.cli"):
         assert not importers(room, inside="hpamdp.env") | importers(room, inside="hpamdp.policies")
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper"),
+    [
+        ("hpamdp.analysis", "hpamdp.run"),
+        ("hpamdp.env", "hpamdp.analysis"),
+        ("hpamdp.policies.base", "hpamdp.policies.shared"),
+        ("hpamdp.policies.shared", LOW),
+        ("hpamdp.policies.shared", HIGH),
+    ],
+)
+def test_no_import_points_upward(lower, upper):
+    for module in [module for module in FILES if is_in(module, lower)]:
+        assert not [name for name in loaded_with(module) if is_in(name, upper)], module
 
 
 def test_the_levels_do_not_know_each_other():

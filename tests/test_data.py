@@ -307,7 +307,7 @@ def test_a_failed_write_leaves_nothing_behind(tmp_path):
         raise OSError(28, "No space left on device")
 
     with pytest.raises(DataError, match=r"cannot be written \(No space left"):
-        export.write_atomically(tmp_path / "folder" / "file", fail)
+        export.write_new(tmp_path / "folder" / "file", fail)
     assert not list((tmp_path / "folder").iterdir())
 
 

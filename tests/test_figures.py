@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hpamdp.analysis import style
+from hpamdp import figure_style as style
 from hpamdp.analysis.figures import _learning_curves, draw_all
 from hpamdp.env.base import Metric
 from hpamdp.env.boatdock import figures as boats

@@ -8,9 +8,9 @@ from conftest import compose_config
 
 from hpamdp.config import ConfigError
 from hpamdp.files import remove_link, replacing
+from hpamdp.metrics_file import MetricsFile
 from hpamdp.run import play
 from hpamdp.run.folder import locked
-from hpamdp.run.metrics import MetricsFile
 from hpamdp.run.sweep import Job, Records
 from hpamdp.run.train import run
 

@@ -15,12 +15,13 @@ from conftest import compose_config
 from test_metrics import without_login  # noqa: F401  (a fixture)
 
 from hpamdp.config import ConfigError
+from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
-from hpamdp.run.folder import CONFIG_NAME, locked, moved_aside
+from hpamdp.run.folder import locked, moved_aside
 from hpamdp.run.loggers import TensorboardLogger
-from hpamdp.run.metrics import read_rows
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import Trainer, run
+from hpamdp.run_files import CONFIG_NAME
 
 TINY = ["num_envs=8", "steps_per_batch=4", "total_frames=128", "log_every=32", "eval.layouts=4", "eval.every=0"]
 TINY += ["high=ucb", "low=random"]

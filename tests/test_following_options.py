@@ -243,16 +243,16 @@ def test_a_replayed_step_is_followed_by_the_option_that_the_selector_would_choos
 def test_a_replayed_step_is_followed_by_the_option_of_that_time_if_the_selector_needs_more_than_the_observation():
     agent = make_agent("pdqn", OfTold(), is_shared=False)
     option = torch.randint(2, (20,))
-    assert torch.equal(agent.learners[0].following.choose(torch.rand(20, 2), option, option), option)
+    assert torch.equal(agent.learners[0].next_options.choose(torch.rand(20, 2), option, option), option)
     agent = make_agent("pdqn", OfSign(SPECS), is_shared=False)
-    assert agent.learners[0].following.choose(torch.rand(20, 2), option, option).tolist() == [1] * 20
+    assert agent.learners[0].next_options.choose(torch.rand(20, 2), option, option).tolist() == [1] * 20
 
 
 def test_asking_the_selector_again_leaves_its_exploration_alone():
     agent = make_agent("pdqn", OfSign(SPECS), is_shared=False)
     seen = []
     agent.selector.select = lambda td: seen.append(exploration_type()) or td[keys.OBSERVATION][..., 0].long()
-    agent.learners[0].following.choose(torch.rand(20, 2), *torch.zeros(2, 20).long())
+    agent.learners[0].next_options.choose(torch.rand(20, 2), *torch.zeros(2, 20).long())
     assert seen == [ExplorationType.DETERMINISTIC] and exploration_type() != ExplorationType.DETERMINISTIC
 
 

@@ -14,7 +14,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
-from hpamdp.run.checks import example_steps
+from hpamdp.run.state_checks import example_steps
 from hpamdp.run.train import run
 
 # What makes a learner's training short; a learner that is not named needs nothing.

@@ -18,10 +18,10 @@ from torchrl.data import ReplayBuffer
 
 from hpamdp.config import ConfigError
 from hpamdp.run import checkpoint
-from hpamdp.run.archive import TensorArchive
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.single import SingleCollection
 from hpamdp.run.players import load_player
+from hpamdp.run.tensor_archive import TensorArchive
 from hpamdp.run.train import DivergedError, Trainer, run
 
 TINY = ["num_envs=4", "steps_per_batch=4", "total_frames=192", "eval.layouts=2", "eval.every=0", "log_every=1000"]
@@ -307,7 +307,7 @@ ODD = {
 
 
 @pytest.mark.parametrize("make", ODD.values(), ids=ODD)
-@pytest.mark.parametrize("member", ["agent", "learner0_optimiser"])
+@pytest.mark.parametrize("member", ["agent", "learner0_optimizer"])
 def test_odd_tensors_and_bombs_are_refused(make, member, opener):
     before = opener.all_of_agent()
     with pytest.raises(ConfigError) as error:

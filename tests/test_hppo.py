@@ -41,7 +41,7 @@ def test_the_greedy_policy_takes_mean_parameters_and_one_discrete_action_or_samp
     expected = probabilities if greedy_discrete == "sampled" else torch.eye(3)[probabilities.argmax()]
     torch.testing.assert_close(taken, expected, atol=0.1, rtol=0.0)
     assert (acted[RAW] == acted[RAW][0]).all()
-    assert (learner.portable() is None) == (greedy_discrete == "sampled")
+    assert (learner.exported() is None) == (greedy_discrete == "sampled")
 
 
 def one_step_rows(learner: HPPO, num: int) -> TensorDict:
@@ -111,7 +111,7 @@ def test_actor_and_critic_see_products_of_vectors():
     for output in (learner.value, lambda seen: learner.actor(seen).mean):
         torch.testing.assert_close(output(turned), output(state))
         assert not torch.allclose(output(other), output(state), atol=1e-3)
-    assert learner.portable() is None, "the actors of pages have no products"
+    assert learner.exported() is None, "the actors of pages have no products"
 
 
 def test_the_parameters_of_other_actions_do_not_change_the_likelihood():

@@ -11,7 +11,7 @@ from hpamdp import keys
 from hpamdp.config import ConfigError, component
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
-from hpamdp.policies.shared.context import ContextFeatures, LinearBandit
+from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit
 from hpamdp.specs import PAMDPSpecs
 
 MEMORIES = ("all", "discounted", "sliding_window")

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.geometry import PlaneGeometry
+from hpamdp.policies.masks import sample_index
 from hpamdp.policies.shared import networks
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
@@ -15,7 +16,6 @@ from hpamdp.policies.shared.networks import (
     VectorProducts,
     mlp,
     polyak_update,
-    sample_index,
     with_clipped_noise,
 )
 from hpamdp.specs import PAMDPSpecs

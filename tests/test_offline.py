@@ -17,11 +17,11 @@ from hpamdp.data.human.rest_to_rest import TAP, to_rest_to_rest
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.metrics_file import read_rows
 from hpamdp.policies.low_level.bc import BC
 from hpamdp.policies.low_level.iql import IQL
 from hpamdp.policies.low_level.td3_bc import TD3BC
 from hpamdp.run.assemble import assemble
-from hpamdp.run.metrics import read_rows
 from hpamdp.run.train import Trainer, run
 from hpamdp.specs import PAMDPSpecs
 

@@ -10,7 +10,7 @@ import yaml
 from conftest import TRAINED, choices, forked, make_config
 
 from hpamdp import cli
-from hpamdp.run.metrics import read_rows
+from hpamdp.metrics_file import read_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"

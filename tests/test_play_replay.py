@@ -230,7 +230,7 @@ def test_agents_act_in_the_page_as_they_do_in_torch(tmp_path, page_data):
             selector.moment.copy_(torch.randn_like(selector.moment))
             selector.gram.add_(torch.eye(selector.gram.shape[-1]))
         results = player.evaluation.run(player.agent.policy)
-        entry = {"name": "a", "title": "a", "controller": "choose", "keymap": 1, "agent": player.agent.portable()}
+        entry = {"name": "a", "title": "a", "controller": "choose", "keymap": 1, "agent": player.agent.exported()}
         places = [{"start": s.tolist(), "goal": g.tolist()}
                   for s, g in zip(results["start"], results["goal"], strict=True)]  # fmt: skip
         script = """

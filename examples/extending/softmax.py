@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
+from hpamdp.policies.shared.bandit import Bandit, Discount, Memory
 from hpamdp.specs import PAMDPSpecs
 
 

@@ -32,7 +32,7 @@ from hpamdp.analysis.study import (
     spread,
     write_tables,
 )
-from hpamdp.analysis.style import LEARNER_COLOURS
+from hpamdp.figure_style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
 # The domains, with the largest published number of steps and what is scored: the mean return or the share of successes.

@@ -29,8 +29,8 @@ from hpamdp.analysis.study import (
     spread,
     write_tables,
 )
-from hpamdp.analysis.style import LEARNER_COLOURS
 from hpamdp.env.boatdock.reference import HUMAN
+from hpamdp.figure_style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from hpamdp.analysis.study import Rows, Run, curve, finished, groups, read_csv, write_tables
-from hpamdp.analysis.style import LEARNER_COLOURS
+from hpamdp.figure_style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
 BOATS = ("congruent", "incongruent")

@@ -30,9 +30,9 @@ from hpamdp.analysis.study import (
     spread,
     write_tables,
 )
-from hpamdp.analysis.style import LEARNER_COLOURS
 from hpamdp.env.boatdock.harbour import CONTROLLERS
 from hpamdp.env.boatdock.reference import HUMAN, RANDOM, human_normalised
+from hpamdp.figure_style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
 HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"

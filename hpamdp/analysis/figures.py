@@ -15,13 +15,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 
-from hpamdp.analysis.style import AGENT, REFERENCES, STYLE, label_ends
 from hpamdp.env.base import Metric, PAMDPEnv
-from hpamdp.files import replacing
+from hpamdp.figure_style import AGENT, REFERENCES, STYLE, label_ends
+from hpamdp.files import read_regular, regular_size, replacing
 from hpamdp.messages import duration, one_line, warn
-from hpamdp.regular_files import read_regular, regular_size
-from hpamdp.run.folder import FIGURES_NAME, MAX_TEXT_BYTES
-from hpamdp.run.metrics import EVALUATION, FRAMES, WALL_SECONDS, read_rows
+from hpamdp.metrics_file import EVALUATION, FRAMES, WALL_SECONDS, read_rows
+from hpamdp.run_files import FIGURES_NAME, MAX_TEXT_BYTES
 
 
 def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:

@@ -15,8 +15,8 @@ from scipy import stats
 
 from hpamdp.files import replacing
 from hpamdp.messages import warn
-from hpamdp.run.folder import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
-from hpamdp.run.metrics import read_rows
+from hpamdp.metrics_file import read_rows
+from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
 
 Rows = list[dict[str, Any]]
 

@@ -6,7 +6,8 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data.checks import (
+from hpamdp.data.errors import DataError
+from hpamdp.data.row_checks import (
     TRAJECTORY,
     check_actions,
     check_decisions,
@@ -14,7 +15,6 @@ from hpamdp.data.checks import (
     check_returns,
     check_transitions,
 )
-from hpamdp.data.errors import DataError
 from hpamdp.specs import PAMDPSpecs
 
 

@@ -41,7 +41,7 @@ def write_csv(tables: Mapping[str, TensorDict], folder: Path, *, axes: Sequence[
                 writer.writerow(columns)
                 writer.writerows(zip(*columns.values(), strict=True))
 
-    write_atomically(folder, write)
+    write_new(folder, write)
 
 
 def _csv_columns(table: TensorDict, axes: Sequence[str] | None) -> dict[str, list[object]]:
@@ -75,7 +75,7 @@ def write_npz(tables: Mapping[str, TensorDict], file: Path) -> None:
         with unfinished.open("wb") as stream:
             np.savez_compressed(stream, **arrays)
 
-    write_atomically(file, write)
+    write_new(file, write)
 
 
 def write_memmap(batch: TensorDict, folder: Path) -> None:
@@ -96,7 +96,7 @@ def write_memmap(batch: TensorDict, folder: Path) -> None:
             with unfinished.joinpath(*folders, f"{own}.memmap").open("r+b") as file:
                 file.write(values.contiguous().numpy().tobytes())
 
-    write_atomically(folder, write)
+    write_new(folder, write)
 
 
 def check_room(folder: Path, num_bytes: int) -> None:
@@ -110,7 +110,7 @@ def check_room(folder: Path, num_bytes: int) -> None:
         os.posix_fallocate(file.fileno(), 0, num_bytes)
 
 
-def write_atomically(target: Path, write: Callable[[Path], object]) -> None:
+def write_new(target: Path, write: Callable[[Path], object]) -> None:
     """Let `write` make a file or folder in a temporary place beside the target, then move it there.
 
     Raises:

@@ -17,8 +17,8 @@ from pydantic_core import from_json
 from tensordict import TensorDict
 
 from hpamdp.data.errors import DataError
+from hpamdp.files import read_regular, regular_size
 from hpamdp.messages import reason_of
-from hpamdp.regular_files import read_regular, regular_size
 
 _META = "meta.json"
 _MAX_META_BYTES = 1 << 20

@@ -19,12 +19,12 @@ import torch
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.data.checks import TRAJECTORY, check_transitions
 from hpamdp.data.errors import DataError
 from hpamdp.data.export import check_room
+from hpamdp.data.row_checks import TRAJECTORY, check_transitions
+from hpamdp.files import read_regular, regular_size
 from hpamdp.json_lines import MAX_LINE_BYTES, read_json
 from hpamdp.messages import first_line
-from hpamdp.regular_files import read_regular, regular_size
 
 if TYPE_CHECKING:
     import minari

@@ -28,7 +28,7 @@ class Page(Protocol):
 
         Args:
             agents: to play beside people: `name`, `title`, `score`, `env` (the options of the problem's yaml), and
-                `agent`, what `HierarchicalAgent.portable` returns.
+                `agent`, what `HierarchicalAgent.exported` returns.
             has_server: whether there is somebody to send episodes to.
 
         Raises:

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, Selector, is_greedy
-from hpamdp.policies.shared.masks import allowed_or_first
+from hpamdp.policies.masks import allowed_or_first
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -162,8 +162,8 @@ class HeldOption(TensorDictModuleBase):
         return td.set(keys.OPTION, option if mask is None else allowed_or_first(option, mask))
 
 
-class NextOptions:
-    """What follows an option that ends inside its episode: a `Following` for the learners of an agent.
+class AgentNextOptions:
+    """What follows an option that ends inside its episode: a `NextOptions` for the learners of an agent.
 
     Args:
         selector: chooses the options.
@@ -301,14 +301,14 @@ class HierarchicalAgent(nn.Module):
         self._set_is_uniform()
         self.router = OptionRouter(learners, specs, is_shared)
         self.policy = self.router if selector is None else TensorDictSequential(selector, self.router)
-        self.next_options: NextOptions | None = None
+        self.next_options: AgentNextOptions | None = None
         if selector is not None:
             selector.decides_ends = selector_ends_options
             if selector.asks_learners:
                 selector.option_values = OptionValues(learners, specs.num_options)
-            self.next_options = NextOptions(selector, learners, is_shared)
+            self.next_options = AgentNextOptions(selector, learners, is_shared)
             for learner in learners:
-                learner.following = self.next_options
+                learner.next_options = self.next_options
 
     def policy_of(self, option: int) -> TensorDictModuleBase:
         """Return the policy that always holds one option and otherwise acts like this agent."""
@@ -408,14 +408,14 @@ class HierarchicalAgent(nn.Module):
         assert isinstance(level, Learner | Selector)
         return level
 
-    def portable(self) -> dict[str, Any] | None:
+    def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if a part of it cannot say.
 
         `selector` is None where there is nothing to choose; `learners` has one entry for each option, or a single one,
         which with `is_shared` observes the one-hot option at the end of the observation.
         """
-        learners = [learner.portable() for learner in self._learners()]
-        selector = None if self.selector is None else self.selector.portable()
+        learners = [learner.exported() for learner in self._learners()]
+        selector = None if self.selector is None else self.selector.exported()
         if any(learner is None for learner in learners) or (self.selector is not None and selector is None):
             return None
         return {"selector": selector, "learners": learners, "is_shared": self.is_shared}

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.shared.masks import random_choice
-from hpamdp.policies.shared.stored_rows import check_rows
+from hpamdp.policies.masks import random_choice
+from hpamdp.policies.stored_rows import check_stored_rows
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -36,7 +36,7 @@ def option_ends(batch: TensorDictBase) -> Tensor:
     return is_end | batch.get(("next", keys.OPTION_ENDED), False)
 
 
-class Following(Protocol):
+class NextOptions(Protocol):
     """What follows an option that ends inside its episode, as the agent tells it to its learners.
 
     The value of a state in which an option has ended is the value under the option that follows, by that option's own
@@ -111,7 +111,7 @@ class Selector(TensorDictModuleBase):
 
     State: the same module acts in training and evaluation, with different numbers of environments, so whatever belongs
     to an episode travels in the tensordict. What the selector has learned belongs in parameters and buffers: they are
-    saved in checkpoints and sent to collector processes. Everything else that training needs, such as optimisers and
+    saved in checkpoints and sent to collector processes. Everything else that training needs, such as optimizers and
     replay buffers, is returned by `stateful`.
 
     Attributes:
@@ -283,7 +283,7 @@ class Selector(TensorDictModuleBase):
         Raises:
             ValueError: a row is invalid.
         """
-        check_rows(rows, self.specs)
+        check_stored_rows(rows, self.specs)
 
     def check_state(self, state: Mapping[str, Any]) -> None:
         """Refuse a state dict with the names and shapes of this selector's, but with invalid values.
@@ -294,10 +294,10 @@ class Selector(TensorDictModuleBase):
             ValueError: a value is invalid.
         """
 
-    def portable(self) -> dict[str, Any] | None:
+    def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to choose greedily; None if that is not known.
 
-        `kind` names the form, which `hpamdp.policies.shared.portable` explains.
+        `kind` names the form, which `hpamdp.policies.shared.exported_policy` explains.
         """
         return None
 
@@ -329,11 +329,11 @@ class Learner(nn.Module):
     - `learn`, to learn from the agent's own transitions;
     - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in `modes`;
     - `value`, if it bootstraps, so that others can bootstrap from it where their option ends and its own follows;
-    - `stateful`, if it has optimisers or a replay buffer.
+    - `stateful`, if it has optimizers or a replay buffer.
 
     Where an option ends inside its episode, the next state is worth what it is worth under the option chosen next, not
     under the one that ended. The batch then has `("next", "option_ended")`, and `("next", "option")` says which option
-    holds in the next state; `following` has the value. The key is missing where options last as long as their
+    holds in the next state; `next_options` has the value. The key is missing where options last as long as their
     episodes, and nothing of this applies.
 
     `policies.shared.replay.ReplayLearner` implements `learn`, `add_demonstrations`, `update` and `stateful` for
@@ -374,7 +374,7 @@ class Learner(nn.Module):
         progress: the buffers, by the last part of their names, that say how far a run has come: counters of its steps
             and the exploration that follows from them. They begin afresh where a new run takes over the learner.
         may_be_nan: the columns of the replay buffer that may hold NaN.
-        following: what follows an option that ends inside its episode; the agent sets it.
+        next_options: what follows an option that ends inside its episode; the agent sets it.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
@@ -385,7 +385,7 @@ class Learner(nn.Module):
     may_be_nan: ClassVar[frozenset[str]] = frozenset()
 
     policy: TensorDictModuleBase
-    following: Following
+    next_options: NextOptions
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
@@ -482,10 +482,10 @@ class Learner(nn.Module):
         """Return whether the learner has made an update, or has nothing to learn, as `Selector.has_updated` does."""
         return have_stepped(self.stateful())
 
-    def portable(self) -> dict[str, Any] | None:
+    def exported(self) -> dict[str, Any] | None:
         """Return as JSON values what a program without torch needs to act greedily; None if that is not known.
 
-        `kind` names the form, which `hpamdp.policies.shared.portable` explains.
+        `kind` names the form, which `hpamdp.policies.shared.exported_policy` explains.
         """
         return None
 
@@ -503,7 +503,7 @@ class Learner(nn.Module):
         Raises:
             ValueError: a row is invalid.
         """
-        check_rows(rows, self.specs, self.may_be_nan)
+        check_stored_rows(rows, self.specs, self.may_be_nan)
 
     def check_state(self, state: Mapping[str, Any]) -> None:
         """Refuse a state dict with invalid values, as `Selector.check_state` does.

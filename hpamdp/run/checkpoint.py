@@ -1,8 +1,8 @@
 """A run on disk: everything that is needed to continue it or to score its agent.
 
 A checkpoint is a zip archive: `manifest.json` with the run's progress and the checksums of the other members, and one
-member for each component, written by `torch.save`. Opening somebody else's file runs none of its code, see `archive`.
-Loading changes an agent only if the whole file fits, see `checks`.
+member for each component, written by `torch.save`. Opening somebody else's file runs none of its code, see
+`tensor_archive`. Loading changes an agent only if the whole file fits, see `state_checks`.
 
 TorchRL's `Checkpoint` is not used. It reads a replay buffer's prefetch queue with pickle, and stores replay buffers at
 full capacity. It also moves the old file away before the new one is in place.
@@ -36,33 +36,35 @@ from hpamdp.files import replacing
 from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner, Selector
-from hpamdp.run.archive import MemberFile, TensorArchive, stored_members
-from hpamdp.run.checks import (
+from hpamdp.run.state_checks import (
     Progress,
     SavedPart,
+    buffers_sized_by_data,
     check_form,
     check_generator,
     check_like,
     check_moments,
     check_names,
+    check_num_rows,
     check_optimizer,
     check_replay,
-    check_rows,
     check_values,
     checked,
     checked_as,
     scheduled,
-    stepped,
-    varying,
+    state_after_a_step,
 )
-from hpamdp.run.folder import CHECKPOINT_NAME as FILE_NAME
-from hpamdp.run.folder import POLICY_NAME
+from hpamdp.run.tensor_archive import MemberFile, TensorArchive, stored_members
+from hpamdp.run_files import CHECKPOINT_NAME as FILE_NAME
+from hpamdp.run_files import POLICY_NAME
 
 _FORMAT = 2
 _MANIFEST = "manifest.json"
 _MAX_JSON = 2**24
 _BLOCK = 2**20
 _CUDA_STATE_BYTES = 16
+# Parts of an agent as earlier versions named them in checkpoints, and today's names.
+_RENAMED = {"optimiser": "optimizer"}
 # Parts of a run that are saved beside the agent.
 STATES = ("collection", "recorder")
 # What can be wrong with the bytes of a file.
@@ -354,8 +356,10 @@ class _Opened:
             text = archive.read(_MANIFEST)
             manifest = checked(_Manifest, _json(text))
             _check_format(manifest.format)
-            self._checksums = manifest.members
-            self.names = {*manifest.members}
+            self._members = {
+                _todays_name(name): (f"{name}.pt", checksum) for name, checksum in manifest.members.items()
+            }
+            self.names = {*self._members}
             progress = manifest.progress
         else:
             saved = TensorArchive(file, num_bytes)
@@ -369,8 +373,9 @@ class _Opened:
         """Return the contents of a member, with a `SavedTensor` in the place of each tensor."""
         if name not in self._parts:
             with _explained(self._damaged):
-                info = self._infos[f"{name}.pt"]
-                if _checksum(MemberFile(self._file, info)) != self._checksums[name]:
+                member, checksum = self._members[name]
+                info = self._infos[member]
+                if _checksum(MemberFile(self._file, info)) != checksum:
                     raise ValueError(f"the checksum of {name} is wrong")
                 self._parts[name] = TensorArchive(BufferedReader(MemberFile(self._file, info)), info.file_size)
         return self._parts[name].state
@@ -395,7 +400,7 @@ class _Opened:
         """
         archive = self._parts[name]
         own = module.state_dict(keep_vars=True)
-        any_size = varying(module)
+        any_size = buffers_sized_by_data(module)
         check_names(saved, own)
         for key, value in own.items():
             if isinstance(value, Tensor):
@@ -439,7 +444,7 @@ class _Opened:
         Raises:
             ValueError: the state is of another optimizer, or holds invalid numbers.
         """
-        own = stepped(optimizer)
+        own = state_after_a_step(optimizer)
         saved = self.part(name)
         check_optimizer(name, saved, own)
         moments = self._parts[name].filled(saved["state"], device)
@@ -463,7 +468,7 @@ class _Opened:
         example = agent.replay_rows(name, steps)
         if example is None:  # its owner does not override `replay_rows`
             return _Replay(TensorDict(self.filled(name, steps.device)["rows"], [saved.num_rows]), writer)
-        check_rows(f"{name}.rows", saved.rows, example.to_dict(), saved.num_rows)
+        check_num_rows(f"{name}.rows", saved.rows, example.to_dict(), saved.num_rows)
         rows = TensorDict(self._parts[name].filled(saved.rows, example.device), batch_size=[saved.num_rows])
         agent.check_rows(name, rows, example)
         return _Replay(rows, writer)
@@ -476,6 +481,12 @@ def _json(text: Any) -> Any:
     if not isinstance(text, str | bytes) or len(text) > _MAX_JSON:
         raise ValueError(f"its progress is no text of at most {_MAX_JSON:,} bytes")
     return json.loads(text, parse_constant=refuse)
+
+
+def _todays_name(member: str) -> str:
+    """Return today's name of a member of a checkpoint."""
+    level, _, part = member.partition("_")
+    return f"{level}_{_RENAMED[part]}" if part in _RENAMED else member
 
 
 def _checksum(member: MemberFile) -> str:

@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from hpamdp.analysis.style import REFERENCES
 from hpamdp.env.base import Metric
+from hpamdp.figure_style import REFERENCES
 from hpamdp.messages import duration
-from hpamdp.run.metrics import FRAMES, WALL_SECONDS
+from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
 

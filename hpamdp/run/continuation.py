@@ -11,7 +11,7 @@ import yaml
 
 from hpamdp.config import Config, ConfigError
 from hpamdp.run import checkpoint
-from hpamdp.run.folder import SUMMARY_NAME, saved_config, saved_summary
+from hpamdp.run_files import SUMMARY_NAME, saved_config, saved_summary
 from hpamdp.saved_config import in_todays_form
 
 # Settings that change neither the training nor the score.
@@ -27,14 +27,14 @@ _BOOKKEEPING = (
 )
 
 
-class Left(NamedTuple):
+class Rest(NamedTuple):
     """The rest of a run: nothing if it has a score, else everything after its checkpoint."""
 
     score: float | None = None
     checkpoint: Path | None = None
 
 
-def left(wanted: Config, folder: Path, name: str = "its folder") -> Left:
+def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
     """Return the rest of a run in its folder, which may be new.
 
     Args:
@@ -47,13 +47,13 @@ def left(wanted: Config, folder: Path, name: str = "its folder") -> Left:
     """
     file = folder / checkpoint.FILE_NAME
     if not file.exists() and not (folder / SUMMARY_NAME).exists():
-        return Left()
+        return Rest()
     saved = saved_config(folder)
     if not saved and file.exists():
         saved = checkpoint.progress_of(file)["config"]
     difference = _difference(wanted, saved)
     if difference and wanted.run.overwrite:
-        return Left()
+        return Rest()
     if difference:
         raise ConfigError(
             f"{name} has the results of another config, with {difference}; they stay as they are: set another "
@@ -61,7 +61,7 @@ def left(wanted: Config, folder: Path, name: str = "its folder") -> Left:
         )
     summary = saved_summary(folder)
     score = summary.get("score") if summary.get("finished") else None
-    return Left(score if isinstance(score, int | float) else None, file if file.exists() else None)
+    return Rest(score if isinstance(score, int | float) else None, file if file.exists() else None)
 
 
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:

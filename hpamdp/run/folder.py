@@ -9,36 +9,32 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 
-import yaml
 from filelock import FileLock, Timeout
 
 from hpamdp.config import ConfigError
-from hpamdp.files import remove_link, replacing
-from hpamdp.regular_files import read_regular
+from hpamdp.files import read_regular, remove_link, replacing
+from hpamdp.run_files import (
+    CHECKPOINT_NAME,
+    CONFIG_NAME,
+    DIVERGED_NAME,
+    ERROR_NAME,
+    EVALUATION_NAME,
+    FIGURES_NAME,
+    FILM_NAME,
+    MAX_TEXT_BYTES,
+    METRICS_NAME,
+    POLICY_NAME,
+    SUMMARY_NAME,
+    TENSORBOARD_NAME,
+    WANDB_NAME,
+    saved_config,
+    saved_summary,
+)
 from hpamdp.shell import path_setting
-from hpamdp.yaml_files import check_size
 
 # The value of `resume` that continues the run in its own folder, or starts it there.
 AUTO = "auto"
-# Files of a run that others read.
-CHECKPOINT_NAME = "checkpoint.zip"
-POLICY_NAME = "policy.pt"
-SUMMARY_NAME = "summary.json"
-CONFIG_NAME = "config.yaml"
-METRICS_NAME = "metrics.csv"
-# Folders that a run's logger writes to.
-TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
-# Names of the pictures in the folder, which the environment chooses.
-FIGURES_NAME = ".figures"
-# All other files that a run writes.
-DIVERGED_NAME = "checkpoint.diverged.zip"
-EVALUATION_NAME = "evaluation.npz"
-FILM_NAME = "episodes.gif"
-ERROR_NAME = "error.txt"
-# The largest config or summary that is read.
-MAX_TEXT_BYTES = 1 << 24
 # Each of these marks the folder as that of a run.
 _MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME)
 _OTHERS = (
@@ -124,26 +120,6 @@ def check_no_training(folder: Path) -> None:
         raise ConfigError(
             f"{folder}: holds the record of a training, which an evaluation never changes; take another hydra.run.dir"
         )
-
-
-def saved_config(folder: Path) -> dict[str, Any]:
-    """Return the config of the run in a folder; empty if it is missing or cannot be read."""
-    try:
-        text = read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES)
-        check_size(folder / CONFIG_NAME)
-        config = yaml.safe_load(text)
-    except (OSError, yaml.YAMLError, RecursionError, ConfigError):
-        return {}
-    return config if isinstance(config, dict) else {}
-
-
-def saved_summary(folder: Path) -> dict[str, Any]:
-    """Return the summary of the run in a folder; empty if it is missing or cannot be read."""
-    try:
-        summary = json.loads(read_regular(folder / SUMMARY_NAME, MAX_TEXT_BYTES))
-    except (OSError, ValueError, RecursionError):  # missing, or cut off in the middle
-        return {}
-    return summary if isinstance(summary, dict) else {}
 
 
 def mark_unfinished(folder: Path) -> None:

@@ -17,8 +17,8 @@ from urllib.parse import urlsplit
 from pydantic import Field, ValidationError
 
 from hpamdp.messages import first_line, warn
-from hpamdp.run.folder import TENSORBOARD_NAME, WANDB_NAME
-from hpamdp.run.metrics import FRAMES, WALL_SECONDS
+from hpamdp.metrics_file import FRAMES, WALL_SECONDS
+from hpamdp.run_files import TENSORBOARD_NAME, WANDB_NAME
 
 
 class EarlierRun(NamedTuple):

@@ -22,9 +22,9 @@ from urllib.parse import urlsplit
 from filelock import FileLock
 
 from hpamdp.env.page import EpisodeError, Page
+from hpamdp.files import read_regular, regular_size
 from hpamdp.json_lines import MAX_LINE_BYTES, LineError, left_out, lines_of, read_json
 from hpamdp.messages import one_line, reason_of, warn
-from hpamdp.regular_files import read_regular, regular_size
 
 DATA_NAME = "data.js"
 EPISODES = "/episodes"

@@ -20,10 +20,10 @@ from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, reason_of, say, warn
 from hpamdp.run.assemble import make_env
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.folder import POLICY_NAME, saved_summary
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.run.players import Player, load_player, split_words, whole_number
 from hpamdp.run.resume import saved_choices
+from hpamdp.run_files import POLICY_NAME, saved_summary
 from hpamdp.saved_config import choices_of
 
 _DESCRIPTION = """\
@@ -138,7 +138,7 @@ def _permissions(name: str, config: Config, settings: Sequence[str]) -> list[str
 
 
 def _agent(path: Path, player: Player) -> dict[str, Any] | None:
-    form = player.agent.portable()
+    form = player.agent.exported()
     if form is None:
         return None
     config = player.config

@@ -17,14 +17,14 @@ from hpamdp import keys
 from hpamdp.analysis import figures, film
 from hpamdp.config import Config
 from hpamdp.files import replacing
+from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
-from hpamdp.run.checks import SavedPart, check_columns, check_values, checked
 from hpamdp.run.closing_table import WITHOUT_UPDATE, closing_table
-from hpamdp.run.folder import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 from hpamdp.run.loggers import CSVLogger, EarlierRun, Guarded, Logger
-from hpamdp.run.metrics import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
+from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
 from hpamdp.run.summary import summarise
+from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 
 # Small and short enough to take a second or two.
 _FPS, _FILM_SIZE, _FILMED_STEPS = 20.0, 200, 40

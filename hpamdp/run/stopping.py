@@ -84,7 +84,7 @@ class ProgramExitError(RuntimeError):
 
 
 @contextmanager
-def exits_told() -> Iterator[None]:
+def exits_explained() -> Iterator[None]:
     """Turn a call of `sys.exit` inside the block into an error that names its place.
 
     Calls by argparse are let through. So are calls by submitit, which ends a job this way to requeue it.

@@ -27,9 +27,10 @@ from omegaconf import DictConfig, open_dict, read_write
 from hpamdp.config import ConfigError, job_overrides
 from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
-from hpamdp.run.folder import ERROR_NAME, check_no_link, is_about_folder, locked, saved_summary
+from hpamdp.run.folder import check_no_link, is_about_folder, locked
 from hpamdp.run.search import go_on
-from hpamdp.run.stopping import exits_told, pass_on_signal
+from hpamdp.run.stopping import exits_explained, pass_on_signal
+from hpamdp.run_files import ERROR_NAME, saved_summary
 from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
@@ -181,7 +182,7 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
     records.write(job)
     say(f"Job {job.number}: {job.overrides}")
     try:
-        with locked(folder, _PATIENCE_S), exits_told():
+        with locked(folder, _PATIENCE_S), exits_explained():
             job.state, job.score, job.reason = _go_on(cfg, overrides, folder)
     except ConfigError as error:
         job.state, job.reason = _REFUSED, one_line(str(error))
@@ -206,11 +207,11 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
     """Run what is not done yet in a job's folder; return the job's state, its score and why it failed."""
     # These take seconds, which --help need not wait for.
     from hpamdp.run import train
-    from hpamdp.run.continuation import left
+    from hpamdp.run.continuation import rest_of
     from hpamdp.run.resume import resolve
 
     wanted, _ = resolve(cfg, overrides)
-    done, source = left(wanted, folder)
+    done, source = rest_of(wanted, folder)
     if done is not None:
         return _SKIPPED, done, ""
     (folder / ERROR_NAME).unlink(missing_ok=True)

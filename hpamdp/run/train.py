@@ -21,23 +21,13 @@ from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
-from hpamdp.run.checks import example_steps
 from hpamdp.run.collection.base import Collection, CollectionError
-from hpamdp.run.folder import (
-    CONFIG_NAME,
-    DIVERGED_NAME,
-    POLICY_NAME,
-    TENSORBOARD_NAME,
-    WANDB_NAME,
-    check_no_link,
-    check_no_training,
-    check_unused,
-    mark_unfinished,
-    moved_aside,
-)
+from hpamdp.run.folder import check_no_link, check_no_training, check_unused, mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import check_saved_options, resolve
-from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_told, signals_ignored, stop_on_signals
+from hpamdp.run.state_checks import example_steps
+from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_explained, signals_ignored, stop_on_signals
+from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME, TENSORBOARD_NAME, WANDB_NAME
 from hpamdp.saved_config import needs_trust
 from hpamdp.shell import path_setting, program
 
@@ -76,7 +66,7 @@ def run(
         ConfigError: a wrong value or path, or values that do not go together.
     """
     try:
-        with exits_told():
+        with exits_explained():
             config, source = resolve(cfg, overrides)
             source = stopped_at or source
             with memory_errors_explained(config):

@@ -15,12 +15,12 @@ from torchrl.data.datasets.common import BaseDatasetExperienceReplay
 from torchrl.data.replay_buffers import Sampler
 
 from hpamdp.data import memmap
-from hpamdp.data.checks import TRAJECTORY, check_actions, check_transitions
 from hpamdp.data.errors import DataError
 from hpamdp.data.export import write_memmap
 from hpamdp.data.human.episodes import select
 from hpamdp.data.human.released_file import SHA256, default_path, load_bytes, read
 from hpamdp.data.human.transitions import transitions
+from hpamdp.data.row_checks import TRAJECTORY, check_actions, check_transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.episode import MAX_PRESSES, ObservationForm, RewardForm
 from hpamdp.messages import reason_of

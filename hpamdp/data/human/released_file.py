@@ -21,8 +21,8 @@ from hpamdp.data.errors import DataError
 from hpamdp.data.human import schema
 from hpamdp.data.human.matfile import read_variable
 from hpamdp.env.boatdock import harbour, physics
+from hpamdp.files import read_regular
 from hpamdp.messages import reason_of
-from hpamdp.regular_files import read_regular
 
 FILE_NAME = "BDtrajectory40.mat"
 SHA256 = "9de16874b43de9e377c2c10749cb2bd435a6db3ca7cead445b826d64ec399d20"

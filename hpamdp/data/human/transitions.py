@@ -19,9 +19,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.data.checks import TRAJECTORY
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FRAMES_PER_SECOND, HumanData
+from hpamdp.data.row_checks import TRAJECTORY
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics
 from hpamdp.env.boatdock.episode import BoatState, ObservationForm, RewardForm, Rules

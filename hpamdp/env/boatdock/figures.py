@@ -13,10 +13,10 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import PercentFormatter
 from scipy.stats import binomtest
 
-from hpamdp.analysis.style import AGENT, FAINT, INK, REFERENCES, label_ends
 from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, NOT_CHOSEN
 from hpamdp.env.boatdock.physics import DOCK_RADIUS, HARBOUR_RADIUS, OUTCOMES, SUCCESS
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+from hpamdp.figure_style import AGENT, FAINT, INK, REFERENCES, label_ends
 
 _OUTCOME_COLOURS = {
     "success": "#009E73",

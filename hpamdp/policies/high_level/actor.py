@@ -30,8 +30,8 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.masks import masked_logits
-from hpamdp.policies.shared.networks import mlp, sample_index
+from hpamdp.policies.masks import masked_logits, sample_index
+from hpamdp.policies.shared.networks import mlp
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions
 from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs

@@ -11,8 +11,8 @@ import torch
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
-from hpamdp.policies.shared.masks import random_choice
+from hpamdp.policies.masks import random_choice
+from hpamdp.policies.shared.bandit import Bandit, Discount, Memory
 from hpamdp.settings import Fraction
 from hpamdp.specs import PAMDPSpecs
 

@@ -18,8 +18,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory, RewardStatistics
-from hpamdp.policies.shared.masks import masked_values
+from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.bandit import Bandit, Discount, Memory, RewardStatistics
 from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
-from hpamdp.policies.shared.masks import allowed_or_first
+from hpamdp.policies.masks import allowed_or_first
 from hpamdp.specs import PAMDPSpecs
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hpamdp.policies.shared.context import LinearBandit
+from hpamdp.policies.shared.linear_bandit import LinearBandit
 
 
 class LinThompson(LinearBandit):

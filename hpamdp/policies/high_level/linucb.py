@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from hpamdp.policies.shared.context import LinearBandit
+from hpamdp.policies.shared.linear_bandit import LinearBandit
 
 
 class LinUCB(LinearBandit):

@@ -26,9 +26,9 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.masks import masked_values
+from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
-from hpamdp.policies.shared.portable import portable_ensemble
 from hpamdp.policies.shared.replay import first_multiple, linear_schedule
 from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
@@ -98,16 +98,16 @@ class MetaCritic(Selector):
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
-        """Return the optimiser and the replay buffer."""
+        """Return the optimizer and the replay buffer."""
         return {"critics": self.optimizer, "buffer": self.buffer}
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
         """Return the rows that the buffer would store if every step of a batch `[*B, T]` ended an option."""
         return {"buffer": self._rows(batch.flatten())}
 
-    def portable(self) -> dict[str, Any]:
-        """Return the critics: see `hpamdp.policies.shared.portable`."""
-        return portable_ensemble(self.critics)
+    def exported(self) -> dict[str, Any]:
+        """Return the critics: see `hpamdp.policies.shared.exported_policy`."""
+        return exported_ensemble(self.critics)
 
     @property
     def epsilon(self) -> float:

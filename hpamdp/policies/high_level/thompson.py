@@ -12,8 +12,8 @@ import torch
 from pydantic import PositiveFloat, PositiveInt
 from torch import Tensor
 
-from hpamdp.policies.shared.bandit_statistics import Bandit, Discount, Memory
-from hpamdp.policies.shared.masks import masked_values
+from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.bandit import Bandit, Discount, Memory
 from hpamdp.specs import PAMDPSpecs
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector
-from hpamdp.policies.shared.masks import random_choice
+from hpamdp.policies.masks import random_choice
 
 
 class Uniform(Selector):

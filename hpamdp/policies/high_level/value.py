@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.masks import masked_values, random_choice
+from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.settings import Fraction
 from hpamdp.specs import PAMDPSpecs
 

@@ -40,8 +40,8 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.low_level.dlpa_model import PAMDPModel
+from hpamdp.policies.masks import random_choice
 from hpamdp.policies.shared.end_values import EndValues
-from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import Expectile, LearningRate, PositiveFraction

@@ -35,10 +35,10 @@ from typing_extensions import Self
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy
 from hpamdp.policies.shared.default_dtype import float32_by_default
+from hpamdp.policies.shared.exported_policy import exported_actor
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, encoder
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions
-from hpamdp.policies.shared.portable import portable_actor
 from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
@@ -182,9 +182,9 @@ class HPPO(OnPolicy, Learner):
         """Have the matrix products of the loss and its gradient in bfloat16."""
         self.descent.lower_precision()
 
-    def portable(self) -> dict[str, Any] | None:
-        """Return the actor, unless it is to sample: see `hpamdp.policies.shared.portable`."""
-        return None if self.policy.samples_when_greedy else portable_actor(self.policy.actor, self.specs)
+    def exported(self) -> dict[str, Any] | None:
+        """Return the actor, unless it is to sample: see `hpamdp.policies.shared.exported_policy`."""
+        return None if self.policy.samples_when_greedy else exported_actor(self.policy.actor, self.specs)
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the size of a minibatch."""
@@ -263,7 +263,7 @@ class HPPO(OnPolicy, Learner):
         """Return the values `[*B, T, 1]` of states `[*B, T]` under options `[*B, T]`."""
         observation = states.get(keys.OBSERVATION).flatten(0, -2)
         masks = [states.get(keys.ACTION_MASK).flatten(0, -2)] if self.specs.has_action_mask else []
-        return self.following.value(observation, option.flatten(), *masks).reshape(*option.shape, 1)
+        return self.next_options.value(observation, option.flatten(), *masks).reshape(*option.shape, 1)
 
     def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what an update needs of the rows in `mask`, `[N]`.

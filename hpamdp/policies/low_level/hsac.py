@@ -34,8 +34,8 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
+from hpamdp.policies.masks import masked_logits, random_choice
 from hpamdp.policies.shared.hybrid_actor import HybridDistribution
-from hpamdp.policies.shared.masks import masked_logits, random_choice
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,

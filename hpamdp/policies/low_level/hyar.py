@@ -55,7 +55,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
+from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     before_tanh,

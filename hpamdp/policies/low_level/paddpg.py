@@ -33,7 +33,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.masks import masked_values
+from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InitialLayer,

@@ -43,7 +43,7 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
-from hpamdp.policies.shared.masks import allowed_rows, masked_values, random_choice
+from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,

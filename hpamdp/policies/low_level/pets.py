@@ -47,9 +47,9 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
+from hpamdp.policies.masks import random_choice
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.frame import CanonicalFrame, joined
-from hpamdp.policies.shared.masks import random_choice
 from hpamdp.policies.shared.networks import EnsembleLinear
 from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, SequenceStep, discounted_return
 from hpamdp.policies.shared.replay import ReplayLearner

@@ -45,8 +45,8 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
-from hpamdp.policies.shared.masks import masked_logits, masked_values
-from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, sample_index
+from hpamdp.policies.masks import masked_logits, masked_values, sample_index
+from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
 from hpamdp.policies.shared.sized_by_data import SizedByData
 from hpamdp.settings import Fraction, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
@@ -552,7 +552,7 @@ class QPAMDP(Learner):
             is_followed = (option_ended & ~batch["next", keys.DONE]).squeeze(-1) & mask
             next_observation = batch["next", keys.OBSERVATION][is_followed]
             masks = [batch["next", keys.ACTION_MASK][is_followed]] if self.specs.has_action_mask else []
-            value = self.following.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
+            value = self.next_options.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
             reward = reward.index_put((is_followed,), self.sarsa.gamma * value, accumulate=True)
             terminated = terminated | is_followed
         rows = {

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
-from hpamdp.policies.shared.masks import random_choice
+from hpamdp.policies.masks import random_choice
 from hpamdp.specs import PAMDPSpecs
 
 

@@ -30,7 +30,7 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.masks import allowed_rows, masked_logits
+from hpamdp.policies.masks import allowed_rows, masked_logits
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import LearningRate, PositiveFraction

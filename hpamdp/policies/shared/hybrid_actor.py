@@ -15,8 +15,8 @@ from torch.nn import functional as F
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.shared.masks import masked_logits
-from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts, sample_index
+from hpamdp.policies.masks import masked_logits, sample_index
+from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts
 from hpamdp.specs import PAMDPSpecs
 
 

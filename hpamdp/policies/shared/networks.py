@@ -93,12 +93,6 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim, dtype=torch.float32))
 
 
-def sample_index(logits: Tensor) -> Tensor:
-    """Sample an index from the softmax of logits `[*B, K]`, int64 `[*B]`."""
-    # The Gumbel-max trick: faster than torch.multinomial, and works for any batch shape.
-    return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
-
-
 def before_tanh(output: Tensor) -> Tensor:
     """Return a network's output in float32: in bfloat16 tanh is 1 from 3.3 on, and has no gradient."""
     return output.float()

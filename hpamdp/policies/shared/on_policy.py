@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
-from hpamdp.policies.shared.stored_rows import check_choices
+from hpamdp.policies.stored_rows import check_choices
 from hpamdp.settings import LearningRate, Settings
 from hpamdp.specs import PAMDPSpecs
 
@@ -48,7 +48,7 @@ class OnPolicy(nn.Module):
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizer, for the checkpoint."""
-        return {"optimiser": self.optimizer}
+        return {"optimizer": self.optimizer}
 
     def get_extra_state(self) -> list[dict[str, Tensor]]:
         """Return the rows that wait for the next update, for the state dict."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from hpamdp.policies.shared.masks import random_choice
+from hpamdp.policies.masks import random_choice
 
 # Of a sequence with a forbidden action: finite, so that the weights of the elites are numbers.
 _FORBIDDEN_RETURN = -1e9

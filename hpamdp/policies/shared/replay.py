@@ -224,11 +224,11 @@ class ReplayLearner(Learner):
         value = self.value(state, *masks)
         if "option_ended" not in sample.keys():
             return value
-        is_ended = sample["option_ended"] | self.following.decides_ends
+        is_ended = sample["option_ended"] | self.next_options.decides_ends
         if is_ended.any():
             state = state[is_ended]
-            option = self.following.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
-            value[is_ended] = self.following.value(state, option, *(mask[is_ended] for mask in masks))
+            option = self.next_options.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
+            value[is_ended] = self.next_options.value(state, option, *(mask[is_ended] for mask in masks))
         return value
 
     def allowed(self, sample: TensorDictBase) -> Tensor | None:

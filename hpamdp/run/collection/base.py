@@ -11,9 +11,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.shared.stored_rows import check_choices
+from hpamdp.policies.stored_rows import check_choices
 from hpamdp.run.assemble import Parts
-from hpamdp.run.checks import SavedPart, check_columns, check_generator, checked, example_steps
+from hpamdp.run.state_checks import SavedPart, check_columns, check_generator, checked, example_steps
 
 
 class CollectionState(SavedPart):

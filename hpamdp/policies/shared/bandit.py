@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.masks import masked_values
-from hpamdp.policies.shared.stored_rows import check_choices
+from hpamdp.policies.masks import masked_values
+from hpamdp.policies.stored_rows import check_choices
 from hpamdp.specs import PAMDPSpecs
 
 Memory = Literal["all", "discounted", "sliding_window"]

@@ -26,7 +26,7 @@ def check_choices(rows: Mapping[str, Tensor], specs: PAMDPSpecs) -> None:
             raise ValueError(f"{name} holds {int(column.min())} to {int(column.max())}, but must be 0 to {limit - 1}")
 
 
-def check_rows(rows: TensorDictBase, specs: PAMDPSpecs, may_be_nan: frozenset[str] = frozenset()) -> None:
+def check_stored_rows(rows: TensorDictBase, specs: PAMDPSpecs, may_be_nan: frozenset[str] = frozenset()) -> None:
     """Refuse stored rows with numbers that are not finite and with choices that do not exist.
 
     Raises:

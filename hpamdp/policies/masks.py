@@ -1,4 +1,4 @@
-"""Choices among the discrete actions, or the options, that a mask allows.
+"""Choose among the discrete actions, or the options, that a mask allows.
 
 A mask is bool `[*B, K]`, True where a choice is allowed; None allows everything and changes nothing.
 """
@@ -10,11 +10,16 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.shared.networks import sample_index
 from hpamdp.specs import PAMDPSpecs
 
 # Of a forbidden choice: its probability is exactly 0, while entropies and gradients stay finite.
 _FORBIDDEN_LOGIT = -1e9
+
+
+def sample_index(logits: Tensor) -> Tensor:
+    """Sample an index from the softmax of logits `[*B, K]`, int64 `[*B]`."""
+    # The Gumbel-max trick: faster than torch.multinomial, and works for any batch shape.
+    return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
 
 
 def masked_logits(logits: Tensor, mask: Tensor | None) -> Tensor:

@@ -22,7 +22,7 @@ from hpamdp.policies.shared.networks import EnsembleLinear, EnsembleMLP
 from hpamdp.specs import PAMDPSpecs
 
 
-def portable_actor(actor: HybridActor, specs: PAMDPSpecs) -> dict[str, Any] | None:
+def exported_actor(actor: HybridActor, specs: PAMDPSpecs) -> dict[str, Any] | None:
     """Return a `hybrid_actor`; None if it has initial parameters or products of vectors, which the form lacks."""
     if actor.initial.exists or actor.products is not None:
         return None
@@ -37,7 +37,7 @@ def portable_actor(actor: HybridActor, specs: PAMDPSpecs) -> dict[str, Any] | No
     }
 
 
-def portable_ensemble(net: EnsembleMLP) -> dict[str, Any]:
+def exported_ensemble(net: EnsembleMLP) -> dict[str, Any]:
     """Return an `ensemble`."""
     layers = [layer for layer in net.layers if isinstance(layer, EnsembleLinear)]
     members = [[_layer(layer.weight[i].T, layer.bias[i, 0]) for layer in layers] for i in range(net.num_members)]

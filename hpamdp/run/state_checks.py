@@ -18,7 +18,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.messages import first_line
 from hpamdp.policies.shared.sized_by_data import SizedByData
-from hpamdp.run.archive import SavedTensor
+from hpamdp.run.tensor_archive import SavedTensor
 
 # The largest whole number that a float holds exactly.
 _MOST = 2**53
@@ -185,13 +185,13 @@ def check_names(saved: object, own: Mapping[str, Any]) -> Mapping[str, Any]:
     return saved
 
 
-def varying(module: nn.Module) -> set[int]:
+def buffers_sized_by_data(module: nn.Module) -> set[int]:
     """Return the ids of the buffers whose sizes depend on data."""
     sized = [part for part in module.modules() if isinstance(part, SizedByData)]
     return {id(buffer) for part in sized for buffer in part.buffers(recurse=False)}
 
 
-def stepped(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+def state_after_a_step(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     """Return the state of a copy of an optimizer that has made a step, for the forms of its tensors."""
     another = copy.deepcopy(optimizer)
     for group in another.param_groups:
@@ -268,7 +268,7 @@ def check_replay(where: str, saved: Any, buffer: ReplayBuffer) -> _ReplayState:
     return state
 
 
-def check_rows(where: str, saved: Any, own: Mapping[str, Any], num: int) -> None:
+def check_num_rows(where: str, saved: Any, own: Mapping[str, Any], num: int) -> None:
     """Refuse columns that do not have `num` rows, or whose dtypes or shapes differ from `own`.
 
     Raises:

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
-from hpamdp.policies.shared.bandit_statistics import Discount, Memory, RewardStatistics
-from hpamdp.policies.shared.masks import masked_values
+from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.bandit import Discount, Memory, RewardStatistics
 from hpamdp.specs import PAMDPSpecs
 
 Features = Literal["polynomial", "random_fourier"]
@@ -153,8 +153,8 @@ class LinearBandit(Selector):
         theta = torch.cholesky_solve((self.moment / size).unsqueeze(-1), factor).squeeze(-1) / size
         return theta, factor, size
 
-    def portable(self) -> dict[str, Any] | None:
-        """Return the polynomials: see `hpamdp.policies.shared.portable`; None for other features."""
+    def exported(self) -> dict[str, Any] | None:
+        """Return the polynomials: see `hpamdp.policies.shared.exported_policy`; None for other features."""
         if not self.features.is_polynomial:
             return None
         theta, _, _ = self._regression()

@@ -1,0 +1,51 @@
+"""The files in the folder of a run: their names, and readers of its config and its summary."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hpamdp.config import ConfigError
+from hpamdp.files import read_regular
+from hpamdp.yaml_files import check_size
+
+# Files of a run that others read.
+CHECKPOINT_NAME = "checkpoint.zip"
+POLICY_NAME = "policy.pt"
+SUMMARY_NAME = "summary.json"
+CONFIG_NAME = "config.yaml"
+METRICS_NAME = "metrics.csv"
+# Folders that a run's logger writes to.
+TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
+# Names of the pictures in the folder, which the environment chooses.
+FIGURES_NAME = ".figures"
+# All other files that a run writes.
+DIVERGED_NAME = "checkpoint.diverged.zip"
+EVALUATION_NAME = "evaluation.npz"
+FILM_NAME = "episodes.gif"
+ERROR_NAME = "error.txt"
+# The largest config or summary that is read.
+MAX_TEXT_BYTES = 1 << 24
+
+
+def saved_config(folder: Path) -> dict[str, Any]:
+    """Return the config of the run in a folder; empty if it is missing or cannot be read."""
+    try:
+        text = read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES)
+        check_size(folder / CONFIG_NAME)
+        config = yaml.safe_load(text)
+    except (OSError, yaml.YAMLError, RecursionError, ConfigError):
+        return {}
+    return config if isinstance(config, dict) else {}
+
+
+def saved_summary(folder: Path) -> dict[str, Any]:
+    """Return the summary of the run in a folder; empty if it is missing or cannot be read."""
+    try:
+        summary = json.loads(read_regular(folder / SUMMARY_NAME, MAX_TEXT_BYTES))
+    except (OSError, ValueError, RecursionError):  # missing, or cut off in the middle
+        return {}
+    return summary if isinstance(summary, dict) else {}
