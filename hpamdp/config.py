@@ -716,7 +716,7 @@ def complete_yaml_files() -> None:
     So the composed config has all settings: the command line can override them, `--cfg job` shows them, and other yaml
     files can refer to them.
     """
-    sources: list[Any] = [each for each in Plugins.instance().discover(ConfigSource) if each.scheme() == "file"]
+    sources: list[Any] = [each for each in Plugins.instance().discover(ConfigSource) if each.scheme() == "file"]  # type: ignore[attr-defined]
     for source in sources:
         if not hasattr(source, "load_alone"):
             source.load_alone = source.load_config
