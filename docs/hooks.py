@@ -388,8 +388,9 @@ def on_config(config):
     for item in config.nav:
         if "Results" in item:
             item["Results"] += studies()
-        if "API" in item:
-            item["API"] = api_nav()
+        for inner in item.get("Reference", []):
+            if "API" in inner:
+                inner["API"] = api_nav()
     return config
 
 
