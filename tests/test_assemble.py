@@ -196,12 +196,12 @@ def test_learners_of_another_run_bring_their_networks_and_begin_their_schedules_
 
 
 def test_a_finished_hppo_begins_a_new_run_with_its_first_learning_rate(tmp_path):
-    words = [*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"], "low.anneal_frames=64", "low.minibatch_size=8"]
+    words = [*SMALL, "high=uniform", "low=hppo", *SHORT["hppo"], "low.anneal_steps=64", "low.minibatch_size=8"]
     train(make_config(words), tmp_path / "first")
     parts = make(make_config([*words, f"low.checkpoint={tmp_path / 'first'}"]), tmp_path / "second")
     parts.agent.learn(parts.env.rollout(8, parts.policy, break_when_any_done=False))
     for learner in parts.agent.learners:
-        assert learner.optimizer.param_groups[0]["lr"] == learner.lr
+        assert learner.optimizer.param_groups[0]["lr"] == learner.options.lr
 
 
 @pytest.mark.parametrize("low", ["pdqn", "hsac"])

@@ -58,7 +58,7 @@ LEARNERS = {
         "low.greedy_samples=4",
         "low.num_iterations=1",
     ],
-    "qpamdp": [f"low.gamma={GAMMA}", "low.features=null", "low.warmup_frames=1", "low.phi_order=1", "low.psi_order=1"],
+    "qpamdp": [f"low.gamma={GAMMA}", "low.features=null", "low.warmup_steps=1", "low.phi_order=1", "low.psi_order=1"],
 }
 
 

@@ -43,7 +43,7 @@ SHORT = {
     ],
     "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
     "pdqn_published": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
-    "qpamdp": ["low.warmup_frames=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
+    "qpamdp": ["low.warmup_steps=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
 # The same for selectors.
 SHORT_SELECTORS = {

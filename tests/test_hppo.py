@@ -20,7 +20,7 @@ OPTIONS = dict(
     hidden_dims=[32, 32], critic_hidden_dims=[32, 32], vector_products=False, initial_parameters="none",
     initial_scale=0.5, min_scale=0.05, min_scale_final=0.01,
     max_scale=1.0, epochs=4, minibatch_size=256, clip=0.2, gamma=0.9, gae_lambda=0.8, lr=3e-3, lr_final=3e-4,
-    critic_weight=0.5, discrete_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_frames=40_000,
+    critic_weight=0.5, discrete_entropy=0.01, parameter_entropy=0.0, entropy_final=0.1, anneal_steps=40_000,
     max_grad_norm=1.0, greedy_discrete="most_probable",
 )  # fmt: skip
 
@@ -237,7 +237,7 @@ def test_discrete_actions_without_parameters_are_learned_too():
 
 
 def test_learning_rate_and_scale_are_annealed_over_the_steps_of_the_whole_run():
-    learner = make(anneal_frames=200, minibatch_size=2)
+    learner = make(anneal_steps=200, minibatch_size=2)
     td = random_rows(learner, 50, 2)
     mask = everything(td)
     mask[1:] = False

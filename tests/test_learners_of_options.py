@@ -43,7 +43,7 @@ def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_
     assert config.low_of["kick"].options == recipe != make_config(["low=qpamdp"]).low.options
     assert config.low_of["dribble"].options == config.low.options
     hppo = make_config(["env=goal", "high=none", "low=hppo", "low.clip=0.3", "total_frames=1234"]).low.options
-    assert config.low_of["shoot"].options == hppo and hppo["anneal_frames"] == 1234
+    assert config.low_of["shoot"].options == hppo and hppo["anneal_steps"] == 1234
     assert read_saved(config.to_dict()) == config
 
 

@@ -123,7 +123,7 @@ def test_links_to_code_lead_to_pages_that_show_it(hooks, tmp_path, monkeypatch):
 
 
 # What makes each one learn within a few steps, and seldom.
-FEW = {"warmup_frames": 128, "updates_per_frame": 0.1}
+FEW = {"warmup_steps": 128, "warmup_frames": 128, "updates_per_frame": 0.1}
 QUICK = {
     "hppo": ["low.minibatch_size=16"],
     "qpamdp": [
@@ -153,7 +153,7 @@ def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
     words = [f"low={low}", f"high={high}", "num_envs=16", "steps_per_batch=4", "total_frames=1024", "log_every=64"]
     words += ["eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}", "agent.uniform_option_frames=1024"]
     words += ["env=rooms", "agent.termination=learned"] if high == "option_critic" else []
-    settings = yaml.safe_load((ROOT / f"conf/low/{low}.yaml").read_text())
+    settings = make_config([f"low={low}"]).low.options
     words += [f"low.{name}={value}" for name, value in FEW.items() if name in settings]
     assert forked(run, [*words, *QUICK.get(low, []), *QUICK.get(high, [])]) == 0
     columns = {name for row in read_rows(tmp_path / "metrics.csv") for name in row}

@@ -10,7 +10,15 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.low_level.qpamdp import PARAMETERS, QPAMDP, RAW, SARSA, NaturalActorCritic, SarsaLambda
+from hpamdp.policies.low_level.qpamdp import (
+    PARAMETERS,
+    QPAMDP,
+    RAW,
+    SARSA,
+    NaturalActorCritic,
+    QPAMDPOptions,
+    SarsaLambda,
+)
 from hpamdp.policies.low_level.qpamdp_features import fourier_coefficients, num_fourier_features
 from hpamdp.specs import PAMDPSpecs
 
@@ -18,7 +26,7 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(2, (), (1, 1, 0), (0.0, -2.0), (2.0, 2.0))
 
 OPTIONS = dict(
-    features=None, phi_order=1, phi_max_coupled=2, psi_order=1, psi_max_coupled=1, warmup_frames=100,
+    features=None, phi_order=1, phi_max_coupled=2, psi_order=1, psi_max_coupled=1, warmup_steps=100,
     initial_episodes=100, relearning_episodes=100, gamma=0.9, trace_decay=0.5, step_size=1.0, temperature=0.5,
     parameter_updates=3, patience=2, rollouts=100, natural_step_size=1.0, max_divergence=1.0, ridge=1e-6,
     initial_mean=0.0, initial_parameters="none",
@@ -33,6 +41,10 @@ GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> QPAMDP:
     return QPAMDP(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+
+
+def make_sarsa(**changes) -> SarsaLambda:
+    return SarsaLambda(QPAMDPOptions(**{"gamma": 0.5, "trace_decay": 0.5, **changes}))
 
 
 def play(learner: QPAMDP, num_envs: int = 64, num_steps: int = 2) -> TensorDict:
@@ -81,7 +93,7 @@ def test_the_fourier_basis_has_every_term_of_few_enough_inputs(num_inputs, order
 
 
 def test_features_are_cosines_of_the_varying_entries_scaled_to_their_ranges():
-    learner = make(phi_order=2, phi_max_coupled=1, warmup_frames=4)
+    learner = make(phi_order=2, phi_max_coupled=1, warmup_steps=4)
     batch = play(learner, 2, 2)
     batch[keys.OBSERVATION] = torch.tensor([[[3.0, 7.0], [5.0, 7.0]], [[4.0, 7.0], [3.5, 7.0]]])
     learner.learn(batch, torch.ones(2, 2, dtype=torch.bool))
@@ -120,7 +132,7 @@ def sarsa_rows(phi, next_phi, discrete, reward, terminated, done) -> TensorDict:
 
 def test_sarsa_matches_a_computation_by_hand():
     # One feature, two discrete actions, gamma 0.5, lambda 0.5, a step too small for the bound to matter.
-    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.1, step_bound="each_step")
+    sarsa = make_sarsa(step_size=0.1)
     w = torch.tensor([[1.0], [2.0]])
     # Environment 0 goes on after the first step, environment 1 ends its episode there.
     phi, next_phi = [[[1.0], [2.0]], [[1.0], [1.0]]], [[[2.0], [1.0]], [[9.0], [2.0]]]
@@ -148,7 +160,7 @@ def test_sarsa_matches_a_computation_by_hand():
 
 
 def test_an_abandoned_episode_leaves_nothing_to_the_next_one_of_its_environment():
-    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.1, step_bound="each_step")
+    sarsa = make_sarsa(step_size=0.1)
     goes_on = [[False], [False]]
     rows = sarsa_rows([[[1.0]], [[1.0]]], [[[2.0]], [[2.0]]], [[0], [0]], [[1.0], [1.0]], goes_on, goes_on)
     rows["is_first"] = torch.tensor([[True], [False]])
@@ -166,7 +178,7 @@ def test_an_abandoned_episode_leaves_nothing_to_the_next_one_of_its_environment(
 
 
 def test_the_bound_shortens_sarsas_step_to_cancel_the_error():
-    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=1.0, step_bound="each_step")
+    sarsa = make_sarsa(step_size=1.0)
     ends = [[True], [True]]
     rows = sarsa_rows([[[3.0]], [[3.0]]], [[[0.0]], [[0.0]]], [[0], [0]], [[6.0], [6.0]], ends, ends)
     got, error = sarsa.update(torch.zeros(2, 1), rows, ONE, ONE)
@@ -180,7 +192,7 @@ def one_row(phi: float, reward: float, done: bool = True) -> TensorDict:
 
 
 def test_a_non_increasing_bound_stays_at_the_smallest_so_far_and_heeds_only_updates_that_reduce_the_error():
-    sarsa = SarsaLambda(gamma=1.0, trace_decay=1.0, step_size=1.0, step_bound="non_increasing")
+    sarsa = make_sarsa(gamma=1.0, trace_decay=1.0, step_size=1.0, step_bound="non_increasing")
     w = torch.zeros(2, 1)
     w, _ = sarsa.update(w, one_row(2.0, 4.0), ONE, ONE)
     assert sarsa.step_size == 0.25, "the error changes by -2 * 2"
@@ -209,23 +221,23 @@ def test_updates_of_groups_of_environments_follow_one_another():
     )
     rows["done"] |= rows["terminated"]
     features = torch.ones(4)
-    grouped = SarsaLambda(0.9, 0.5, 0.1, "each_step", envs_per_update=2)
+    grouped = make_sarsa(gamma=0.9, step_size=0.1, envs_per_update=2)
     got, _ = grouped.update(torch.zeros(2, 4), rows, ONE, features)
 
     # By hand: each group has its own traces; a batch of one time step and one group at a time, with its next action.
     w = torch.zeros(2, 4)
     groups = [rows[:2], rows[2:4], rows[4:]]
-    alone = [SarsaLambda(0.9, 0.5, 0.1, "each_step") for _ in groups]
+    alone = [make_sarsa(gamma=0.9, step_size=0.1) for _ in groups]
     for sarsa, group in zip(alone, groups, strict=True):
         sarsa.traces = torch.zeros(len(group), 2, 4)
     for t in range(3):
         for sarsa, group in zip(alone, groups, strict=True):
             row = {name: group[name][:, t] for name in group.keys()}
             taken = group["discrete"][:, t + 1] if t < 2 else torch.full((len(group),), -1)
-            w, _ = sarsa._updated(w, row, taken, sarsa.traces, ONE, features)
+            w, _ = sarsa.step(w, row, taken, sarsa.traces, ONE, features)
     torch.testing.assert_close(got, w)
     torch.testing.assert_close(grouped.traces, torch.cat([sarsa.traces for sarsa in alone]))
-    together, _ = SarsaLambda(0.9, 0.5, 0.1, "each_step").update(torch.zeros(2, 4), rows, ONE, features)
+    together, _ = make_sarsa(gamma=0.9, step_size=0.1).update(torch.zeros(2, 4), rows, ONE, features)
     assert not torch.allclose(got, together)
 
 
@@ -235,12 +247,12 @@ def test_step_scaling_divides_each_weights_step_by_the_norm_of_its_coefficients(
     expected = [1.0 / max(1.0, sum(c * c for c in row) ** 0.5) for row in phi.coefficients.tolist()]
     torch.testing.assert_close(phi.step_scale(), torch.tensor(expected))
     scale = torch.tensor([1.0, 0.5])
-    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=0.01, step_bound="each_step")
+    sarsa = make_sarsa(step_size=0.01)
     rows = sarsa_rows([[[1.0, 2.0]]] * 2, [[[0.0, 0.0]]] * 2, [[0]] * 2, [[6.0]] * 2, [[True]] * 2, [[True]] * 2)
     w, _ = sarsa.update(torch.zeros(2, 2), rows, ONE, scale)
     torch.testing.assert_close(w[0], torch.tensor([0.06, 0.06]))
     # With the bound the error is cancelled: 1 + 2 * 2 / 2 = 3 of a step of size 1.
-    sarsa = SarsaLambda(gamma=0.5, trace_decay=0.5, step_size=1.0, step_bound="each_step")
+    sarsa = make_sarsa(step_size=1.0)
     w, _ = sarsa.update(torch.zeros(2, 2), rows, ONE, scale)
     torch.testing.assert_close(w[0] @ torch.tensor([1.0, 2.0]), torch.tensor(6.0))
 

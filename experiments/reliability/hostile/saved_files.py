@@ -31,7 +31,7 @@ AGENTS = {
         *("low.updates_per_frame=0.05", "high.minibatch_size=32"),
     ],
     "meta_critic_qpamdp": [
-        *("high=meta_critic", "low=qpamdp", "low.warmup_frames=32", "low.initial_episodes=8"),
+        *("high=meta_critic", "low=qpamdp", "low.warmup_steps=32", "low.initial_episodes=8"),
         *("low.relearning_episodes=8", "low.rollouts=8", "high.warmup_decisions=16", "high.batch_size=16"),
     ],
 }

@@ -1,6 +1,6 @@
 """Q-PAMDP: learn which discrete action to take, then, with that fixed, its parameters, and so on in turns.
 
-The values of the discrete actions are linear and learned by Sarsa(lambda); the parameters are learned by the episodic
+The values of the discrete actions are linear and learned by Sarsa(lambda). The parameters are learned by the episodic
 natural actor-critic (eNAC).
 
 Source: Masson, Ranchod and Konidaris, *Reinforcement Learning with Parameterized Actions*, 2016, arXiv 1509.01644:
@@ -8,26 +8,22 @@ algorithm 1 and section 5; eNAC: Peters and Schaal 2008, *Natural Actor-Critic*,
 Osentoski and Thomas 2011, *Value Function Approximation in Reinforcement Learning using the Fourier Basis*; the bound
 on the step: Dabney and Barto 2012, *Adaptive Step-Size for Online Temporal Difference Learning*.
 
-Where random actions do not lead everywhere, as on Platform, give `feature_range`: without it, entries are clipped to
-the range that the warm-up saw, and the learner cannot tell states beyond it apart. With many parallel environments a
-small `envs_per_update` learns more from the same steps, since every group of environments makes updates of its own.
-
 Differs from the source:
-- all environments learn together: Sarsa makes one update per time step and group of environments, the mean over the
-  group (all of them by default), and the bound on its step size holds for that mean; eNAC accumulates its regression as
-  normal equations, with ridge regularisation;
-- the value of the next discrete action is its expectation under the softmax where that action is not in the batch: in
-  the batch's last column, and where an episode is truncated;
-- where an option ends inside its episode, the step is terminal, and its reward includes the discounted value under the
-  option that follows; what the source says of an episode then holds for the option, in Sarsa, eNAC and windows alike;
-- the Fourier basis couples at most `max_coupled` entries of the observation, each scaled to `feature_range` or to its
-  range in the warm-up;
-- by default, that is with `qpamdp.yaml`: all weights of the values have the same step size, which Dabney and Barto's
-  bound limits anew at each step and whatever its sign, the temperature stays as it is, also in the parameter phases,
-  and sigma decays. The published settings: step_scaling=true, step_bound=non_increasing, temperature_decay=0.995,
-  samples_in_parameter_phase=false, sigma_decay=1;
-- parameters are in units where their bounds are [-1, 1], sigma is a standard deviation, eNAC's returns are not
-  discounted, and its step is bounded by the divergence from the old policy.
+- All environments learn together. Sarsa makes one update for each time step and group of environments, the mean over
+  the group, and the bound on its step size holds for that mean. eNAC accumulates its regression as normal equations,
+  with a ridge penalty.
+- The value of the next discrete action is its expectation under the softmax if that action is not in the batch: in the
+  batch's last column, and where an episode is truncated.
+- If an option ends inside its episode, the step is terminal, and its reward includes the discounted value under the
+  option that follows. Sarsa, eNAC and windows then treat the option as the source treats an episode.
+- The Fourier basis couples at most `max_coupled` entries of the observation. Each entry is scaled to `feature_range`,
+  or to its range in the warm-up.
+- By default all weights of the values have the same step size. Dabney and Barto's bound limits it anew at each step,
+  whatever the sign of the change. The temperature is constant, also in the parameter phases, and sigma decays.
+  The published settings: step_scaling=true, step_bound=non_increasing, temperature=1, temperature_decay=0.995,
+  samples_in_parameter_phase=false, sigma_decay=1.
+- Parameters are in units where their bounds are [-1, 1], and sigma is a standard deviation. eNAC's returns are not
+  discounted, and the divergence from the old policy bounds its step.
 """
 
 from __future__ import annotations
@@ -36,11 +32,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Strict, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn import functional as F
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner, is_greedy, option_ends
@@ -48,13 +45,11 @@ from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
 from hpamdp.policies.shared.sized_by_data import SizedByData
-from hpamdp.settings import Fraction, PositiveFraction
+from hpamdp.settings import Fraction, PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
 RAW = "raw_parameters"
-
-StepBound = Literal["each_step", "non_increasing"]
 
 # Coefficients in eNAC's regression, whose normal equations are a square of them: 2 GB.
 MAX_REGRESSORS = 16_384
@@ -64,49 +59,129 @@ SARSA = 0
 PARAMETERS = 1
 
 
+class QPAMDPOptions(Settings):
+    """Settings of `QPAMDP`. Means and standard deviations are in units where the parameters' bounds are [-1, 1]."""
+
+    features: Annotated[tuple[NonNegativeInt, ...], Strict(False)] | None = None
+    """Entries of the observation that the features see, as in [8, 9]; null: all entries that vary in the warm-up.
+
+    With `agent.sharing=shared` add the entries of the one-hot option, which come last.
+    """
+    feature_range: Annotated[tuple[float, float], Strict(False)] | None = None
+    """Range to which these entries are clipped and scaled, as in [-1, 1]; null: the range seen in the warm-up.
+
+    Give it if random actions do not lead everywhere: states beyond the warm-up's range all look the same.
+    """
+    phi_order: PositiveInt = 5
+    """Highest order of the Fourier basis of the discrete actions' values."""
+    phi_max_coupled: PositiveInt = 2
+    """Largest number of entries in a feature of the values, of which there are fewer than (order + 1)^entries."""
+    psi_order: PositiveInt = 3
+    """Highest order of the Fourier basis of the mean parameters."""
+    psi_max_coupled: PositiveInt = 2
+    """Largest number of entries in a feature of the mean parameters."""
+    warmup_steps: PositiveInt = 2_000
+    """Steps of the initial policy, from which the ranges of the entries are taken."""
+    initial_episodes: PositiveInt = 1_000
+    """Finished episodes in the first phase of Sarsa(lambda)."""
+    relearning_episodes: PositiveInt = 500
+    """Finished episodes in each later phase of Sarsa(lambda)."""
+    gamma: PositiveFraction = 0.99
+    """Discount of a step in the values of the discrete actions."""
+    trace_decay: Fraction = 0.5
+    """Lambda: the decay of the eligibility traces, besides the discount."""
+    step_size: PositiveFloat = 1.0
+    """Largest step size of the values; Dabney and Barto's bound lowers it."""
+    step_scaling: bool = False
+    """Divide the step of each weight by the norm of its Fourier feature's coefficients, as published."""
+    step_bound: Literal["each_step", "non_increasing"] = "each_step"
+    """Bound on the step size: recomputed for every update, or the smallest so far of updates that reduce the error.
+
+    `non_increasing` is the published one; `each_step` allows a large step if traces and next features nearly cancel.
+    """
+    envs_per_update: PositiveInt | None = None
+    """Environments whose mean an update of the values is; null: all of them. Published: 1.
+
+    Small groups learn more from the same steps, because each group makes updates of its own, but take longer.
+    """
+    temperature: PositiveFloat = 0.1
+    """Temperature of the softmax over the discrete actions' values at the start. Published: 1."""
+    temperature_final: PositiveFloat = 0.01
+    """Smallest temperature."""
+    temperature_decay: PositiveFraction = 1.0
+    """Factor on the temperature for every episode that ends while the values are learned. Published: 0.995."""
+    samples_in_parameter_phase: bool = True
+    """Sample discrete actions also while the parameters are learned; if false, as published, take the best ones."""
+    parameter_updates: PositiveInt | None = 10
+    """Parameter updates in a phase: the k of Q-PAMDP(k). If null, that is Q-PAMDP(infinity), see `patience`."""
+    patience: PositiveInt = 5
+    """Windows without a record of the mean return after which a phase ends, if `parameter_updates` is null.
+
+    A window is a parameter update, or `relearning_episodes` of Sarsa(lambda).
+    """
+    rollouts: PositiveInt = 200
+    """Whole episodes in the regression of a parameter update."""
+    natural_step_size: PositiveFloat = 5.0
+    """Largest step size along the natural gradient."""
+    max_divergence: PositiveFloat = 0.2
+    """Largest divergence of the new policy from the old one, in nats an episode; it shortens the step."""
+    ridge: NonNegativeFloat = 1e-4
+    """Ridge penalty of the regression, in units of its regressors' mean square."""
+    initial_parameters: InitialParameters = "domain"
+    """Initial means: `domain` takes the problem's own initial parameters, if it has any; `none` takes none."""
+    initial_mean: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    """Mean parameters at the start, without initial parameters."""
+    sigma: PositiveFloat = 0.1
+    """Standard deviation of the parameters at the start."""
+    sigma_final: PositiveFloat = 0.04
+    """Smallest standard deviation of the parameters."""
+    sigma_decay: PositiveFraction = 0.99
+    """Factor on the standard deviation at each parameter update. Published: 1."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.features is not None and len(set(self.features)) < len(self.features):
+            raise ValueError(f"features={list(self.features)}: names an entry twice")
+        if self.feature_range is not None and not self.feature_range[0] < self.feature_range[1]:
+            raise ValueError(f"feature_range={list(self.feature_range)}: the first number must be less than the second")
+        if self.sigma_final > self.sigma:
+            raise ValueError(f"sigma_final={self.sigma_final}: must be at most sigma={self.sigma}")
+        return self
+
+
 class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
     """A softmax over linear values of the discrete actions, and Gaussian parameters with linear means.
 
-    Args:
-        specs: sizes and bounds of the problem.
+    Attributes:
         phi: features of the values.
         psi: features of the means.
-        temperature: of the softmax.
+        w: weights of the values, `[num_discrete, num_features]`.
+        theta: weights of the means, `[num_parameters, num_features]`.
         sigma: standard deviation of the parameters.
-        mean: initial mean of the parameters.
-        initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
+        temperature: of the softmax.
+        samples_discrete: whether exploring actions are sampled from the softmax, or those of highest value.
     """
 
     w: Tensor
     theta: Tensor
     sigma: Tensor
     temperature: Tensor
-    samples_discrete: Tensor  # whether exploring actions are sampled from the softmax, or those of highest value
+    samples_discrete: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        phi: FourierBasis,
-        psi: FourierBasis,
-        temperature: float,
-        sigma: float,
-        mean: float,
-        initial_parameters: InitialParameters,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: QPAMDPOptions) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, RAW]
         self.specs = specs
-        self.phi = phi
-        self.psi = psi
-        self.register_buffer("temperature", torch.tensor(temperature, dtype=torch.float32))
+        self.phi = FourierBasis(options.phi_order, options.phi_max_coupled)
+        self.psi = FourierBasis(options.psi_order, options.psi_max_coupled)
+        self.initial = InitialLayer(specs, options.initial_parameters, is_squashed=False)
+        mean = 0.0 if self.initial.exists else options.initial_mean
+        self.register_buffer("temperature", torch.tensor(options.temperature, dtype=torch.float32))
         self.register_buffer("samples_discrete", torch.tensor(True))
-        self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.register_buffer("w", torch.zeros(specs.num_discrete, 1, dtype=torch.float32))
-        self.register_buffer(
-            "theta", torch.full((specs.num_parameters, 1), 0.0 if self.initial.exists else mean, dtype=torch.float32)
-        )
-        self.register_buffer("sigma", torch.tensor(sigma, dtype=torch.float32))
+        self.register_buffer("theta", torch.full((specs.num_parameters, 1), mean, dtype=torch.float32))
+        self.register_buffer("sigma", torch.tensor(options.sigma, dtype=torch.float32))
 
     def widen(self) -> None:
         """Append zeros to the weights to match the fitted bases; the policy stays the same."""
@@ -120,9 +195,8 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and their raw sample, each `[*B, num_parameters]`."""
         observation = td.get(keys.OBSERVATION)
-        q = masked_values(
-            self.phi(observation) @ self.w.T, self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
-        )
+        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        q = masked_values(self.phi(observation) @ self.w.T, allowed)
         raw = self.mean(observation)
         is_exploring = not is_greedy()
         discrete = sample_index(q / self.temperature) if is_exploring and self.samples_discrete else q.argmax(-1)
@@ -133,34 +207,15 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
 
 
 class SarsaLambda(SizedByData):
-    """Linear Sarsa(lambda) over parallel environments; the traces carry over from one batch to the next.
-
-    Args:
-        gamma: discount of a step.
-        trace_decay: lambda.
-        step_size: largest step size.
-        step_bound: Dabney and Barto's bound on it: `each_step`, recomputed for every update and whatever its sign, or
-            `non_increasing`: the smallest so far of the updates that reduce the error.
-        envs_per_update: environments whose mean an update is; None: all of them.
-    """
+    """Linear Sarsa(lambda) over parallel environments; the traces carry over from one batch to the next."""
 
     traces: Tensor
     step_size: Tensor
 
-    def __init__(
-        self,
-        gamma: float,
-        trace_decay: float,
-        step_size: float,
-        step_bound: StepBound,
-        envs_per_update: int | None = None,
-    ) -> None:
+    def __init__(self, options: QPAMDPOptions) -> None:
         super().__init__()
-        self.envs_per_update = envs_per_update
-        self.gamma = gamma
-        self.trace_decay = trace_decay
-        self.step_bound = step_bound
-        self.register_buffer("step_size", torch.tensor(step_size, dtype=torch.float32))
+        self.options = options
+        self.register_buffer("step_size", torch.tensor(options.step_size, dtype=torch.float32))
         self.register_buffer("traces", torch.zeros(0, 1, 1, dtype=torch.float32))
 
     def update(self, w: Tensor, rows: TensorDict, temperature: Tensor, step_scale: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,17 +240,17 @@ class SarsaLambda(SizedByData):
             self.traces[rows["is_first"][:, 0]] = 0.0
         # The action at the next time step; -1 in the last column, where it is not known.
         next_discrete = F.pad(rows["discrete"][:, 1:], (0, 1), value=-1)
-        size = num_envs if self.envs_per_update is None else self.envs_per_update
+        size = num_envs if self.options.envs_per_update is None else self.options.envs_per_update
         groups = [{name: rows[name][i : i + size] for name in rows.keys()} for i in range(0, num_envs, size)]
         errors: list[Tensor] = []
         for t in range(num_steps):
             for group, taken, traces in zip(groups, next_discrete.split(size), self.traces.split(size), strict=True):
                 row = {name: values[:, t] for name, values in group.items()}
-                w, error = self._updated(w, row, taken[:, t], traces, temperature, step_scale)
+                w, error = self.step(w, row, taken[:, t], traces, temperature, step_scale)
                 errors.append(error)
         return w, torch.stack(errors).mean()
 
-    def _updated(
+    def step(
         self,
         w: Tensor,
         row: dict[str, Tensor],
@@ -215,7 +270,7 @@ class SarsaLambda(SizedByData):
         phi, next_phi, discrete = row["phi"], row["next_phi"], row["discrete"]
         envs = torch.arange(len(traces), device=w.device)
         weight = row["mask"].float() / row["mask"].sum().clamp(min=1)
-        traces *= self.gamma * self.trace_decay
+        traces *= self.options.gamma * self.options.trace_decay
         traces[envs, discrete] += phi
 
         next_q = next_phi @ w.T
@@ -223,24 +278,19 @@ class SarsaLambda(SizedByData):
         taken = F.one_hot(next_discrete.clamp(min=0), len(w))
         next_logits = masked_logits(next_q / temperature, row.get("next_allowed"))
         next_probs = torch.where(is_known.unsqueeze(-1), taken, next_logits.softmax(-1))
-        next_weight = self.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
+        next_weight = self.options.gamma * next_probs * ~row["terminated"].unsqueeze(-1)
         error = row["reward"] + (next_weight * next_q).sum(-1) - (phi * w[discrete]).sum(-1)
 
-        # Dabney and Barto's bound: the mean change of the errors that a step of size 1 would cause.
+        # Dabney and Barto's bound, from the mean change of the errors that a step of size 1 would cause.
         next_change = torch.einsum("nkf,nf->nk", traces, next_phi * step_scale)
-        change = (next_weight * next_change).sum(-1) - (traces[envs, discrete] * step_scale * phi).sum(-1)
-        step_size = self._bounded((change * weight).sum())
+        changes = (next_weight * next_change).sum(-1) - (traces[envs, discrete] * step_scale * phi).sum(-1)
+        change = (changes * weight).sum()
+        step_size = self.step_size.minimum(1.0 / change.abs())
+        if self.options.step_bound == "non_increasing":
+            step_size = self.step_size = torch.where(change < 0.0, step_size, self.step_size)
         w = w + step_size * step_scale * torch.einsum("n,nkf->kf", error * weight, traces)
         traces[row["done"]] = 0.0
         return w, (error.square() * weight).sum()
-
-    def _bounded(self, change: Tensor) -> Tensor:
-        """Return the step size, given how a step of size 1 changes the error, `[]`."""
-        bounded = self.step_size.minimum(1.0 / change.abs())
-        if self.step_bound == "each_step":
-            return bounded
-        self.step_size = torch.where(change < 0.0, bounded, self.step_size)
-        return self.step_size
 
 
 class NaturalActorCritic(SizedByData):
@@ -324,9 +374,8 @@ class NaturalActorCritic(SizedByData):
             The first `num_weights` coefficients, which are the natural gradient, and the divergence that a step of
             size 1 along them causes, in nats an episode, `[]`.
         """
-        penalty = (
-            self.ridge * self.gram.diagonal().mean() * torch.eye(len(self.gram), dtype=torch.float32).to(self.gram)
-        )
+        identity = torch.eye(len(self.gram), dtype=torch.float32).to(self.gram)
+        penalty = self.ridge * self.gram.diagonal().mean() * identity
         # With gelsy, the default on the CPU, the last digits differ from run to run, and a resumed run from its own.
         driver = "gelsd" if self.gram.device.type == "cpu" else None
         regression = torch.linalg.lstsq(self.gram + penalty, self.moment.unsqueeze(-1), driver=driver)
@@ -341,15 +390,16 @@ class QPAMDP(Learner):
     A phase consists of windows of finished episodes: Sarsa updates in every batch, eNAC once at the end of a window.
     """
 
+    Options = QPAMDPOptions
+    # A run from `low.checkpoint` goes on in the saved phase: a second warm-up would fit other bases under the weights.
+    progress: ClassVar[frozenset[str]] = frozenset()
+
     policy: QPAMDPPolicy
     mask: Tensor
     low: Tensor
     high: Tensor
     best_return: Tensor  # of the current phase's windows
     window_return: Tensor  # sum over the current window
-    # A run from `low.checkpoint` goes on in the saved phase: a second warm-up would fit other bases under the weights.
-    progress: ClassVar[frozenset[str]] = frozenset()
-
     frames: Tensor
     phase: Tensor
     window_episodes: Tensor
@@ -360,80 +410,16 @@ class QPAMDP(Learner):
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        features: list[NonNegativeInt] | None,
-        feature_range: Annotated[list[float], Field(min_length=2, max_length=2)] | None,
-        phi_order: PositiveInt,
-        phi_max_coupled: PositiveInt,
-        psi_order: PositiveInt,
-        psi_max_coupled: PositiveInt,
-        warmup_frames: PositiveInt,
-        initial_episodes: PositiveInt,
-        relearning_episodes: PositiveInt,
-        gamma: PositiveFraction,
-        trace_decay: Fraction,
-        step_size: PositiveFloat,
-        step_scaling: bool,
-        step_bound: StepBound,
-        envs_per_update: PositiveInt | None,
-        temperature: PositiveFloat,
-        temperature_final: PositiveFloat,
-        temperature_decay: PositiveFraction,
-        samples_in_parameter_phase: bool,
-        parameter_updates: PositiveInt | None,
-        patience: PositiveInt,
-        rollouts: PositiveInt,
-        natural_step_size: PositiveFloat,
-        max_divergence: PositiveFloat,
-        ridge: NonNegativeFloat,
-        initial_parameters: InitialParameters,
-        initial_mean: Annotated[float, Field(ge=-1.0, le=1.0)],
-        sigma: PositiveFloat,
-        sigma_final: PositiveFloat,
-        sigma_decay: PositiveFraction,
+        device: torch.device | str = "cpu",
+        options: QPAMDPOptions | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__(specs)
-        if features is not None:
-            last = specs.observation_dim - 1
-            if not features or max(features) > last:
-                raise ValueError(f"features={features}: name some of the observation's entries 0 to {last}; null: all")
-            if len(set(features)) < len(features):
-                raise ValueError(f"features={features}: names an entry twice")
-        if sigma_final > sigma:
-            raise ValueError(f"sigma_final={sigma_final}: must be at most {sigma=}")
-        num_inputs = specs.observation_dim if features is None else len(features)
-        num_regressors = specs.num_parameters * num_fourier_features(num_inputs, psi_order, psi_max_coupled)
-        num_regressors += num_fourier_features(num_inputs, phi_order, phi_max_coupled)
-        if num_regressors > MAX_REGRESSORS:
-            raise ValueError(
-                f"phi_order={phi_order}, psi_order={psi_order}: the regression for the parameters would have "
-                f"{num_regressors:,} coefficients, more than {MAX_REGRESSORS:,}; use fewer features or lower orders"
-            )
-        if feature_range is not None and not feature_range[0] < feature_range[1]:
-            raise ValueError(f"feature_range={feature_range}: the first number must be less than the second")
-        self.features = features
-        self.feature_range = feature_range
-        self.step_scaling = step_scaling
-        self.temperature_final = min(temperature, temperature_final)
-        self.temperature_decay = temperature_decay
-        self.samples_in_parameter_phase = samples_in_parameter_phase
-        self.warmup_frames = warmup_frames
-        self.initial_episodes = initial_episodes
-        self.relearning_episodes = relearning_episodes
-        self.parameter_updates = parameter_updates
-        self.patience = patience
-        self.rollouts = rollouts
-        self.natural_step_size = natural_step_size
-        self.max_divergence = max_divergence
-        self.sigma_final = sigma_final
-        self.sigma_decay = sigma_decay
-
-        phi = FourierBasis(phi_order, phi_max_coupled)
-        psi = FourierBasis(psi_order, psi_max_coupled)
-        self.policy = QPAMDPPolicy(specs, phi, psi, temperature, sigma, initial_mean, initial_parameters)
-        self.sarsa = SarsaLambda(gamma, trace_decay, step_size, step_bound, envs_per_update)
-        self.enac = NaturalActorCritic(ridge)
+        self.options: QPAMDPOptions = QPAMDPOptions.of(options, settings)
+        check_features(self.options, specs)
+        self.policy = QPAMDPPolicy(specs, self.options)
+        self.sarsa = SarsaLambda(self.options)
+        self.enac = NaturalActorCritic(self.options.ridge)
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("low", torch.full((specs.observation_dim,), torch.inf, dtype=torch.float32))
         self.register_buffer("high", torch.full((specs.observation_dim,), -torch.inf, dtype=torch.float32))
@@ -445,7 +431,7 @@ class QPAMDP(Learner):
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the length of the warm-up and one step after it."""
-        return {"warmup_frames": max(0, self.warmup_frames - int(self.frames)) + 1}
+        return {"warmup_steps": max(0, self.options.warmup_steps - int(self.frames)) + 1}
 
     def has_updated(self) -> bool:
         """Return whether Sarsa has made an update, which leaves traces."""
@@ -454,35 +440,146 @@ class QPAMDP(Learner):
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Collect the ranges of the features during the warm-up; then learn what the phase learns, and end it if due.
 
-        Updates within a phase use the rows in `mask`; windows count their episodes, or options if these end before.
+        Updates within a phase use the rows in `mask`. Windows count their episodes, or options if these end before.
         """
         batch = batch.reshape(-1, batch.shape[-1])
         mask = mask.reshape(-1, mask.shape[-1])
-        if self.frames < self.warmup_frames:
+        if self.frames < self.options.warmup_steps:
             self._warm_up(batch[keys.OBSERVATION][mask])
             return {}
         rows = self._rows(batch, mask)
-        self.window_return += (rows["reward"] * rows["mask"]).sum()
         num_episodes = (rows["done"] & rows["mask"]).sum()
+        self.window_return += (rows["reward"] * rows["mask"]).sum()
         self.window_episodes += num_episodes
         scalars = {"phase": float(self.phase)}
         if self.phase == SARSA:
-            phi = self.policy.phi
-            step_scale = phi.step_scale() if self.step_scaling else torch.ones_like(phi.coefficients[:, 0])
-            self.policy.w, error = self.sarsa.update(self.policy.w, rows, self.policy.temperature, step_scale)
-            cooled = self.policy.temperature * self.temperature_decay ** num_episodes.float()
-            self.policy.temperature = cooled.clamp(min=self.temperature_final)
-            scalars["td_error"] = error.item()
+            scalars["td_error"] = self._update_values(rows, num_episodes)
             is_first = self.updates == 0 and self.windows == 0
-            is_full = self.window_episodes >= (self.initial_episodes if is_first else self.relearning_episodes)
+            wanted = self.options.initial_episodes if is_first else self.options.relearning_episodes
+            is_full = self.window_episodes >= wanted
         else:
             self.enac.collect(rows)
-            is_full = self.enac.num_episodes >= self.rollouts
+            is_full = self.enac.num_episodes >= self.options.rollouts
         if is_full:
-            scalars |= self._end_window(rows["done"][:, -1])
-        scalars["updates"] = self.updates.item()
-        scalars["sigma"] = self.policy.sigma.item()
-        return scalars
+            scalars["return"] = (self.window_return / self.window_episodes.clamp(min=1)).item()
+            if self.phase == PARAMETERS:
+                scalars |= self._update_parameters()
+            self._end_window(scalars["return"], is_fresh=rows["done"][:, -1])
+        return {**scalars, "updates": self.updates.item(), "sigma": self.policy.sigma.item()}
+
+    def _update_values(self, rows: TensorDict, num_episodes: Tensor) -> float:
+        """Make Sarsa's updates of a batch and lower the temperature; return the mean squared error."""
+        policy, options = self.policy, self.options
+        coefficients = policy.phi.coefficients
+        step_scale = policy.phi.step_scale() if options.step_scaling else torch.ones_like(coefficients[:, 0])
+        policy.w, error = self.sarsa.update(policy.w, rows, policy.temperature, step_scale)
+        cooled = policy.temperature * options.temperature_decay ** num_episodes.float()
+        policy.temperature = cooled.clamp(min=min(options.temperature, options.temperature_final))
+        return error.item()
+
+    def _update_parameters(self) -> dict[str, float]:
+        """Step the mean parameters along the natural gradient and lower sigma; return scalars."""
+        policy, options = self.policy, self.options
+        direction, divergence = self.enac.natural_gradient(policy.theta.numel())
+        # The divergence grows with the square of the step.
+        step = (options.max_divergence / divergence.clamp(min=1e-12)).sqrt().clamp(max=options.natural_step_size)
+        policy.theta = policy.theta + step * direction.view_as(policy.theta)
+        policy.sigma = (policy.sigma * options.sigma_decay).clamp(min=options.sigma_final)
+        self.updates += 1
+        return {"natural_step": step.item(), "divergence": (divergence * step.square()).item()}
+
+    def _end_window(self, window_return: float, is_fresh: Tensor) -> None:
+        """Begin the next window, and the other phase if this one is over.
+
+        Args:
+            window_return: mean return of the window's episodes.
+            is_fresh: where the next row begins an episode, bool `[N]`.
+        """
+        self.windows += 1
+        if window_return > self.best_return:
+            self.best_return.fill_(window_return)
+            self.windows_since_best.zero_()
+        else:
+            self.windows_since_best += 1
+        if self.options.parameter_updates is None:
+            is_over = self.windows_since_best >= self.options.patience
+        else:
+            is_over = self.windows >= (1 if self.phase == SARSA else self.options.parameter_updates)
+        if is_over:
+            self.phase.fill_(PARAMETERS if self.phase == SARSA else SARSA)
+            self.policy.samples_discrete.fill_(bool(self.phase == SARSA) or self.options.samples_in_parameter_phase)
+            self.best_return.fill_(-torch.inf)
+            self.windows.zero_()
+            self.windows_since_best.zero_()
+            self.sarsa.traces.zero_()
+        if self.phase == PARAMETERS:
+            self.enac.restart(self.policy.theta.numel() + self.policy.w.shape[1], is_fresh)
+        self.window_return.zero_()
+        self.window_episodes.zero_()
+
+    def _warm_up(self, observation: Tensor) -> None:
+        """Extend the ranges by observations `[N, observation_dim]`; fit the bases once there are enough."""
+        self.frames += len(observation)
+        self.low = torch.cat([observation, self.low.unsqueeze(0)]).amin(0)
+        self.high = torch.cat([observation, self.high.unsqueeze(0)]).amax(0)
+        if self.frames < self.options.warmup_steps:
+            return
+        varying = (self.high - self.low > 1e-6).nonzero().squeeze(-1)
+        inputs = varying if self.options.features is None else varying.new_tensor(self.options.features)
+        for basis in (self.policy.phi, self.policy.psi):
+            low, high = self.low[inputs], self.high[inputs]
+            if self.options.feature_range is not None:
+                low, high = (torch.full_like(low, side) for side in self.options.feature_range)
+            basis.fit(inputs, low, high)
+        self.policy.widen()
+
+    @torch.no_grad()
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the expected value of the softmax policy's discrete action, `[N]`."""
+        q = self.policy.phi(observation) @ self.policy.w.T
+        logits = masked_logits(q / self.policy.temperature, self.specs.allowed(observation, action_mask))
+        return (logits.softmax(-1) * q).sum(-1)
+
+    def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
+        """Return what the phase's update needs of a batch `[N, T]`.
+
+        A step with which an option ends inside its episode is `terminated` and `done`, and its reward includes the
+        discounted value of what follows.
+        """
+        observation = batch[keys.OBSERVATION]
+        reward = batch["next", keys.REWARD].squeeze(-1)
+        terminated = batch["next", keys.TERMINATED].squeeze(-1)
+        option_ended = batch.get(("next", keys.OPTION_ENDED), None)
+        if option_ended is not None:
+            is_followed = (option_ended & ~batch["next", keys.DONE]).squeeze(-1) & mask
+            next_observation = batch["next", keys.OBSERVATION][is_followed]
+            masks = [batch["next", keys.ACTION_MASK][is_followed]] if self.specs.has_action_mask else []
+            value = self.next_options.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
+            reward = reward.index_put((is_followed,), self.options.gamma * value, accumulate=True)
+            terminated = terminated | is_followed
+        rows = {
+            "phi": self.policy.phi(observation),
+            "discrete": batch[keys.DISCRETE],
+            "reward": reward,
+            "terminated": terminated,
+            "done": option_ends(batch).squeeze(-1),
+            "mask": mask,
+        }
+        episode_steps = batch.get(keys.EPISODE_STEPS, None)
+        if episode_steps is not None:
+            rows["is_first"] = episode_steps.squeeze(-1) == 0
+        if self.phase == SARSA:
+            next_observation = batch["next", keys.OBSERVATION]
+            rows["next_phi"] = self.policy.phi(next_observation)
+            allowed = self.specs.allowed(next_observation, batch.get(("next", keys.ACTION_MASK), None))
+            if allowed is not None:
+                rows["next_allowed"] = allowed
+        else:
+            psi = self.policy.psi(observation)
+            error = batch[RAW] - self.policy.mean(observation)
+            score = error / self.policy.sigma.square() * self.mask[rows["discrete"]]
+            rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
+        return TensorDict(rows, batch_size=mask.shape)
 
     def check_state(self, state: Mapping[str, Any]) -> None:
         """Refuse sizes that do not fit together, and phases that do not exist.
@@ -515,111 +612,21 @@ class QPAMDP(Learner):
             if not state[name] > 0.0:
                 raise ValueError(f"{name} is {float(state[name])}, but must be greater than 0")
 
-    def _warm_up(self, observation: Tensor) -> None:
-        """Extend the ranges by observations `[N, observation_dim]`; fit the bases once there are enough."""
-        self.frames += len(observation)
-        self.low = torch.cat([observation, self.low.unsqueeze(0)]).amin(0)
-        self.high = torch.cat([observation, self.high.unsqueeze(0)]).amax(0)
-        if self.frames < self.warmup_frames:
-            return
-        varying = (self.high - self.low > 1e-6).nonzero().squeeze(-1)
-        inputs = varying if self.features is None else varying.new_tensor(self.features)
-        for basis in (self.policy.phi, self.policy.psi):
-            low, high = self.low[inputs], self.high[inputs]
-            if self.feature_range is not None:
-                low, high = (torch.full_like(low, side) for side in self.feature_range)
-            basis.fit(inputs, low, high)
-        self.policy.widen()
 
-    @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the expected value of the softmax policy's discrete action, `[N]`."""
-        q = self.policy.phi(observation) @ self.policy.w.T
-        logits = masked_logits(q / self.policy.temperature, self.specs.allowed(observation, action_mask))
-        return (logits.softmax(-1) * q).sum(-1)
+def check_features(options: QPAMDPOptions, specs: PAMDPSpecs) -> None:
+    """Refuse features of entries that the observation does not have, and more features than memory holds.
 
-    def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
-        """Return what the phase's update needs of a batch `[N, T]`.
-
-        A step with which an option ends inside its episode is `terminated` and `done`, and its reward includes the
-        discounted value of what follows.
-        """
-        observation = batch[keys.OBSERVATION]
-        reward = batch["next", keys.REWARD].squeeze(-1)
-        terminated = batch["next", keys.TERMINATED].squeeze(-1)
-        option_ended = batch.get(("next", keys.OPTION_ENDED), None)
-        if option_ended is not None:
-            is_followed = (option_ended & ~batch["next", keys.DONE]).squeeze(-1) & mask
-            next_observation = batch["next", keys.OBSERVATION][is_followed]
-            masks = [batch["next", keys.ACTION_MASK][is_followed]] if self.specs.has_action_mask else []
-            value = self.next_options.value(next_observation, batch[keys.NEXT_OPTION][is_followed], *masks)
-            reward = reward.index_put((is_followed,), self.sarsa.gamma * value, accumulate=True)
-            terminated = terminated | is_followed
-        rows = {
-            "phi": self.policy.phi(observation),
-            "discrete": batch[keys.DISCRETE],
-            "reward": reward,
-            "terminated": terminated,
-            "done": option_ends(batch).squeeze(-1),
-            "mask": mask,
-        }
-        episode_steps = batch.get(keys.EPISODE_STEPS, None)
-        if episode_steps is not None:
-            rows["is_first"] = episode_steps.squeeze(-1) == 0
-        if self.phase == SARSA:
-            next_observation = batch["next", keys.OBSERVATION]
-            rows["next_phi"] = self.policy.phi(next_observation)
-            allowed = self.specs.allowed(next_observation, batch.get(("next", keys.ACTION_MASK), None))
-            if allowed is not None:
-                rows["next_allowed"] = allowed
-        else:
-            psi = self.policy.psi(observation)
-            score = (
-                (batch[RAW] - self.policy.mean(observation)) / self.policy.sigma.square() * self.mask[rows["discrete"]]
-            )
-            rows["gradient"] = (score.unsqueeze(-1) * psi.unsqueeze(-2)).flatten(-2)
-        return TensorDict(rows, batch_size=mask.shape)
-
-    def _end_window(self, is_fresh: Tensor) -> dict[str, float]:
-        """Update the parameters if that is the phase, and end the phase if it is over; return scalars.
-
-        Args:
-            is_fresh: where the next row begins an episode, bool `[N]`.
-        """
-        window_return = (self.window_return / self.window_episodes.clamp(min=1)).item()
-        scalars = {"return": window_return}
-        if self.phase == PARAMETERS:
-            scalars |= self._step_parameters()
-        self.windows += 1
-        if window_return > self.best_return:
-            self.best_return.fill_(window_return)
-            self.windows_since_best.zero_()
-        else:
-            self.windows_since_best += 1
-        if self._phase_is_over():
-            self.phase.fill_(PARAMETERS if self.phase == SARSA else SARSA)
-            self.policy.samples_discrete.fill_(bool(self.phase == SARSA) or self.samples_in_parameter_phase)
-            self.best_return.fill_(-torch.inf)
-            self.windows.zero_()
-            self.windows_since_best.zero_()
-            self.sarsa.traces.zero_()
-        if self.phase == PARAMETERS:
-            self.enac.restart(self.policy.theta.numel() + self.policy.w.shape[1], is_fresh)
-        self.window_return.zero_()
-        self.window_episodes.zero_()
-        return scalars
-
-    def _phase_is_over(self) -> bool:
-        if self.parameter_updates is None:
-            return bool(self.windows_since_best >= self.patience)
-        return bool(self.windows >= (1 if self.phase == SARSA else self.parameter_updates))
-
-    def _step_parameters(self) -> dict[str, float]:
-        """Step the mean parameters along the natural gradient and lower sigma; return scalars."""
-        direction, divergence = self.enac.natural_gradient(self.policy.theta.numel())
-        # The divergence grows with the square of the step.
-        step = (self.max_divergence / divergence.clamp(min=1e-12)).sqrt().clamp(max=self.natural_step_size)
-        self.policy.theta = self.policy.theta + step * direction.view_as(self.policy.theta)
-        self.policy.sigma = (self.policy.sigma * self.sigma_decay).clamp(min=self.sigma_final)
-        self.updates += 1
-        return {"natural_step": step.item(), "divergence": (divergence * step.square()).item()}
+    Raises:
+        ValueError: a setting does not suit the problem.
+    """
+    features, last = options.features, specs.observation_dim - 1
+    if features is not None and (not features or max(features) > last):
+        raise ValueError(f"features={list(features)}: name some of the observation's entries 0 to {last}; null: all")
+    num_inputs = specs.observation_dim if features is None else len(features)
+    num_regressors = specs.num_parameters * num_fourier_features(num_inputs, options.psi_order, options.psi_max_coupled)
+    num_regressors += num_fourier_features(num_inputs, options.phi_order, options.phi_max_coupled)
+    if num_regressors > MAX_REGRESSORS:
+        raise ValueError(
+            f"phi_order={options.phi_order}, psi_order={options.psi_order}: the regression for the parameters would "
+            f"have {num_regressors:,} coefficients, more than {MAX_REGRESSORS:,}; use fewer features or lower orders"
+        )
