@@ -69,8 +69,8 @@ def test_the_networks_of_an_agent_start_a_run(tmp_path):
         "eval.layouts=50",
         "eval.every=0",
         "num_envs=64",
-        "low.warmup_frames=1000",
-        "low.updates_per_frame=0.001",
+        "low.warmup_steps=1000",
+        "low.updates_per_step=0.001",
     ]
     assert run(compose_config(words), tmp_path, words) == 0
     assert json.loads((tmp_path / "summary.json").read_text())["success"] > 0.6

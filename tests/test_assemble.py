@@ -209,7 +209,7 @@ def test_a_learner_of_another_run_fills_its_replay_before_it_updates(low, tmp_pa
     words = [*SMALL, "high=uniform", f"low={low}", *SHORT[low]]
     parts = train(make_config(words), tmp_path / "first")
     frames = min(int(learner.frames) for learner in parts.agent.learners)
-    again = [*words, f"low.checkpoint={tmp_path / 'first'}", f"low.warmup_frames={frames}"]
+    again = [*words, f"low.checkpoint={tmp_path / 'first'}", f"low.warmup_steps={frames}"]
     parts = make(make_config(again), tmp_path / "second")
     before = [int(learner.updates) for learner in parts.agent.learners]
     batch = parts.env.rollout(2, parts.policy, break_when_any_done=False)

@@ -147,8 +147,7 @@ def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
     [pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow]) for low in TRAINED],
 )
 def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
-    warmup = ["low.warmup_steps=8"] if low == "qpamdp" else []
-    warmup += ["low.warmup_frames=8"] if low in ("hyar", "hsac", "iql", "pdqn", "td3_bc") else []
+    warmup = ["low.warmup_steps=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
     warmup += ["low.codec_pretrain_updates=2"] if low == "hyar" else []
     config = make_config(["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "high=ucb", f"low={low}", *warmup])
     parts = assemble(config, tmp_path)

@@ -23,7 +23,7 @@ SEARCH = dict(
 )  # fmt: skip
 OPTIONS = dict(
     form="masking", hidden_dims=[64, 64], num_members=2, lr=2e-3, state_weight=2.0, reward_weight=0.5,
-    termination_weight=0.5, rho=0.5, buffer_size=5000, batch_size=64, updates_per_frame=0.5, warmup_frames=500,
+    termination_weight=0.5, rho=0.5, buffer_size=5000, batch_size=64, updates_per_step=0.5, warmup_steps=500,
     augment=False, epsilon=0.05, planning_precision="float32", end_values=False, end_value_lr=1e-3,
     end_value_tau=0.02, end_value_expectile=0.9, **SEARCH,
 )  # fmt: skip
@@ -186,7 +186,7 @@ def test_windows_follow_an_episode_across_batches_and_cross_no_end_environment_o
 @pytest.mark.parametrize("num_steps", [1, 2, 5])
 def test_windows_cross_no_option_that_changes_inside_an_episode(num_steps, buffer_size, is_shared):
     option_length = 2
-    learner = make(horizon=4, buffer_size=buffer_size, batch_size=min(512, buffer_size), warmup_frames=1000)
+    learner = make(horizon=4, buffer_size=buffer_size, batch_size=min(512, buffer_size), warmup_steps=1000)
     for batch in counting_batches(4, 60 // num_steps, num_steps, option_length):
         learner.learn(batch, torch.ones(batch.shape, dtype=torch.bool) if is_shared else batch[keys.OPTION] == 1)
     windows = next_windows(learner)
@@ -333,7 +333,7 @@ def test_nothing_is_planned_for_finished_episodes_or_before_the_first_update(tra
 
 
 def test_states_and_their_changes_are_scaled_by_standard_deviations_over_all_stored_steps_not_those_of_the_warm_up():
-    learner = make(updates_per_frame=0.1, warmup_frames=24 * 4)
+    learner = make(updates_per_step=0.1, warmup_steps=24 * 4)
     batches = counting_batches(4, 6, 8)
     for batch in batches[:4]:
         # The warm-up sees nothing of what the last entry is later.

@@ -36,7 +36,7 @@ def test_an_option_policy_in_plain_torchrl_beats_either_boat_alone(capsys):
 
 def test_the_command_of_crossing_runs(tmp_path):
     (command,) = re.findall(r"^python -m hpamdp\.cli (.*)$", (CROSSING / "README.md").read_text(), re.MULTILINE)
-    short = ["low.warmup_frames=64", "high.warmup_decisions=20", "high.updates_per_decision=0.1"]
+    short = ["low.warmup_steps=64", "high.warmup_decisions=20", "high.updates_per_decision=0.1"]
     short += ["total_frames=256", "num_envs=8", "eval.every=0", "eval.layouts=10", f"hydra.run.dir={tmp_path}"]
 
     def run() -> None:

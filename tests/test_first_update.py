@@ -18,11 +18,11 @@ TINY = ["num_envs=16", "steps_per_batch=4", "eval.layouts=4", "eval.every=0"]
 @pytest.mark.parametrize(
     ("total", "words", "setting", "needed", "most"),
     [
-        (100, "high=ucb low=hyar num_envs=256", "low.warmup_frames=2000 (low=hyar)", "2,000", "1,024"),
+        (100, "high=ucb low=hyar num_envs=256", "low.warmup_steps=2000 (low=hyar)", "2,000", "1,024"),
         (1984, "high=ucb low=hppo", "low.minibatch_size=2048 (low=hppo)", "2,048", "1,984"),
-        (65, "high=ucb low=pets low.updates_per_frame=0.005", "low.updates_per_frame=0.005 (low=pets)", "200", "128"),
+        (65, "high=ucb low=pets low.updates_per_step=0.005", "low.updates_per_step=0.005 (low=pets)", "200", "128"),
         (64, "high=ucb low=qpamdp low.warmup_steps=64", "low.warmup_steps=64 (low=qpamdp)", "65", "64"),
-        (640, "low=random +low.per_option={congruent:pdqn}", "low.warmup_frames=5000 (low=pdqn)", "5,000", "640"),
+        (640, "low=random +low.per_option={congruent:pdqn}", "low.warmup_steps=5000 (low=pdqn)", "5,000", "640"),
         (640, "low=random high=meta_critic", "high.warmup_decisions=1000 (high=meta_critic)", "1,000", "640"),
         (640, "low=random high=option_critic", "high.warmup_steps=2000 (high=option_critic)", "2,000", "640"),
         (640, "low.freeze=true low=random high=actor", "high.minibatch_size=1024 (high=actor)", "1,024", "640"),

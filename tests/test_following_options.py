@@ -20,11 +20,11 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(2, ("first", "second"), (1, 1), (0.0, 0.0), (1.0, 1.0))
 CPU = torch.device("cpu")
 GAMMA = 0.5
-REPLAY = ["low.warmup_frames=0", "low.updates_per_frame=0.15", "low.batch_size=32", "low.critic_lr=0.02"]
+REPLAY = ["low.warmup_steps=0", "low.updates_per_step=0.15", "low.batch_size=32", "low.critic_lr=0.02"]
 SMALL = ["low.hidden_dims=[16]", f"low.gamma={GAMMA}"]
 MODEL = [
-    "low.warmup_frames=1",
-    "low.updates_per_frame=0.15",
+    "low.warmup_steps=1",
+    "low.updates_per_step=0.15",
     "low.batch_size=32",
     "low.horizon=1",
     "low.end_values=true",
@@ -44,7 +44,7 @@ LEARNERS = {
         "low.tune_discrete_temperature=false",
         "low.tune_parameter_temperature=false",
     ],
-    "hyar": [*SMALL, *REPLAY, "low.warmup_frames=64", "low.tau=0.3", "low.codec_pretrain_updates=2"],
+    "hyar": [*SMALL, *REPLAY, "low.warmup_steps=64", "low.tau=0.3", "low.codec_pretrain_updates=2"],
     "iql": [*SMALL, *REPLAY, "low.tau=0.3"],
     "td3_bc": [*SMALL, *REPLAY, "low.tau=0.3"],
     "dlpa": [*SMALL, *MODEL, "low.num_samples=8", "low.num_elites=4", "low.num_iterations=1"],

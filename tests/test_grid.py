@@ -20,17 +20,17 @@ from hpamdp.run.train import run
 # What makes a learner's training short; a learner that is not named needs nothing.
 SHORT = {
     "dlpa": [
-        *("low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16", "low.hidden_dims=[16,16]"),
+        *("low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16", "low.hidden_dims=[16,16]"),
         *("low.num_samples=16", "low.num_elites=4", "low.num_iterations=2"),
     ],
     "hppo": ["low.minibatch_size=16"],
-    "iql": ["low.warmup_frames=64", "low.batch_size=16"],
-    "td3_bc": ["low.warmup_frames=64", "low.batch_size=16"],
-    "hsac": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
-    "hyar": ["low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.updates_per_frame=0.05", "low.batch_size=16"],
-    "paddpg": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
+    "iql": ["low.warmup_steps=64", "low.batch_size=16"],
+    "td3_bc": ["low.warmup_steps=64", "low.batch_size=16"],
+    "hsac": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
+    "hyar": ["low.warmup_steps=64", "low.codec_pretrain_updates=2", "low.updates_per_step=0.05", "low.batch_size=16"],
+    "paddpg": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
     "pets": [
-        *("low.warmup_frames=64", "low.updates_per_frame=0.1", "low.batch_size=16", "low.transition_dims=[16]"),
+        *("low.warmup_steps=64", "low.updates_per_step=0.1", "low.batch_size=16", "low.transition_dims=[16]"),
         *(
             "low.outcome_dims=[16]",
             "low.num_members=2",
@@ -41,8 +41,8 @@ SHORT = {
         ),
         "low.max_sequences=8",
     ],
-    "pdqn": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
-    "pdqn_published": ["low.warmup_frames=64", "low.updates_per_frame=0.05", "low.batch_size=16"],
+    "pdqn": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
+    "pdqn_published": ["low.warmup_steps=64", "low.updates_per_step=0.05", "low.batch_size=16"],
     "qpamdp": ["low.warmup_steps=32", "low.initial_episodes=8", "low.relearning_episodes=8", "low.rollouts=8"],
 }
 # The same for selectors.

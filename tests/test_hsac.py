@@ -19,8 +19,8 @@ OPTIONS = dict(
     hidden_dims=[64, 64], initial_parameters="none",
     min_scale=0.01, max_scale=1.0, discrete_temperature=0.05, parameter_temperature=0.03,
     tune_discrete_temperature=True, tune_parameter_temperature=True, discrete_target_entropy=0.1,
-    parameter_target_entropy=-1.5, temperature_lr=3e-3, warmup_frames=1000, buffer_size=20_000, batch_size=64,
-    updates_per_frame=0.12, augment=False, policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
+    parameter_target_entropy=-1.5, temperature_lr=3e-3, warmup_steps=1000, buffer_size=20_000, batch_size=64,
+    updates_per_step=0.12, augment=False, policy_delay=2, gamma=0.9, tau=0.02, actor_lr=3e-3, critic_lr=3e-3,
 )  # fmt: skip
 
 
@@ -80,7 +80,7 @@ def test_soft_targets_equal_those_computed_by_hand_and_stop_at_termination_alone
 
 
 def test_the_stored_discount_is_0_at_termination_alone_and_rows_of_other_learners_are_dropped():
-    learner = make(warmup_frames=10_000)
+    learner = make(warmup_steps=10_000)
     rows = one_step_rows(learner, 4).squeeze(-1)
     rows["next", keys.TERMINATED] = torch.tensor([[True], [False], [False], [True]])
     rows["next", keys.TRUNCATED] = torch.tensor([[False], [True], [False], [False]])
@@ -132,7 +132,7 @@ def test_a_temperature_falls_above_its_target_rises_below_and_stays_if_fixed(exc
 def test_updates_leave_fixed_temperatures_unchanged():
     learner = make(tune_discrete_temperature=False, tune_parameter_temperature=False, policy_delay=1)
     before = learner.temperatures()
-    learner.train_step(sample())
+    learner.update_once(sample())
     assert learner.temperatures() == before
 
 
@@ -153,7 +153,7 @@ def test_the_greedy_policy_samples_nothing_and_the_exploring_one_is_uniform_in_t
 
 
 def test_discrete_actions_without_parameters_work():
-    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100)
+    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_steps=100)
     td = learner.policy(states(200))
     assert td[keys.PARAMETERS].shape == (200, 0)
     is_end = torch.ones(200, 1, dtype=torch.bool)

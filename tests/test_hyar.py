@@ -12,15 +12,15 @@ from hpamdp.specs import PAMDPSpecs
 SPECS = PAMDPSpecs(4, (), (1, 2, 0), (0.0, -1.0, 5.0), (2.0, 1.0, 9.0))
 
 OPTIONS = dict(
-    rl="td3", discrete="greedy",
-    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], layer_norm=False, warmup_frames=2000,
+    twin=True, discrete="greedy",
+    embedding_dim=3, latent_dim=3, codec_hidden_dim=64, hidden_dims=[64, 64], layer_norm=False, warmup_steps=2000,
     codec_pretrain_updates=700, codec_every=10, codec_lr=1e-3, kl_weight=1e-4, dynamics_weight=0.1,
     latent_coverage=0.96, correction_factor=5.0, parameter_tolerance=None, relabelling="mean",
-    buffer_size=20_000, batch_size=64, updates_per_frame=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
+    buffer_size=20_000, batch_size=64, updates_per_step=0.25, gamma=0.9, reward_scale=1.0, tau=0.02, actor_lr=1e-3,
     critic_lr=1e-3, augment=False,
-    lr_final=1.0, lr_frames=0, policy_delay=2, target_noise=0.1, target_noise_clip=0.2, exploration_noise=0.1,
+    lr_final=1.0, lr_steps=0, policy_delay=2, target_smoothing=0.1, target_smoothing_clip=0.2, parameter_noise=0.1,
     preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
-    greedy_samples=0, greedy_noise=0.3, epsilon_final=0.05, epsilon_frames=3000,
+    greedy_samples=0, greedy_noise=0.3, epsilon_final=0.05, epsilon_steps=3000,
 )  # fmt: skip
 
 
@@ -130,18 +130,18 @@ def test_the_greedy_policy_takes_the_best_of_the_actors_latent_actions_and_their
 
 def test_the_state_change_is_scaled_by_its_standard_deviation(trained):
     change = trained.buffer[:]["next_state"] - trained.buffer[:]["state"]
-    expected = change[: OPTIONS["warmup_frames"]].std(0).clamp(min=1e-2)
+    expected = change[: OPTIONS["warmup_steps"]].std(0).clamp(min=1e-2)
     torch.testing.assert_close(trained.codec.change_scale, expected)
 
 
 def test_only_masked_transitions_are_stored():
-    learner = make(warmup_frames=10_000)
+    learner = make(warmup_steps=10_000)
     learner.learn(one_step_rows(learner, 100), torch.arange(100) < 30)
     assert learner.frames == 30 and len(learner.buffer) == 30
 
 
 def test_rewards_are_stored_scaled():
-    learner = make(reward_scale=0.1, warmup_frames=10_000)
+    learner = make(reward_scale=0.1, warmup_steps=10_000)
     rows = one_step_rows(learner, 50)
     learner.learn(rows, torch.ones(rows.shape, dtype=torch.bool))
     torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * rows["next", keys.REWARD].flatten())
@@ -176,7 +176,7 @@ def test_the_greedy_form_takes_the_discrete_action_with_the_highest_q():
 
 
 def test_the_target_of_the_greedy_form_is_the_maximum_over_discrete_actions():
-    learner = make(target_noise=0.0)
+    learner = make(target_smoothing=0.0)
     rows = TensorDict(next_state=torch.randn(50, 4), reward=torch.zeros(50), discount=torch.ones(50), batch_size=[50])
     z = learner.target_actor.net(rows["next_state"]).tanh().unflatten(-1, (3, 3))
     each = [
@@ -215,7 +215,7 @@ def test_the_greedy_form_or_a_search_leaves_a_discrete_action_whose_neighbours_a
     )  # fmt: skip
     for _ in range(400):
         learner.updates += 1
-        learner.train_step(rows)
+        learner.update_once(rows)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         acted = learner.policy(TensorDict({keys.OBSERVATION: torch.zeros(1, 1)}, [1]))
     assert acted[keys.DISCRETE].item() == (2 if is_left else 0)
@@ -241,7 +241,7 @@ def test_the_search_brings_z_to_a_higher_hill_that_the_gradient_does_not_see(dis
         learner.actor.net[-1].weight.zero_()
         learner.actor.net[-1].bias.fill_(0.5)
     for _ in range(300):
-        learner.minimise("actor", learner._actor_loss, state, None)
+        learner.gradient_step("actor", learner._actor_loss, state, None)
     z = learner.actor(state, learner.codec.embeddings)[..., 3:]
     torch.testing.assert_close(z, torch.full_like(z, expected), atol=0.1, rtol=0.0)
 
@@ -270,19 +270,19 @@ def test_the_penalty_brings_the_actor_back_from_the_bounds():
         learner.actor.net[-1].bias.fill_(8.0)
     state = torch.rand(64, 4) * 2 - 1
     for _ in range(300):
-        learner.minimise("actor", learner._actor_loss, state, None)
+        learner.gradient_step("actor", learner._actor_loss, state, None)
     assert learner.actor.raw(state).abs().max() < 3.0
 
 
 def test_ddpg_has_one_critic_an_actor_update_each_time_and_no_noise_in_its_targets():
-    learner = make(rl="ddpg", target_noise=0.5, policy_delay=2, warmup_frames=200, codec_pretrain_updates=1)
+    learner = make(twin=False, target_smoothing=0.5, policy_delay=2, warmup_steps=200, codec_pretrain_updates=1)
     learn(learner, 2)
     assert learner.critics(torch.zeros(5, 4), torch.zeros(5, 1, 6)).shape == (1, 5, 1)
     assert make().critics(torch.zeros(5, 4), torch.zeros(5, 1, 6)).shape == (2, 5, 1)
     before = learner.actor.net[0].weight.clone()
     learner.updates += 1 + learner.updates % 2  # an odd number, at which TD3 leaves the actor as it is
     rows = learner.buffer.sample(64)
-    learner.train_step(rows)
+    learner.update_once(rows)
     assert not torch.equal(learner.actor.net[0].weight, before)
     rows["discount"] = torch.ones(64)
     assert torch.equal(learner.target(rows), learner.target(rows))
@@ -368,9 +368,9 @@ def test_without_a_number_z_has_as_many_dimensions_as_an_action_has_parameters_a
 
 
 def test_the_learning_rates_fall_to_their_final_fraction():
-    learner = make(lr_final=0.1, lr_frames=1000, codec_lr=2e-3, actor_lr=1e-3, critic_lr=3e-3)
+    learner = make(lr_final=0.1, lr_steps=1000, codec_lr=2e-3, actor_lr=1e-3, critic_lr=3e-3)
     rates = []
     for frames in (0, 500, 1000, 5000):
-        learner.explore(frames)
+        learner.on_progress(frames)
         rates.append([learner.optimizers[name].param_groups[0]["lr"] for name in ("codec", "actor", "critics")])
     assert rates == [pytest.approx([f * 2e-3, f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]

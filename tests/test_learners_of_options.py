@@ -14,7 +14,7 @@ from hpamdp.policies.low_level.paddpg import PADDPG
 from hpamdp.saved_config import read_saved
 
 WORDS = [*SMALL, "env=platform", "+env.options=default", *QUICK_CRITIC, "low=hppo", *SHORT["hppo"]]
-PER_OPTION = "+low.per_option={jump: {name: paddpg, hidden_dims: [16], warmup_frames: 10, batch_size: 16}}"
+PER_OPTION = "+low.per_option={jump: {name: paddpg, hidden_dims: [16], warmup_steps: 10, batch_size: 16}}"
 
 
 def test_learners_of_two_classes_train_side_by_side(tmp_path):

@@ -23,10 +23,10 @@ from hpamdp.specs import PAMDPSpecs
 CPU = torch.device("cpu")
 SHORT = {
     **LEARNERS,
-    "hyar": [*LEARNERS["hyar"], "low.warmup_frames=100", "low.epsilon_frames=100"],
+    "hyar": [*LEARNERS["hyar"], "low.warmup_steps=100", "low.epsilon_steps=100"],
     "dlpa": [
         "low.hidden_dims=[16]",
-        "low.warmup_frames=100",
+        "low.warmup_steps=100",
         "low.num_samples=32",
         "low.num_elites=8",
         "low.num_iterations=2",
@@ -37,7 +37,7 @@ SHORT = {
         "low.transition_dims=[16]",
         "low.outcome_dims=[16]",
         "low.num_members=2",
-        "low.warmup_frames=100",
+        "low.warmup_steps=100",
         "low.batch_size=32",
         "low.max_sequences=9",
         "low.num_kept=2",
@@ -60,8 +60,8 @@ CASES = {
 def make_learner(name: str, specs: PAMDPSpecs):
     torch.manual_seed(0)
     low, words = CASES[name]
-    words = [word for word in words if "updates_per_frame" not in word]
-    rate = ["low.updates_per_frame=0.1"] if any("batch_size" in word for word in words) and low != "hppo" else []
+    words = [word for word in words if "updates_per_step" not in word]
+    rate = ["low.updates_per_step=0.1"] if any("batch_size" in word for word in words) and low != "hppo" else []
     return make_config([f"low={low}", "high=none", "env=platform", *words, *rate]).low.build(specs=specs, device=CPU)
 
 

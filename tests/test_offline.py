@@ -99,7 +99,7 @@ def test_a_learner_whose_option_is_not_in_the_data_makes_no_update_from_it(mode,
     demonstrations.batch[keys.OPTION].zero_()
     monkeypatch.setattr("hpamdp.run.assemble.make_data", lambda *_: demonstrations)
     given = [*overrides(path, "iql", "fixed"), f"mode={mode}", "high.option=incongruent"]
-    given += ["num_envs=8", "steps_per_batch=4", "total_frames=64", "low.warmup_frames=32"]
+    given += ["num_envs=8", "steps_per_batch=4", "total_frames=64", "low.warmup_steps=32"]
     assert run(compose_config(given), tmp_path, given) == 0
     printed = capsys.readouterr().out
     assert "no update was made: low/congruent\n" in printed
@@ -141,7 +141,7 @@ def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(hi
 def test_selectors_of_their_own_choices_alone_train_beside_a_data_set(high, path, tmp_path):
     words = [f"data.path={path}", "data=human", "data.checksum=null", "low=pdqn", f"high={high}", "eval.layouts=4"]
     words += ["num_envs=8", "steps_per_batch=4", "total_frames=256", "low.batch_size=16", "eval.every=0"]
-    words += ["low.warmup_frames=64", *(["high.minibatch_size=8"] if high == "actor" else [])]
+    words += ["low.warmup_steps=64", *(["high.minibatch_size=8"] if high == "actor" else [])]
     assert run(compose_config(words), tmp_path, words) == 0
     header = (tmp_path / "metrics.csv").read_text().splitlines()[0]
     assert any(name.startswith("high/") for name in header.split(","))
@@ -237,7 +237,7 @@ def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path):
     assert json.loads((tmp_path / "b/summary.json").read_text())["frames"] == 9
     with pytest.raises(ConfigError, match="a run with mode=offline; resume it so"):
         run(compose_config([f"resume={tmp_path / 'a'}"]), tmp_path / "c", [f"resume={tmp_path / 'a'}"])
-    tuned = ["low=iql", "high=human", f"low.checkpoint={tmp_path / 'a'}", "total_frames=512", "low.warmup_frames=64"]
+    tuned = ["low=iql", "high=human", f"low.checkpoint={tmp_path / 'a'}", "total_frames=512", "low.warmup_steps=64"]
     tuned += ["num_envs=16", "eval.layouts=10", "eval.every=0", "low.batch_size=16"]
     assert run(compose_config(tuned), tmp_path / "d", tuned) == 0
 
@@ -278,12 +278,12 @@ def one_step_batch(num: int = 6000) -> TensorDict:
 COMMON = {"hidden_dims": [32, 32], "buffer_size": 10_000, "batch_size": 128}
 IQL_OPTIONS = COMMON | dict(
     min_scale=0.02, max_scale=1.0, expectile=0.8, temperature=10.0, max_weight=100.0, gamma=0.9, tau=0.01,
-    actor_lr=3e-3, critic_lr=3e-3, warmup_frames=0, updates_per_frame=1.0,
+    actor_lr=3e-3, critic_lr=3e-3, warmup_steps=0, updates_per_step=1.0,
     augment=False,
 )  # fmt: skip
 TD3BC_OPTIONS = COMMON | dict(
     behaviour_weight=0.2, discrete_threshold=0.3, target_smoothing=0.0, target_smoothing_clip=0.1, policy_delay=2,
-    parameter_noise=0.1, gamma=0.9, tau=0.01, actor_lr=3e-3, critic_lr=3e-3, warmup_frames=0, updates_per_frame=1.0,
+    parameter_noise=0.1, gamma=0.9, tau=0.01, actor_lr=3e-3, critic_lr=3e-3, warmup_steps=0, updates_per_step=1.0,
     augment=False,
 )  # fmt: skip
 

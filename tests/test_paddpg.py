@@ -14,9 +14,9 @@ from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
     twin=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2, initial_parameters="none",
-    hidden_dims=[64, 64], warmup_frames=1000, buffer_size=20_000, batch_size=64, updates_per_frame=0.12, gamma=0.9,
-    tau=0.02, actor_lr=1e-3, critic_lr=1e-3, max_grad_norm=None, exploration_noise=0.1, epsilon_final=0.1,
-    epsilon_frames=3000,
+    hidden_dims=[64, 64], warmup_steps=1000, buffer_size=20_000, batch_size=64, updates_per_step=0.12, gamma=0.9,
+    tau=0.02, actor_lr=1e-3, critic_lr=1e-3, max_grad_norm=None, parameter_noise=0.1, epsilon_final=0.1,
+    epsilon_steps=3000,
 )  # fmt: skip
 GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)
 
@@ -81,9 +81,9 @@ def test_patd3_takes_the_lower_value_of_two_critics_smooths_targets_and_delays_t
     smooth = make(twin=True, target_smoothing=0.5, target_smoothing_clip=0.5)
     assert not torch.allclose(smooth.target(batch), smooth.target(batch))
     learner.updates += 1
-    assert "actor" not in learner.train_step(batch)
+    assert "actor" not in learner.update_once(batch)
     learner.updates += 1
-    assert "actor" in learner.train_step(batch)
+    assert "actor" in learner.update_once(batch)
 
 
 def test_paddpg_has_no_part_of_td3():
@@ -91,7 +91,7 @@ def test_paddpg_has_no_part_of_td3():
     assert learner.critics.num_members == 1
     torch.testing.assert_close(learner.target(batch), learner.target(batch))
     learner.updates += 1
-    assert "actor" in learner.train_step(batch)
+    assert "actor" in learner.update_once(batch)
 
 
 def test_the_actors_gradient_is_that_of_the_critic_scaled_by_the_range_that_is_left():

@@ -123,7 +123,7 @@ def test_links_to_code_lead_to_pages_that_show_it(hooks, tmp_path, monkeypatch):
 
 
 # What makes each one learn within a few steps, and seldom.
-FEW = {"warmup_steps": 128, "warmup_frames": 128, "updates_per_frame": 0.1}
+FEW = {"warmup_steps": 128, "updates_per_step": 0.1}
 QUICK = {
     "hppo": ["low.minibatch_size=16"],
     "qpamdp": [

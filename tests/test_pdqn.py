@@ -15,14 +15,14 @@ from hpamdp.policies.shared.networks import InvertingGradients
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
-    multipass=True, twin_q=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
-    n_step=1, bounding="tanh", hidden_dims=[64, 64], layer_norm=False, warmup_frames=1000, buffer_size=20_000,
-    batch_size=64, updates_per_frame=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02,
+    multipass=True, twin=True, double_q=False, target_smoothing=0.1, target_smoothing_clip=0.2, policy_delay=2,
+    n_step=1, bounding="tanh", hidden_dims=[64, 64], layer_norm=False, warmup_steps=1000, buffer_size=20_000,
+    batch_size=64, updates_per_step=0.12, augment=False, gamma=0.9, actor_lr=1e-3, critic_lr=1e-3, actor_tau=0.02,
     critic_tau=0.02, max_grad_norm=None, parameter_noise=0.1, greedy_samples=0, greedy_noise=0.3, epsilon_final=0.1,
-    epsilon_frames=3000, epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0,
-    lr_frames=1000, preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
+    epsilon_steps=3000, epsilon_episodes=None, reward_scale=1.0, initial_parameters="none", lr_final=1.0,
+    lr_steps=1000, preactivation_penalty=0.0, search_samples=0, search_weight=0.1,
 )  # fmt: skip
-PUBLISHED = dict(twin_q=False, target_smoothing=0.0, policy_delay=1)
+PUBLISHED = dict(twin=False, target_smoothing=0.0, policy_delay=1)
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> PDQN:
@@ -76,11 +76,11 @@ def test_the_actor_update_leaves_the_critics_alone():
     assert all(p.grad is None and p.requires_grad for p in learner.critics.parameters())
 
 
-@pytest.mark.parametrize("twin_q", [True, False])
+@pytest.mark.parametrize("twin", [True, False])
 @pytest.mark.parametrize("double_q", [True, False])
-def test_targets_equal_those_computed_by_hand(twin_q, double_q):
+def test_targets_equal_those_computed_by_hand(twin, double_q):
     torch.manual_seed(0)
-    learner, other = make(twin_q=twin_q, double_q=double_q, target_smoothing=0.0), make(twin_q=twin_q)
+    learner, other = make(twin=twin, double_q=double_q, target_smoothing=0.0), make(twin=twin)
     learner.target_actor.load_state_dict(other.actor.state_dict())
     learner.target_critics.load_state_dict(other.critics.state_dict())
     batch = sample(200)
@@ -113,7 +113,7 @@ def test_target_smoothing_is_bounded():
 
 
 def test_n_step_returns_end_with_episodes_and_bootstrap_unless_terminated():
-    learner = make(n_step=3, warmup_frames=10_000)
+    learner = make(n_step=3, warmup_steps=10_000)
     # Environment 0: an episode that terminates at its third step, then another; environment 1: truncated at its second.
     reward = torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0], [1.0, 2.0, 4.0, 8.0, 16.0]])
     terminated = torch.tensor([[0, 0, 1, 0, 0], [0, 0, 0, 0, 0]], dtype=torch.bool)
@@ -211,7 +211,7 @@ def test_variations_of_greedy_parameters_change_neither_exploration_nor_training
     ends = []
     for greedy_samples in (0, 20):
         torch.manual_seed(0)
-        learner = make(greedy_samples=greedy_samples, warmup_frames=100)
+        learner = make(greedy_samples=greedy_samples, warmup_steps=100)
         learn(learner, 3)
         ends.append(learner.state_dict())
     assert ends[0].keys() == ends[1].keys()
@@ -219,7 +219,7 @@ def test_variations_of_greedy_parameters_change_neither_exploration_nor_training
 
 
 def test_discrete_actions_without_parameters_work():
-    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_frames=100, greedy_samples=3)
+    learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_steps=100, greedy_samples=3)
     td = learner.policy(states(200))
     assert td[keys.PARAMETERS].shape == (200, 0)
     is_end = torch.ones(200, 1, dtype=torch.bool)
@@ -241,17 +241,17 @@ def test_a_policy_takes_any_batch_shape():
 
 def test_gradients_are_clipped_to_the_given_norm():
     learner = make(max_grad_norm=1e-3)
-    learner.train_step(sample())
+    learner.update_once(sample())
     norm = torch.stack([p.grad.norm() for p in learner.critics.parameters()]).norm()
     assert norm <= 1.001e-3
 
 
 def test_multi_pass_stores_the_chosen_actions_parameters_alone_and_samples_them_with_zeros():
-    learner = make(warmup_frames=10_000)
+    learner = make(warmup_steps=10_000)
     td = one_step_rows(learner, 50)
     learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
     assert learner.buffer[:]["unit"].shape == (50, 2), "the largest number of parameters of an action"
-    learner.batch_size = 400
+    learner.options = learner.options.model_copy(update={"batch_size": 400})
     rows = next(iter(learner.sample_batches(1)))
     own = SPECS.parameter_mask[rows["discrete"]]
     assert rows["unit"].shape == (400, 3) and (rows["unit"][~own] == 0.0).all()
@@ -263,7 +263,7 @@ def test_multi_pass_stores_the_chosen_actions_parameters_alone_and_samples_them_
 
 
 def test_single_pass_stores_all_parameters():
-    learner = make(multipass=False, warmup_frames=10_000)
+    learner = make(multipass=False, warmup_steps=10_000)
     td = one_step_rows(learner, 50)
     learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
     torch.testing.assert_close(learner.buffer[:]["unit"], SPECS.to_unit(td[keys.PARAMETERS])[:, 0])
@@ -350,7 +350,7 @@ def test_the_search_is_refused_where_values_depend_on_other_actions_parameters()
 
 
 def test_epsilon_can_fall_with_the_episodes():
-    learner = make(warmup_frames=20, updates_per_frame=0.01, epsilon_episodes=100, epsilon_final=0.2)
+    learner = make(warmup_steps=20, updates_per_step=0.01, epsilon_episodes=100, epsilon_final=0.2)
     learn(learner, 1, size=50)
     assert learner.policy.epsilon == pytest.approx(1.0 - 0.8 * 0.5)
     learn(learner, 2, size=50)
@@ -358,17 +358,17 @@ def test_epsilon_can_fall_with_the_episodes():
 
 
 def test_the_learning_rates_fall_to_their_final_fraction():
-    learner = make(lr_final=0.1, lr_frames=1000, actor_lr=1e-3, critic_lr=3e-3)
+    learner = make(lr_final=0.1, lr_steps=1000, actor_lr=1e-3, critic_lr=3e-3)
     rates = []
     for frames in (0, 500, 1000, 5000):
-        learner.explore(frames)
+        learner.on_progress(frames)
         rates.append([learner.optimizers[name].param_groups[0]["lr"] for name in ("actor", "critics")])
     assert rates == [pytest.approx([f * 1e-3, f * 3e-3]) for f in (1.0, 0.55, 0.1, 0.1)]
 
 
 def test_rewards_are_stored_scaled():
     torch.manual_seed(0)
-    learner = make(reward_scale=0.1, warmup_frames=10_000)
+    learner = make(reward_scale=0.1, warmup_steps=10_000)
     td = one_step_rows(learner, 50)
     learner.learn(td, torch.ones(50, 1, dtype=torch.bool))
     torch.testing.assert_close(learner.buffer[:]["reward"], 0.1 * td["next", keys.REWARD].flatten())
@@ -378,7 +378,7 @@ def test_the_published_recipe_has_the_published_settings_and_runs_where_there_ar
     options = make_config(["low=pdqn_published", "high=none", "env=platform"]).low.options
     expected = dict(
         bounding="inverting_gradients", max_grad_norm=10.0, critic_lr=1e-3, actor_lr=1e-4, critic_tau=0.1,
-        actor_tau=0.001, epsilon_final=0.01, epsilon_episodes=1000, parameter_noise=0.0, twin_q=False,
+        actor_tau=0.001, epsilon_final=0.01, epsilon_episodes=1000, parameter_noise=0.0, twin=False,
         target_smoothing=0.0, policy_delay=1, initial_parameters="domain", multipass=True,
     )  # fmt: skip
     assert {name: options[name] for name in expected} == expected

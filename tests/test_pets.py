@@ -24,8 +24,8 @@ SEARCH = dict(
 )  # fmt: skip
 OPTIONS = dict(
     augment="auto", num_members=3, transition_dims=[32, 32], outcome_dims=[32, 32], probabilistic=False,
-    linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_frames=256, transition_weight=2.0,
-    warmup_frames=64, updates_per_frame=2.0, batch_size=32, buffer_size=4000,
+    linear_part="auto", lr=2e-3, weight_decay=0.1, weight_decay_steps=256, transition_weight=2.0,
+    warmup_steps=64, updates_per_step=2.0, batch_size=32, buffer_size=4000,
     posterior_sampling=True, optimism=0.0, caution=0.0, parameter_noise=0.05, epsilon=0.0, gamma=0.97,
     planning_precision="float32", end_values=False, end_value_lr=1e-3,
     end_value_tau=0.02, end_value_expectile=0.9, **SEARCH,
@@ -254,7 +254,7 @@ def test_the_model_learns_where_steps_lead_when_they_end_and_what_ends_earn():
     reward = torch.where(ends, 10.0 * (discrete == 1), way)
     # Where an episode ends, the observation says nothing.
     after[ends] = 0.0
-    learner = make(updates_per_frame=1.2, lr=5e-3)
+    learner = make(updates_per_step=1.2, lr=5e-3)
     learn(learner, batch_of(state, discrete, unit, reward, after, ends))
     slots = SPECS.parameter_slots
     own = unit.gather(-1, slots[discrete]) * learner.policy.search.has_slot[discrete]
@@ -310,7 +310,7 @@ def test_the_linear_part_knows_polynomial_changes_after_few_steps():
     batch = pushes(300)
     error = {}
     for linear_part in (True, False):
-        learner = make(linear_part=linear_part, warmup_frames=100)
+        learner = make(linear_part=linear_part, warmup_steps=100)
         learn(learner, batch[:100])
         error[linear_part] = change_error(learner, batch[100:])
     assert error[True][0] < 0.5 * error[False][0]
@@ -338,7 +338,7 @@ def test_a_probabilistic_model_learns_how_noisy_a_step_is():
     state = torch.rand(1000, 4)
     deviation = torch.where(state[:, :1] > 0.5, 1.0, 0.05)
     after = state + deviation * torch.randn(1000, 4)
-    learner = make(probabilistic=True, updates_per_frame=0.5)
+    learner = make(probabilistic=True, updates_per_step=0.5)
     learn(learner, random_batch(1000, state=state, next_state=after, terminated=torch.zeros(1000, dtype=torch.bool)))
     each = [part.expand(3, *part.shape) for part in (state, torch.zeros(1000, dtype=torch.long), torch.zeros(1000, 2))]
     with torch.no_grad():
@@ -397,11 +397,11 @@ def test_with_a_frame_mirror_images_are_learned_from_and_without_one_all_maps():
 
     assert make(BOAT).symmetry is not None
     for env, factor in ((BoatDockEnv(4, controller="congruent"), 2), (CatchPointEnv(4), 16)):
-        learner = make(PAMDPSpecs.from_env(env), warmup_frames=10_000)
+        learner = make(PAMDPSpecs.from_env(env), warmup_steps=10_000)
         rolled = with_decisions(env).rollout(8, learner.policy, break_when_any_done=False)
         learn(learner, rolled)
         assert len(learner.prepared()) == 32 * factor
-        unaugmented = make(PAMDPSpecs.from_env(env), warmup_frames=10_000, augment=False)
+        unaugmented = make(PAMDPSpecs.from_env(env), warmup_steps=10_000, augment=False)
         learn(unaugmented, rolled)
         assert len(unaugmented.prepared()) == 32
 
@@ -421,7 +421,7 @@ def acting(learner: PETS, td: TensorDict) -> TensorDict:
 
 
 def test_the_weight_decay_falls_with_the_number_of_steps():
-    learner = make(weight_decay=0.8, weight_decay_frames=100, updates_per_frame=0.01)
+    learner = make(weight_decay=0.8, weight_decay_steps=100, updates_per_step=0.01)
     decays = []
     for num in (80, 120, 200):
         learn(learner, random_batch(num))
@@ -453,7 +453,7 @@ def with_opinions(learner: PETS, rewards: list[float]) -> PETS:
 def test_exploring_plans_with_the_environments_own_member_greedy_ones_and_without_posterior_sampling_with_all():
     learner = with_opinions(make(num_members=3), [1.0, 2.0, 6.0])
     state, member = torch.randn(6, 4), torch.tensor([2, 0, 2, 2, 0, 0])
-    two_steps = 1.0 + learner.gamma
+    two_steps = 1.0 + learner.options.gamma
     own = learner.policy.plan(state, member).value
     torch.testing.assert_close(own, two_steps * torch.tensor([1.0, 2.0, 6.0])[member], atol=1e-3, rtol=0.0)
     together = learner.policy.plan(state).value
@@ -472,7 +472,7 @@ def test_exploring_plans_with_the_environments_own_member_greedy_ones_and_withou
 
 def test_exploring_plans_by_all_members_count_their_disagreement_greedy_ones_do_not():
     learner = with_opinions(make(num_members=3, optimism=2.0), [1.0, 2.0, 6.0])
-    state, two_steps = torch.randn(6, 4), 1.0 + learner.gamma
+    state, two_steps = torch.randn(6, 4), 1.0 + learner.options.gamma
     deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
     explored = learner.policy.plan(state).value
     torch.testing.assert_close(explored, two_steps * (3.0 + 2.0 * deviation).expand(6), atol=1e-3, rtol=0.0)
@@ -485,7 +485,7 @@ def test_cautious_greedy_plans_count_the_disagreement_of_members_against_a_seque
     deviation = torch.tensor([1.0, 2.0, 6.0]).std(correction=0)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         planned = learner.policy.plan(torch.randn(6, 4)).value
-    expected = (1.0 + learner.gamma) * (3.0 - 0.5 * deviation)
+    expected = (1.0 + learner.options.gamma) * (3.0 - 0.5 * deviation)
     torch.testing.assert_close(planned, expected.expand(6), atol=1e-3, rtol=0.0)
 
 
@@ -564,7 +564,7 @@ def test_before_planning_the_value_assumes_the_only_known_reward():
 def test_plans_avoid_or_reach_terminations_if_every_reward_is_the_same(reward, is_good):
     """Action 1 ends the episode if its first parameter is above the state's first entry; nothing else does."""
     torch.manual_seed(0)
-    learner = make(warmup_frames=64, lr=5e-3)
+    learner = make(warmup_steps=64, lr=5e-3)
 
     def play(state):
         td = learner.policy(TensorDict({keys.OBSERVATION: state}, [len(state)]))
@@ -672,7 +672,7 @@ def test_values_are_expectiles_of_what_the_stored_actions_led_to(expectile, expe
 def test_it_learns_a_two_step_problem_within_some_hundred_steps():
     """Action 1 opens a door if its parameters meet the state; through the open door, action 0 earns 1 and ends."""
     torch.manual_seed(0)
-    learner = make(warmup_frames=100, updates_per_frame=1.5, lr=5e-3, num_samples=32, num_elites=6, num_iterations=4)
+    learner = make(warmup_steps=100, updates_per_step=1.5, lr=5e-3, num_samples=32, num_elites=6, num_iterations=4)
 
     def play(state):
         td = learner.policy(TensorDict({keys.OBSERVATION: state}, [len(state)]))

@@ -64,7 +64,7 @@ REFUSED = [
     ("low=qpamdp low.sigma_final=5", "low: sigma_final=5.0: must be at most sigma=0.1"),
     ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_samples=256, num_iterations=5: a plan would try"),
     ("low=hppo low.epochs=100000", "low: epochs=100000: must be at most 1000"),
-    ("low.updates_per_frame=1e9", "low: updates_per_frame=1000000000.0: must be at most 1000"),
+    ("low.updates_per_step=1e9", "low: updates_per_step=1000000000.0: must be at most 1000"),
     ("low=qpamdp low.features=[]", "low: features=[]: name some of the observation's entries 0 to 15; null: all"),
     ("low=qpamdp low.features=[0,16]", "low: features=[0, 16]: name some of the observation's entries 0 to 15"),
     ("low=qpamdp low.features=[0,0]", "low: features=[0, 0]: names an entry twice"),
@@ -167,7 +167,7 @@ def test_a_project_name_that_wandb_refuses_is_reported_in_one_line(tmp_path):
 
 
 def test_the_estimate_of_memory_counts_all_parts_together(monkeypatch, tmp_path):
-    config = read(config_of("low.buffer_size=1000000 low.warmup_frames=32"))
+    config = read(config_of("low.buffer_size=1000000 low.warmup_steps=32"))
     assemble(config, tmp_path)
     monkeypatch.setattr(assemble_module, "total_memory", lambda device: 100_000_000)
     line = r"^low.buffer_size=1000000: the run takes at least 0\.3 GB of memory, and there are 0\.1 GB$"

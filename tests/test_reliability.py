@@ -89,15 +89,15 @@ def test_an_error_in_the_environment_saves_what_was_learned_and_is_raised_as_it_
 
 def test_a_loss_that_is_nan_stops_the_run_before_it_is_saved(tmp_path, monkeypatch, capsys):
     given = [*SMALL, "low=pdqn", *SHORT["pdqn"], "checkpoint_every=128"]
-    train_step, steps = PDQN.train_step, itertools.count()
+    update_once, steps = PDQN.update_once, itertools.count()
 
     def spoiled(self, sample):
         if next(steps) == 8:
             with torch.no_grad():
                 next(self.critics.parameters()).fill_(torch.nan)
-        return train_step(self, sample)
+        return update_once(self, sample)
 
-    monkeypatch.setattr(PDQN, "train_step", spoiled)
+    monkeypatch.setattr(PDQN, "update_once", spoiled)
     assert run(compose_config(given), tmp_path, given) == 3
     assert "/critic is nan at frame" in capsys.readouterr().err
     with checkpoint._Opened(tmp_path / "checkpoint.zip") as opened:

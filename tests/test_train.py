@@ -68,7 +68,7 @@ def test_the_planner_under_the_oracle_reaches_the_ceiling_with_nothing_to_learn(
 
 
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(tmp_path):
-    learner = ["low=hyar", "low.warmup_frames=256", "low.codec_pretrain_updates=5", "low.updates_per_frame=0.02"]
+    learner = ["low=hyar", "low.warmup_steps=256", "low.codec_pretrain_updates=5", "low.updates_per_step=0.02"]
     learner += ["total_frames=512", "eval.every=256"]
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         start(tmp_path / name, *learner, f"seed={seed}")

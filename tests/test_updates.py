@@ -20,13 +20,13 @@ from hpamdp.config import ConfigError
 from hpamdp.policies.low_level.hyar import LATENT
 from hpamdp.policies.low_level.paddpg import SCORES
 from hpamdp.policies.shared.gradients import gradients_of
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.run.assemble import assemble
 
 # Neither draws random numbers in a loss: compiled code draws others.
 MAKE = {
     "pdqn": partial(test_pdqn.make, target_smoothing=0.0),
-    "hyar": partial(test_hyar.make, target_noise=0.0, relabelling="mean"),
+    "hyar": partial(test_hyar.make, target_smoothing=0.0, relabelling="mean"),
     "paddpg": partial(test_paddpg.make, max_grad_norm=None),
 }
 LR = {
@@ -40,8 +40,8 @@ class TransposedLearner(ReplayLearner):
     """Has one weight, which it uses transposed: so its gradient comes transposed, too."""
 
     def __init__(self) -> None:
-        sizes = dict(gamma=0.9, warmup_frames=0, buffer_size=10, batch_size=2, updates_per_frame=1.0)
-        super().__init__(SPECS, torch.device("cpu"), **sizes)
+        options = ReplayOptions(warmup_steps=0, buffer_size=10, batch_size=2)
+        super().__init__(SPECS, "cpu", options)
         self.weight = nn.Parameter(torch.randn(3, 5))
         self.optimizers = {"weight": torch.optim.Adam([self.weight], lr=0.1, fused=True)}
 
@@ -71,7 +71,7 @@ def test_a_step_is_that_of_plain_adam_however_the_gradient_lies_in_memory():
         (x @ weight.T).square().sum().backward()
         plain.step()
         plain.zero_grad()
-        learner.minimise("weight", learner.loss, x)
+        learner.gradient_step("weight", learner.loss, x)
     torch.testing.assert_close(learner.weight, weight)
 
 
@@ -84,7 +84,7 @@ def test_the_critics_step_is_that_of_plain_adam_after_a_backward_pass(name):
     plain = torch.optim.Adam(reference.critics.parameters(), lr=LR[name], fused=False)
     reference._critic_loss(batch)[0].backward()
     plain.step()
-    learner.train_step(batch)
+    learner.update_once(batch)
     for new, expected in zip(learner.critics.parameters(), reference.critics.parameters(), strict=True):
         torch.testing.assert_close(new, expected)
 
@@ -100,7 +100,7 @@ def test_compiled_updates_are_the_same_up_to_rounding(name):
     compiled.compile_updates()
     for _ in range(2):
         batch = batch_for(name)
-        scalars, expected = compiled.train_step(batch), learner.train_step(batch)
+        scalars, expected = compiled.update_once(batch), learner.update_once(batch)
         assert list(scalars) == list(expected)
     for key, value in learner.actor.state_dict().items():
         torch.testing.assert_close(compiled.actor.state_dict()[key], value, rtol=1e-3, atol=1e-4)
@@ -118,7 +118,7 @@ def test_compiled_updates_may_search(name, settings):
     before = copy.deepcopy(learner.actor.state_dict())
     learner.compile_updates()
     learner.lower_precision()
-    learner.train_step(batch_for(name))
+    learner.update_once(batch_for(name))
     assert all(not after.equal(before[key]) for key, after in learner.actor.state_dict().items() if "net" in key)
 
 

@@ -19,12 +19,12 @@ from hpamdp.config import conf_dir, read
 from hpamdp.run.assemble import Parts, assemble
 
 HERE = Path(__file__).resolve().parent
-PUBLISHED = ["low=pdqn", "low.twin_q=false", "low.target_smoothing=0", "low.policy_delay=1", "low.hidden_dims=[128]"]
-EVERY_PRESS = ["low.updates_per_frame=1", "low.batch_size=128", "num_envs=64", "steps_per_batch=1"]
-HYAR = ["low=hyar", "low.warmup_frames=1000", "low.codec_pretrain_updates=10"]
+PUBLISHED = ["low=pdqn", "low.twin=false", "low.target_smoothing=0", "low.policy_delay=1", "low.hidden_dims=[128]"]
+EVERY_PRESS = ["low.updates_per_step=1", "low.batch_size=128", "num_envs=64", "steps_per_batch=1"]
+HYAR = ["low=hyar", "low.warmup_steps=1000", "low.codec_pretrain_updates=10"]
 HYAR_SIZE = ["low.hidden_dims=[256,256]", "low.codec_hidden_dim=256"]
-DLPA = ["low=dlpa", "low.warmup_frames=64"]
-MANY_UPDATES = ["low.updates_per_frame=25"]
+DLPA = ["low=dlpa", "low.warmup_steps=64"]
+MANY_UPDATES = ["low.updates_per_step=25"]
 DLPA_SIZE = [
     "low.num_samples=1000",
     "low.num_elites=100",

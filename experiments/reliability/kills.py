@@ -21,9 +21,9 @@ COMMON = [
 ]  # fmt: skip
 RUNS = {
     "hppo": ["high=linucb", "low=hppo"],
-    "pdqn": ["high=ucb", "low=pdqn", "low.warmup_frames=64", "low.batch_size=16", "low.hidden_dims=[16]"],
+    "pdqn": ["high=ucb", "low=pdqn", "low.warmup_steps=64", "low.batch_size=16", "low.hidden_dims=[16]"],
     "actor": ["high=actor", "low=hppo", "high.minibatch_size=32"],
-    "meta_critic": ["high=meta_critic", "low=hsac", "low.warmup_frames=64", "low.batch_size=16"],
+    "meta_critic": ["high=meta_critic", "low=hsac", "low.warmup_steps=64", "low.batch_size=16"],
     "multi": ["high=ucb", "low=hppo", "collector=multi"],
 }
 

@@ -17,8 +17,8 @@ CONF = command_line.REPOSITORY / "conf"
 SMALL = ["num_envs=4", "steps_per_batch=2", "total_frames=16", "eval.layouts=4", "eval.every=0"]
 # What lets learners and selectors make an update in so short a run.
 SHORT = {
-    "warmup_frames": 8, "warmup_steps": 8, "warmup_decisions": 8, "minibatch_size": 8, "updates_per_step": 0.5,
-    "updates_per_decision": 0.5, "updates_per_frame": 0.5, "codec_pretrain_updates": 2,
+    "warmup_steps": 8, "warmup_decisions": 8, "minibatch_size": 8, "updates_per_step": 0.5,
+    "updates_per_decision": 0.5, "codec_pretrain_updates": 2,
 }  # fmt: skip
 DEFAULTS = {"high": "ucb", "low": "hyar"}
 # What a value of each type can never be.

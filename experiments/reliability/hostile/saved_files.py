@@ -25,10 +25,10 @@ from .case import ACCEPTED, HARM, SILENT, TRACEBACK, Case
 SMALL = ["num_envs=8", "steps_per_batch=4", "eval.layouts=4", "eval.every=0", "film=false", "log_every=64"]
 AGENTS = {
     "linucb_hppo": ["high=linucb", "low=hppo", "low.minibatch_size=16"],
-    "ucb_pdqn": ["high=ucb", "low=pdqn", "low.warmup_frames=64", "low.batch_size=16", "low.hidden_dims=[16]"],
+    "ucb_pdqn": ["high=ucb", "low=pdqn", "low.warmup_steps=64", "low.batch_size=16", "low.hidden_dims=[16]"],
     "actor_hyar": [
-        *("high=actor", "low=hyar", "low.warmup_frames=64", "low.codec_pretrain_updates=2", "low.batch_size=16"),
-        *("low.updates_per_frame=0.05", "high.minibatch_size=32"),
+        *("high=actor", "low=hyar", "low.warmup_steps=64", "low.codec_pretrain_updates=2", "low.batch_size=16"),
+        *("low.updates_per_step=0.05", "high.minibatch_size=32"),
     ],
     "meta_critic_qpamdp": [
         *("high=meta_critic", "low=qpamdp", "low.warmup_steps=32", "low.initial_episodes=8"),

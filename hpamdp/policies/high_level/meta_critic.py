@@ -27,9 +27,10 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
-from hpamdp.policies.shared.replay import first_multiple, linear_schedule
+from hpamdp.policies.shared.replay import first_multiple
 from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 

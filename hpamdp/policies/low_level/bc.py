@@ -16,7 +16,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
@@ -53,24 +53,23 @@ class BC(ReplayLearner):
     ) -> None:
         if not min_scale < max_scale:
             raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=1.0,
-            warmup_frames=0,
+            warmup_steps=0,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=0.0,
+            updates_per_step=1.0,
         )
+        super().__init__(specs, device, options)
         self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
         optimizer = torch.optim.AdamW(self.actor.parameters(), lr=lr, weight_decay=weight_decay, fused=True)
         self.optimizers = {"actor": optimizer}
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Make one step up the log-likelihood of transitions `[batch_size]`; return scalars."""
-        return self.minimise("actor", self._loss, sample, self.allowed(sample))
+        return self.gradient_step("actor", self._loss, sample, self.allowed(sample))
 
     def _loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         distribution: HybridDistribution = self.actor(sample["state"], allowed)

@@ -43,7 +43,7 @@ from hpamdp.policies.low_level.dlpa_model import PAMDPModel
 from hpamdp.policies.masks import random_choice
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.settings import Expectile, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
@@ -272,6 +272,8 @@ class DLPA(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_option = "end_values"
 
+    catches_up = True
+
     policy: DLPAPolicy
 
     def __init__(
@@ -289,9 +291,9 @@ class DLPA(ReplayLearner):
         rho: PositiveFraction,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        updates_per_step: PositiveFloat,
         augment: bool,
-        warmup_frames: PositiveInt,
+        warmup_steps: PositiveInt,
         epsilon: FractionBelowOne,
         gamma: PositiveFraction,
         horizon: PositiveInt,
@@ -308,16 +310,15 @@ class DLPA(ReplayLearner):
         end_value_tau: PositiveFraction,
         end_value_expectile: Expectile,
     ) -> None:
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
             augment=augment,
         )
+        super().__init__(specs, device, options)
         self.loss_weights = {"state": state_weight, "reward": reward_weight, "termination": termination_weight}
         self.rho = rho
         self.horizon = horizon
@@ -426,13 +427,9 @@ class DLPA(ReplayLearner):
             trajectory[environment] = last["trajectory"][is_followed]
         return place, trajectory
 
-    def explore(self, frames: int) -> None:
+    def on_progress(self, steps: int) -> None:
         """Let the policy plan."""
         self.policy.is_trained.fill_(True)
-
-    def updates_due(self, before: int, frames: int) -> int:
-        """Return how many updates to make; the first ones make up for the warm-up."""
-        return super().updates_due(before if before >= self.warmup_frames else 0, frames)
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Fit the model's scales; yield `num_batches` samples of windows that start at any stored step.
@@ -442,7 +439,7 @@ class DLPA(ReplayLearner):
         """
         stored = self.buffer[:]
         self.model.fit_scales(stored["state"], stored["next_state"])
-        starts = torch.randint(len(self.buffer), (num_batches, self.batch_size), device=self.frames.device)
+        starts = torch.randint(len(self.buffer), (num_batches, self.options.batch_size), device=self.frames.device)
         for start in starts:
             yield self.augmented(self.windows(start))
 
@@ -483,9 +480,9 @@ class DLPA(ReplayLearner):
                 parts[name] = parts[name] + self.rho**h * (error * step["valid"]).mean()
         return parts
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""
-        scalars = self.minimise("model", self._loss, sample.select(*_STORED, "terminated", "valid"))
+        scalars = self.gradient_step("model", self._loss, sample.select(*_STORED, "terminated", "valid"))
         if self.end_values is not None:
             first = sample[:, 0]
             scalars |= self.end_values.update(self, first, first["state"], first["next_state"])

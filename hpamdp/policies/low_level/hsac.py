@@ -44,7 +44,7 @@ from hpamdp.policies.shared.networks import (
     mlp,
     polyak_update,
 )
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.settings import LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
@@ -142,10 +142,10 @@ class HSAC(ReplayLearner):
         discrete_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0)],
         parameter_target_entropy: Annotated[float, Field(lt=math.log(2.0))],
         temperature_lr: LearningRate,
-        warmup_frames: NonNegativeInt,
+        warmup_steps: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        updates_per_step: PositiveFloat,
         augment: bool,
         policy_delay: PositiveInt,
         gamma: PositiveFraction,
@@ -155,16 +155,15 @@ class HSAC(ReplayLearner):
     ) -> None:
         if not min_scale < max_scale:
             raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
             augment=augment,
         )
+        super().__init__(specs, device, options)
         self.discrete_target_entropy = discrete_target_entropy
         self.most_discrete_entropy = math.log(specs.num_discrete)
         self.parameter_target_entropy = parameter_target_entropy
@@ -190,7 +189,7 @@ class HSAC(ReplayLearner):
             "temperatures": torch.optim.Adam(temperatures, lr=temperature_lr, fused=True),
         }
 
-    def explore(self, frames: int) -> None:
+    def on_progress(self, steps: int) -> None:
         """Explore with the actor from the end of the warm-up on."""
         self.policy.is_random.fill_(False)
 
@@ -225,9 +224,9 @@ class HSAC(ReplayLearner):
         parameter_excess = -(probs * (own_log_density + own_target)).sum(-1)
         return (probs * q).sum(-1), discrete_excess, parameter_excess
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the temperatures. Return scalars."""
-        scalars = self.minimise("critics", self._critic_loss, sample)
+        scalars = self.gradient_step("critics", self._critic_loss, sample)
         scalars["discrete_temperature"], scalars["parameter_temperature"] = self.temperatures()
         if self.updates % self.policy_delay == 0:
             scalars |= self._update_actor(sample["state"], self.allowed(sample))
@@ -249,7 +248,7 @@ class HSAC(ReplayLearner):
 
     def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
         """Update the actor to increase the soft value; return the loss and the mean entropies minus their targets."""
-        return self.minimise("actor", self._actor_loss, state, allowed)
+        return self.gradient_step("actor", self._actor_loss, state, allowed)
 
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed)
@@ -260,7 +259,7 @@ class HSAC(ReplayLearner):
     def _update_temperatures(self, discrete_excess: Tensor, parameter_excess: Tensor) -> None:
         """Lower each temperature where its entropy exceeds the target, raise it where the entropy falls short."""
         if self.log_discrete_temperature.requires_grad or self.log_parameter_temperature.requires_grad:
-            self.minimise("temperatures", self._temperature_loss, discrete_excess, parameter_excess)
+            self.gradient_step("temperatures", self._temperature_loss, discrete_excess, parameter_excess)
 
     def _temperature_loss(self, discrete_excess: Tensor, parameter_excess: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         discrete_loss = self.log_discrete_temperature * discrete_excess

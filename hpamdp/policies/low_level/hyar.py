@@ -56,6 +56,8 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
+from hpamdp.policies.shared.actor_critic import set_learning_rates
+from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     before_tanh,
@@ -67,7 +69,7 @@ from hpamdp.policies.shared.networks import (
     with_clipped_noise,
     with_variations,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.policies.shared.scales import scale_of
 from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
@@ -348,14 +350,14 @@ class HyAR(ReplayLearner):
         specs: PAMDPSpecs,
         device: torch.device,
         *,
-        rl: Literal["td3", "ddpg"],
+        twin: bool,
         discrete: Literal["greedy", "nearest"],
         embedding_dim: PositiveInt,
         latent_dim: PositiveInt | None,
         codec_hidden_dim: PositiveInt,
         hidden_dims: list[PositiveInt],
         layer_norm: bool,
-        warmup_frames: PositiveInt,
+        warmup_steps: PositiveInt,
         codec_pretrain_updates: PositiveInt,
         codec_every: PositiveInt,
         codec_lr: LearningRate,
@@ -367,7 +369,7 @@ class HyAR(ReplayLearner):
         relabelling: Literal["mean", "sample"],
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        updates_per_step: PositiveFloat,
         augment: bool,
         gamma: PositiveFraction,
         reward_scale: PositiveFloat,
@@ -375,29 +377,28 @@ class HyAR(ReplayLearner):
         actor_lr: LearningRate,
         critic_lr: LearningRate,
         lr_final: PositiveFraction,
-        lr_frames: NonNegativeInt,
+        lr_steps: NonNegativeInt,
         policy_delay: PositiveInt,
-        target_noise: NonNegativeFloat,
-        target_noise_clip: NonNegativeFloat,
+        target_smoothing: NonNegativeFloat,
+        target_smoothing_clip: NonNegativeFloat,
         preactivation_penalty: NonNegativeFloat,
         search_samples: NonNegativeInt,
         search_weight: NonNegativeFloat,
-        exploration_noise: NonNegativeFloat,
+        parameter_noise: NonNegativeFloat,
         greedy_samples: NonNegativeInt,
         greedy_noise: NonNegativeFloat,
         epsilon_final: Fraction,
-        epsilon_frames: NonNegativeInt,
+        epsilon_steps: NonNegativeInt,
     ) -> None:
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
             augment=augment,
         )
+        super().__init__(specs, device, options)
         self.codec_pretrain_updates = codec_pretrain_updates
         self.codec_every = codec_every
         self.kl_weight = kl_weight
@@ -409,21 +410,20 @@ class HyAR(ReplayLearner):
         self.relabels_with_noise = relabelling == "sample"
         self.tau = tau
         self.lr_final = lr_final
-        self.lr_frames = lr_frames
-        is_td3 = rl == "td3"
-        self.policy_delay = policy_delay if is_td3 else 1
-        self.target_noise = target_noise if is_td3 else 0.0
-        self.target_noise_clip = target_noise_clip
+        self.lr_steps = lr_steps
+        self.policy_delay = policy_delay if twin else 1
+        self.target_smoothing = target_smoothing if twin else 0.0
+        self.target_smoothing_clip = target_smoothing_clip
         self.preactivation_penalty = preactivation_penalty
         self.search_samples = search_samples
         self.search_weight = search_weight
         self.epsilon_final = epsilon_final
-        self.epsilon_frames = epsilon_frames
+        self.epsilon_steps = epsilon_steps
 
         latent_dim = latent_dim or max(1, *specs.parameter_dims)
         self.codec = HybridCodec(specs, embedding_dim, latent_dim, codec_hidden_dim)
         self.actor = LatentActor(specs, embedding_dim, latent_dim, hidden_dims, is_greedy=discrete == "greedy")
-        num_critics = 2 if is_td3 else 1
+        num_critics = 2 if twin else 1
         self.critics = LatentCritics(
             num_critics, specs.observation_dim, embedding_dim + latent_dim, hidden_dims, layer_norm=layer_norm
         )
@@ -434,7 +434,7 @@ class HyAR(ReplayLearner):
             self.critics,
             self.codec,
             specs,
-            noise=exploration_noise,
+            noise=parameter_noise,
             greedy_samples=greedy_samples,
             greedy_noise=greedy_noise,
         )
@@ -464,20 +464,20 @@ class HyAR(ReplayLearner):
         stored = self.buffer[:]
         self.codec.change_scale.copy_(scale_of(stored["next_state"] - stored["state"]))
         for _ in range(self.codec_pretrain_updates):
-            self._update_codec(self.augmented(self.buffer.sample(self.batch_size)))
+            self._update_codec(self.augmented(self.buffer.sample(self.options.batch_size)))
         self._fit_latent_range()
 
-    def explore(self, frames: int) -> None:
+    def on_progress(self, steps: int) -> None:
         """Lower the fraction of random actions and the learning rates."""
-        self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
-        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(frames, self.lr_frames, self.lr_final))
+        self.policy.epsilon.fill_(linear_schedule(steps, self.epsilon_steps, self.epsilon_final))
+        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(steps, self.lr_steps, self.lr_final))
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
-        scalars = self.minimise("critics", self._critic_loss, sample)
+        scalars = self.gradient_step("critics", self._critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars |= self.minimise("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         if self.updates % self.codec_every == 0:
@@ -545,7 +545,9 @@ class HyAR(ReplayLearner):
         The proposals carry clipped noise.
         """
         allowed = self.specs.allowed(observation, action_mask)
-        proposals = self.target_actor(observation, self.codec.embeddings, self.target_noise, self.target_noise_clip)
+        proposals = self.target_actor(
+            observation, self.codec.embeddings, self.target_smoothing, self.target_smoothing_clip
+        )
         if not self.actor.is_greedy:
             return self.target_critics(observation, self.codec.of_allowed(proposals, allowed)).amin(0).amax(-1)
         return masked_values(self.target_critics(observation, proposals).amin(0), allowed).amax(-1)
@@ -598,7 +600,7 @@ class HyAR(ReplayLearner):
 
     def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the codec; return the parts of its loss."""
-        scalars = self.minimise("codec", self._codec_loss, sample)
+        scalars = self.gradient_step("codec", self._codec_loss, sample)
         self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
         return scalars
 

@@ -28,7 +28,7 @@ from torch.nn import functional as F
 from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.settings import Expectile, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
@@ -53,24 +53,23 @@ class IQL(ReplayLearner):
         tau: PositiveFraction,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
-        warmup_frames: NonNegativeInt,
+        warmup_steps: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        updates_per_step: PositiveFloat,
         augment: bool,
     ) -> None:
         if not min_scale < max_scale:
             raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
             augment=augment,
         )
+        super().__init__(specs, device, options)
         self.expectile = expectile
         self.temperature = temperature
         self.max_weight = max_weight
@@ -92,14 +91,14 @@ class IQL(ReplayLearner):
         """Return V(s), `[B]`."""
         return self.state_value(observation).squeeze(-1)
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update V, then Q, then the policy from transitions `[batch_size]`; return scalars."""
         with torch.no_grad():
             q = self.target_critics.of_discrete(sample["state"], sample["discrete"], sample["unit"]).amin(0)
-        of_value = self.minimise("state_value", self._value_loss, sample["state"], q)
-        scalars = self.minimise("critics", self._critic_loss, sample) | of_value | {"q": q.mean()}
+        of_value = self.gradient_step("state_value", self._value_loss, sample["state"], q)
+        scalars = self.gradient_step("critics", self._critic_loss, sample) | of_value | {"q": q.mean()}
         polyak_update(self.target_critics, self.critics, self.tau)
-        return scalars | self.minimise("actor", self._actor_loss, sample, self.allowed(sample), q)
+        return scalars | self.gradient_step("actor", self._actor_loss, sample, self.allowed(sample), q)
 
     def _value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of V from the expectile of the values `[B]` of the data's actions."""

@@ -11,7 +11,7 @@ sections 4 and 5, equation 11. TD3: Fujimoto, van Hoof and Meger 2018, arXiv 180
 Differs from the source:
 - a random action is stored with random scores of which the highest is its own, as in the code of Bester, James and
   Konidaris 2019, arXiv 1905.04388;
-- `exploration_noise` adds Gaussian noise to scores and parameters, besides epsilon-random actions;
+- `parameter_noise` adds Gaussian noise to scores and parameters, besides epsilon-random actions;
 - smaller networks, which start as PyTorch's; the learning rates and the target rate are those of this project;
 - the problem's initial parameters, if `initial_parameters` asks for them, are added by a frozen layer, as in Bester et
   al.
@@ -34,6 +34,7 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_values
+from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InitialLayer,
@@ -43,7 +44,7 @@ from hpamdp.policies.shared.networks import (
     polyak_update,
     with_clipped_noise,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
@@ -102,7 +103,7 @@ class PADDPGPolicy(TensorDictModuleBase):
         output = self.actor(observation)
         if not is_greedy():
             is_random = torch.rand_like(output[..., :1]) < self.epsilon
-            noisy = (output + self.noise * torch.randn_like(output)).clamp(-1.0, 1.0)
+            noisy = with_exploring_noise(output, self.noise)
             output = torch.where(is_random, 2.0 * torch.rand_like(output) - 1.0, noisy)
         scores, unit = with_lowest_scores(output, allowed).tensor_split([self.specs.num_discrete], -1)
         discrete = masked_values(scores, allowed).argmax(-1)
@@ -128,42 +129,41 @@ class PADDPG(ReplayLearner):
         policy_delay: PositiveInt,
         initial_parameters: InitialParameters,
         hidden_dims: list[PositiveInt],
-        warmup_frames: NonNegativeInt,
+        warmup_steps: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        updates_per_step: PositiveFloat,
         gamma: PositiveFraction,
         tau: PositiveFraction,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
         max_grad_norm: PositiveFloat | None,
-        exploration_noise: NonNegativeFloat,
+        parameter_noise: NonNegativeFloat,
         epsilon_final: Fraction,
-        epsilon_frames: NonNegativeInt,
+        epsilon_steps: NonNegativeInt,
     ) -> None:
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
         )
+        super().__init__(specs, device, options)
         self.target_smoothing = target_smoothing if twin else 0.0
         self.target_smoothing_clip = target_smoothing_clip
         self.policy_delay = policy_delay if twin else 1
         self.tau = tau
         self.max_grad_norm = max_grad_norm
         self.epsilon_final = epsilon_final
-        self.epsilon_frames = epsilon_frames
+        self.epsilon_steps = epsilon_steps
 
         action_dim = specs.num_discrete + specs.num_parameters
         self.actor = PADDPGActor(specs, hidden_dims, initial_parameters)
         self.critics = EnsembleMLP(2 if twin else 1, specs.observation_dim + action_dim, hidden_dims, 1)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = PADDPGPolicy(self.actor, specs, exploration_noise)
+        self.policy = PADDPGPolicy(self.actor, specs, parameter_noise)
         self.to(device)
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
@@ -177,21 +177,21 @@ class PADDPG(ReplayLearner):
         output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
         return self._q(self.target_critics, observation, output).amin(0)
 
-    def explore(self, frames: int) -> None:
+    def on_progress(self, steps: int) -> None:
         """Lower the fraction of random actions."""
-        self.policy.epsilon.fill_(linear_schedule(frames, self.epsilon_frames, self.epsilon_final))
+        self.policy.epsilon.fill_(linear_schedule(steps, self.epsilon_steps, self.epsilon_final))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return the rows to store, with all scores."""
         return super().transitions(batch).set(SCORES, batch[SCORES])
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
-        scalars = self.minimise("critics", self._critic_loss, sample, max_grad_norm=self.max_grad_norm)
+        scalars = self.gradient_step("critics", self._critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
             inputs = sample["state"], self.allowed(sample)
-            scalars |= self.minimise("actor", self._actor_loss, *inputs, max_grad_norm=self.max_grad_norm)
+            scalars |= self.gradient_step("actor", self._actor_loss, *inputs)
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         return scalars

@@ -44,6 +44,8 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
+from hpamdp.policies.shared.actor_critic import set_learning_rates
+from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
@@ -58,7 +60,7 @@ from hpamdp.policies.shared.networks import (
     with_clipped_noise,
     with_variations,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, linear_schedule, set_learning_rates
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
@@ -157,7 +159,7 @@ class PDQNPolicy(TensorDictModuleBase):
             discrete = masked_values(self.critics(state, unit).amin(0), allowed).argmax(-1)
         if not is_greedy():
             is_random = torch.rand(discrete.shape, device=discrete.device, dtype=torch.float32) < self.epsilon
-            noisy = (unit + self.noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
+            noisy = with_exploring_noise(unit, self.noise)
             unit = torch.where(is_random.unsqueeze(-1), 2.0 * torch.rand_like(unit) - 1.0, noisy)
             anything = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
             discrete = torch.where(is_random, anything, discrete)
@@ -191,7 +193,7 @@ class PDQN(ReplayLearner):
         device: torch.device,
         *,
         multipass: bool,
-        twin_q: bool,
+        twin: bool,
         double_q: bool,
         target_smoothing: NonNegativeFloat,
         target_smoothing_clip: NonNegativeFloat,
@@ -201,17 +203,17 @@ class PDQN(ReplayLearner):
         initial_parameters: InitialParameters,
         hidden_dims: list[PositiveInt],
         layer_norm: bool,
-        warmup_frames: NonNegativeInt,
+        warmup_steps: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        updates_per_step: PositiveFloat,
         augment: bool,
         gamma: PositiveFraction,
         reward_scale: PositiveFloat,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
         lr_final: PositiveFraction,
-        lr_frames: NonNegativeInt,
+        lr_steps: NonNegativeInt,
         actor_tau: PositiveFraction,
         critic_tau: PositiveFraction,
         max_grad_norm: PositiveFloat | None,
@@ -222,7 +224,7 @@ class PDQN(ReplayLearner):
         greedy_samples: NonNegativeInt,
         greedy_noise: NonNegativeFloat,
         epsilon_final: Fraction,
-        epsilon_frames: NonNegativeInt,
+        epsilon_steps: NonNegativeInt,
         epsilon_episodes: PositiveInt | None,
     ) -> None:
         if preactivation_penalty > 0.0 and bounding != "tanh":
@@ -231,16 +233,15 @@ class PDQN(ReplayLearner):
             raise ValueError(
                 f"{search_samples=}: needs multipass=true, as values else depend on other actions' parameters"
             )
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
             augment=augment,
         )
+        super().__init__(specs, device, options)
         self.stores_own_parameters = multipass
         self.double_q = double_q
         self.target_smoothing = target_smoothing
@@ -249,7 +250,7 @@ class PDQN(ReplayLearner):
         self.n_step = n_step
         self.learning_rates = {"actor": actor_lr, "critics": critic_lr}
         self.lr_final = lr_final
-        self.lr_frames = lr_frames
+        self.lr_steps = lr_steps
         self.actor_tau = actor_tau
         self.critic_tau = critic_tau
         self.max_grad_norm = max_grad_norm
@@ -258,12 +259,12 @@ class PDQN(ReplayLearner):
         self.search_weight = search_weight
         self.reward_scale = reward_scale
         self.epsilon_final = epsilon_final
-        self.epsilon_frames = epsilon_frames
+        self.epsilon_steps = epsilon_steps
         self.epsilon_episodes = epsilon_episodes
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
 
         self.actor = ParameterActor(specs, hidden_dims, bounding, initial_parameters)
-        self.critics = HybridCritics(specs, 2 if twin_q else 1, hidden_dims, multipass, layer_norm=layer_norm)
+        self.critics = HybridCritics(specs, 2 if twin else 1, hidden_dims, multipass, layer_norm=layer_norm)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = PDQNPolicy(
@@ -285,25 +286,25 @@ class PDQN(ReplayLearner):
         self.episodes += (batch["next", keys.DONE].squeeze(-1) & mask).sum()
         return super().learn(batch, mask)
 
-    def explore(self, frames: int) -> None:
+    def on_progress(self, steps: int) -> None:
         """Lower the fraction of random actions and the learning rates."""
-        time, over = frames, self.epsilon_frames
+        time, over = steps, self.epsilon_steps
         if self.epsilon_episodes is not None:
             time, over = int(self.episodes), self.epsilon_episodes
         self.policy.epsilon.fill_(linear_schedule(time, over, self.epsilon_final))
-        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(frames, self.lr_frames, self.lr_final))
+        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(steps, self.lr_steps, self.lr_final))
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state that follows and the discount of that state's value."""
         rows = super().transitions(batch)
         done = option_ends(batch).squeeze(-1)
         terminated = batch["next", keys.TERMINATED].squeeze(-1)
-        reward, last = n_step_returns(rows["reward"], done, self.n_step, self.gamma)
+        reward, last = n_step_returns(rows["reward"], done, self.n_step, self.options.gamma)
         num_rewards = last - torch.arange(done.shape[-1], device=last.device) + 1
         next_state = rows["next_state"]
         rows["reward"] = reward
         rows["next_state"] = next_state.gather(-2, last.unsqueeze(-1).expand_as(next_state))
-        rows["discount"] = self.gamma ** num_rewards.float() * ~terminated.gather(-1, last)
+        rows["discount"] = self.options.gamma ** num_rewards.float() * ~terminated.gather(-1, last)
         for name in ("option_ended", "next_option"):
             if name in rows.keys():
                 rows[name] = rows[name].gather(-1, last)
@@ -312,9 +313,9 @@ class PDQN(ReplayLearner):
             rows["next_action_mask"] = mask.gather(-2, last.unsqueeze(-1).expand_as(mask))
         return rows
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
-        scalars = self.minimise("critics", self._critic_loss, sample, max_grad_norm=self.max_grad_norm)
+        scalars = self.gradient_step("critics", self._critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
             scalars |= self._update_actor(sample["state"], self.allowed(sample))
@@ -330,7 +331,7 @@ class PDQN(ReplayLearner):
 
     def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
         """Update the actor to increase the sum of the allowed discrete actions' values; return the loss."""
-        return self.minimise("actor", self._actor_loss, state, allowed, max_grad_norm=self.max_grad_norm)
+        return self.gradient_step("actor", self._actor_loss, state, allowed)
 
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         raw = self.actor.raw(state)

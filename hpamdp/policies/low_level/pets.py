@@ -49,10 +49,11 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import random_choice
 from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.exploration import with_exploring_noise
 from hpamdp.policies.shared.frame import CanonicalFrame, joined
 from hpamdp.policies.shared.networks import EnsembleLinear
 from hpamdp.policies.shared.planning import Found, Prediction, Returns, SequenceSearch, SequenceStep, discounted_return
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.policies.shared.scales import scale_of
 from hpamdp.settings import Expectile, Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
@@ -441,7 +442,7 @@ class PETSPolicy(TensorDictModuleBase):
             found = self.plan(state[is_planned], member[is_planned] if self._follows_member else None, allowed)
             own = found.own
             if not is_greedy():
-                own = (own + self.noise * torch.randn_like(own)).clamp(-1.0, 1.0)
+                own = with_exploring_noise(own, self.noise)
             discrete[is_planned] = found.discrete
             unit[is_planned] = unit[is_planned].scatter(-1, self.slots[found.discrete], own)
         shape = td.batch_size
@@ -604,6 +605,8 @@ class PETS(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     stores_own_parameters = True
 
+    catches_up = True
+
     policy: PETSPolicy
 
     def __init__(
@@ -619,10 +622,10 @@ class PETS(ReplayLearner):
         linear_part: Literal["auto"] | bool,
         lr: LearningRate,
         weight_decay: NonNegativeFloat,
-        weight_decay_frames: PositiveInt,
+        weight_decay_steps: PositiveInt,
         transition_weight: PositiveFloat,
-        warmup_frames: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        warmup_steps: PositiveInt,
+        updates_per_step: PositiveFloat,
         batch_size: PositiveInt,
         buffer_size: PositiveInt,
         posterior_sampling: Literal["auto"] | bool,
@@ -651,18 +654,17 @@ class PETS(ReplayLearner):
         self.entries = list(range(specs.observation_dim))
         if uses_geometry:
             self.entries, specs = specs.telling_entries, specs.with_telling_entries()
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
             augment=specs.symmetries is not None if augment == "auto" else augment,
         )
+        super().__init__(specs, device, options)
         self.weight_decay = weight_decay
-        self.weight_decay_frames = weight_decay_frames
+        self.weight_decay_steps = weight_decay_steps
         self.transition_weight = transition_weight
         self.model = PETSModel(
             specs,
@@ -735,7 +737,7 @@ class PETS(ReplayLearner):
             return self.policy.value(observation, action_mask)
         return self.end_values.of_own(observation[..., self.entries])
 
-    def explore(self, frames: int) -> None:
+    def on_progress(self, steps: int) -> None:
         """Let the policy plan once stored rewards or terminations differ, or at once if there are end values."""
         if self.policy.is_trained:  # later steps may be the same because the plans are good
             return
@@ -743,17 +745,13 @@ class PETS(ReplayLearner):
         differ = [(stored[name] != stored[name][0]).any() for name in ("reward", "terminated")]
         self.policy.is_trained.fill_(self.end_values is not None or bool(torch.stack(differ).any()))
 
-    def updates_due(self, before: int, frames: int) -> int:
-        """Return how many updates to make; the first ones make up for the warm-up."""
-        return super().updates_due(before if before >= self.warmup_frames else 0, frames)
-
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples `[num_members, batch_size]` of all stored steps, each with all its mirror images or maps."""
-        decay = self.weight_decay * min(1.0, self.weight_decay_frames / len(self.buffer))
+        decay = self.weight_decay * min(1.0, self.weight_decay_steps / len(self.buffer))
         for group in self.optimizers["model"].param_groups:
             group["weight_decay"] = decay
         rows = self.prepared()
-        shape = num_batches, self.model.num_members, self.batch_size
+        shape = num_batches, self.model.num_members, self.options.batch_size
         for places in torch.randint(len(rows), shape, device=rows.device):
             yield rows[places]
 
@@ -798,12 +796,12 @@ class PETS(ReplayLearner):
         rows = self.symmetry.mapped(number, rows)
         return rows.set("unit", rows["unit"].gather(-1, self.slots[rows["discrete"]]))
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update every member from its own minibatch of a sample `[num_members, batch_size]`.
 
         Then update the values, if they are learned, from as many steps as they were, mapped by no symmetry.
         """
-        scalars = self.minimise("model", self._loss, sample)
+        scalars = self.gradient_step("model", self._loss, sample)
         if self.end_values is not None:
             rows = self.buffer.sample(sample.numel())
             state, next_state = rows["state"], rows["next_state"]

@@ -31,8 +31,9 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import allowed_rows, masked_logits
+from hpamdp.policies.shared.exploration import with_exploring_noise
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
-from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.settings import LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
@@ -91,7 +92,7 @@ class TD3BCPolicy(TensorDictModuleBase):
         q = self.critics(state, unit).amin(0)
         discrete = q.masked_fill(self.is_refused(state, allowed_rows(self.specs, td)), -torch.inf).argmax(-1)
         if not is_greedy():
-            unit = (unit + self.parameter_noise * torch.randn_like(unit)).clamp(-1.0, 1.0)
+            unit = with_exploring_noise(unit, self.parameter_noise)
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
         return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
 
@@ -119,22 +120,21 @@ class TD3BC(ReplayLearner):
         tau: PositiveFraction,
         actor_lr: LearningRate,
         critic_lr: LearningRate,
-        warmup_frames: NonNegativeInt,
+        warmup_steps: NonNegativeInt,
         buffer_size: PositiveInt,
         batch_size: PositiveInt,
-        updates_per_frame: PositiveFloat,
+        updates_per_step: PositiveFloat,
         augment: bool,
     ) -> None:
-        super().__init__(
-            specs,
-            device,
+        options = ReplayOptions(
             gamma=gamma,
-            warmup_frames=warmup_frames,
+            warmup_steps=warmup_steps,
             buffer_size=buffer_size,
             batch_size=batch_size,
-            updates_per_frame=updates_per_frame,
+            updates_per_step=updates_per_step,
             augment=augment,
         )
+        super().__init__(specs, device, options)
         self.behaviour_weight = behaviour_weight
         self.target_smoothing = target_smoothing
         self.target_smoothing_clip = target_smoothing_clip
@@ -154,13 +154,13 @@ class TD3BC(ReplayLearner):
             "behaviour": torch.optim.Adam(self.behaviour.parameters(), lr=actor_lr, fused=True),
         }
 
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update critics and behaviour; every `policy_delay` updates, also actor and targets. Return scalars."""
         allowed = self.allowed(sample)
-        scalars = self.minimise("critics", self._critic_loss, sample)
-        scalars |= self.minimise("behaviour", self._behaviour_loss, sample, allowed)
+        scalars = self.gradient_step("critics", self._critic_loss, sample)
+        scalars |= self.gradient_step("behaviour", self._behaviour_loss, sample, allowed)
         if self.updates % self.policy_delay == 0:
-            scalars |= self.minimise("actor", self._actor_loss, sample, allowed)
+            scalars |= self.gradient_step("actor", self._actor_loss, sample, allowed)
             polyak_update(self.target_actor, self.actor, self.tau)
             polyak_update(self.target_critics, self.critics, self.tau)
         return scalars

@@ -89,6 +89,6 @@ class EndValues(nn.Module):
         with torch.no_grad():
             next_value = learner.next_value(rows)
         inputs = state, next_state, rows["reward"], rows["discount"], next_value
-        scalars = learner.minimise("end_values", self.loss, *inputs)
+        scalars = learner.gradient_step("end_values", self.loss, *inputs)
         polyak_update(self.target_own, self.own, self.tau)
         return scalars

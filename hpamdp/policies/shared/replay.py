@@ -4,80 +4,98 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
+from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
 from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
+from hpamdp.settings import PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
-class ReplayLearner(Learner):
-    """A learner with its own replay buffer, which makes `updates_per_frame` updates for each step that it stores.
+class ReplayOptions(Settings):
+    """Settings of a learner with a replay buffer."""
 
-    A subclass fills `optimizers` and implements `train_step`. It may extend the other methods:
+    warmup_steps: NonNegativeInt = 5000
+    """Random steps of a learner before its first update."""
+    buffer_size: PositiveInt = 200_000
+    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
+    batch_size: PositiveInt = 128
+    """Transitions in an update."""
+    updates_per_step: Annotated[float, Field(gt=0.0)] = 0.25
+    """Updates for each step that the learner collects."""
+    augment: Literal["auto"] | bool = False
+    """Map each sampled transition by a random symmetry that the problem declares. `auto` does so if there is any."""
+    gamma: PositiveFraction = 0.99
+    """Discount of a step."""
+
+    @model_validator(mode="after")
+    def _check_replay(self) -> Self:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(f"batch_size={self.batch_size}: must be at most buffer_size={self.buffer_size}")
+        if self.updates_per_step > 1000.0:
+            raise ValueError(f"updates_per_step={self.updates_per_step}: must be at most 1000")
+        return self
+
+
+class ReplayLearner(Learner):
+    """A learner with its own replay buffer, which makes `updates_per_step` updates for each step that it stores.
+
+    `learn` stores the steps and calls `update`, which samples and calls `update_once`. A subclass implements this
+    method: it is the box of the paper, and takes its optimization steps by `gradient_step`. The subclass also fills
+    `optimizers`, and may extend the other methods:
 
     - `transitions` or `store`: what the buffer holds;
     - `sample_batches`: what an update sees;
-    - `start` and `explore`: what happens at the end of the warm-up, and with every batch after it;
-    - `updates_due`: when updates are made.
+    - `start` and `on_progress`: what happens at the end of the warm-up, and with every batch after it.
 
-    Losses are given to `minimise` as methods. For `compile_updates` they must be such that `torch.compile` can trace
-    them in one piece, with dicts in the place of TensorDicts; a subclass with others has to refuse it.
+    A loss is a method that maps tensors to the loss and to scalars to log. For `compile_updates`, `torch.compile` must
+    be able to trace it in one piece, with dicts in place of TensorDicts. A subclass whose losses cannot be traced has
+    to refuse it.
 
     The `target` of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
     Attributes:
         symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
-        stores_own_parameters: whether the buffer holds the parameters of the discrete action taken alone, which is less
-            where there are many; samples then have 0 for the others.
+        stores_own_parameters: true if the buffer holds only the parameters of the discrete action that was taken. This
+            saves memory where there are many; samples then have 0 for the others.
+        catches_up: true if the first updates make up for the steps of the warm-up.
         reward_scale: factor on the rewards that are stored.
+        max_grad_norm: largest gradient norm of a gradient step; if None, there is no limit.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
     stores_own_parameters: bool = False
+    catches_up: bool = False
     reward_scale: float = 1.0
+    max_grad_norm: float | None = None
 
+    options: ReplayOptions
     optimizers: dict[str, torch.optim.Optimizer]
     frames: Tensor
     updates: Tensor
     slots: Tensor
     owner: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        gamma: float,
-        warmup_frames: int,
-        buffer_size: int,
-        batch_size: int,
-        updates_per_frame: float,
-        augment: bool = False,
-    ) -> None:
-        if batch_size > buffer_size:
-            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
-        if updates_per_frame > 1000.0:
-            raise ValueError(f"updates_per_frame={updates_per_frame}: must be at most 1000")
+    def __init__(self, specs: PAMDPSpecs, device: torch.device | str, options: ReplayOptions) -> None:
         super().__init__(specs)
-        self.gamma = gamma
-        self.warmup_frames = warmup_frames
-        self.batch_size = batch_size
-        self.updates_per_frame = updates_per_frame
-        self.symmetry = RandomSymmetry(specs, device) if augment else None
+        self.options = options
+        augment = specs.symmetries is not None if options.augment == "auto" else options.augment
+        self.symmetry = RandomSymmetry(specs, torch.device(device)) if augment else None
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
         self.register_buffer("slots", specs.parameter_slots, persistent=False)
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(options.buffer_size, device=device))
         self.descent = Descent()
 
     def stateful(self) -> dict[str, Any]:
@@ -90,23 +108,18 @@ class ReplayLearner(Learner):
         if num_steps == 0:
             return {}
         self.store(batch, mask)
-        before = int(self.frames)
-        frames = before + num_steps
+        before, warmup = int(self.frames), self.options.warmup_steps
+        steps = before + num_steps
         self.frames = self.frames + num_steps
-        if frames < self.warmup_frames:
+        if steps < warmup:
             return {}
-        if before < self.warmup_frames and int(self.updates) == 0:  # a learner of an earlier run has started already
+        if before < warmup and int(self.updates) == 0:  # a learner of an earlier run has started already
             self.start()
-        self.explore(frames - self.warmup_frames)
-        return self._make_updates(self.updates_due(before, frames))
-
-    def compile_updates(self) -> None:
-        """Compile what `minimise` does but for the optimizer's step, each loss at the first update that needs it."""
-        self.descent.compile(self.frames.device, any_size=False)
-
-    def lower_precision(self) -> None:
-        """Have the matrix products of what `minimise` does in bfloat16."""
-        self.descent.lower_precision()
+        self.on_progress(steps - warmup)
+        if self.catches_up and before < warmup:
+            before = 0
+        rate = self.options.updates_per_step
+        return self.update(int(steps * rate) - int(before * rate))
 
     def add_demonstrations(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Store the transitions in `mask`, if there are any."""
@@ -119,17 +132,39 @@ class ReplayLearner(Learner):
             return {}
         if int(self.frames) == int(self.updates) == 0:
             self.start()
-        return self._make_updates(num_updates)
-
-    def _make_updates(self, num_updates: int) -> dict[str, float]:
         history: dict[str, list[Tensor]] = {}
-        if num_updates > 0:
-            for sample in self.sample_batches(num_updates):
-                self.updates += 1
-                for name, value in self.train_step(sample).items():
-                    history.setdefault(name, []).append(value.detach())
+        for sample in self.sample_batches(num_updates) if num_updates > 0 else ():
+            self.updates += 1
+            for name, value in self.update_once(sample).items():
+                history.setdefault(name, []).append(value.detach())
         scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
         return {**scalars, "updates": self.updates.item()}
+
+    @abstractmethod
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Make one update from a sample of `sample_batches`; return scalars to log."""
+        raise NotImplementedError
+
+    def gradient_step(self, name: str, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
+        """Take one step of the named optimizer down the gradient of a loss; return the scalars of the loss.
+
+        The loss is compiled, in bfloat16 and its gradient clipped, as the run wants it: see `Descent.step`.
+        """
+        return self.descent.step(self.optimizers[name], loss_of, *inputs, max_grad_norm=self.max_grad_norm)
+
+    def compile_updates(self) -> None:
+        """Compile the gradients of each loss, at the first gradient step that needs it."""
+        self.descent.compile(self.frames.device, any_size=False)
+
+    def lower_precision(self) -> None:
+        """Compute the matrix products of losses and gradients in bfloat16."""
+        self.descent.lower_precision()
+
+    def start(self) -> None:
+        """Prepare for the first update, from the transitions that the warm-up stored."""
+
+    def on_progress(self, steps: int) -> None:
+        """Set what changes with the number of steps after the warm-up, such as exploration and learning rates."""
 
     def is_untrained(self) -> bool:
         """Return whether no update was made."""
@@ -137,14 +172,10 @@ class ReplayLearner(Learner):
 
     def steps_to_update(self) -> dict[str, int]:
         """Return the length of the warm-up and the number of steps for one update."""
-        needed = {"warmup_frames": self.warmup_frames}
-        if self.updates_per_frame > 0.0:
-            needed["updates_per_frame"] = first_multiple(self.updates_per_frame)
+        needed = {"warmup_steps": self.options.warmup_steps}
+        if self.options.updates_per_step > 0.0:
+            needed["updates_per_step"] = first_multiple(self.options.updates_per_step)
         return needed
-
-    def updates_due(self, before: int, frames: int) -> int:
-        """Return how many updates to make when the number of stored steps has risen from `before` to `frames`."""
-        return int(frames * self.updates_per_frame) - int(before * self.updates_per_frame)
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""
@@ -166,7 +197,7 @@ class ReplayLearner(Learner):
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples for `num_batches` updates, each with transitions `[batch_size]`."""
         # One call for all updates: the buffer's overhead is as long as a forward pass.
-        for sample in self.buffer.sample(num_batches * self.batch_size).split(self.batch_size):
+        for sample in self.buffer.sample(num_batches * self.options.batch_size).split(self.options.batch_size):
             if self.stores_own_parameters:
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
             yield self.augmented(sample)
@@ -193,7 +224,7 @@ class ReplayLearner(Learner):
                 "unit": self.specs.to_unit(batch[keys.PARAMETERS]),
                 "reward": self.reward_scale * batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
-                "discount": self.gamma * (~batch["next", keys.TERMINATED]).squeeze(-1).float(),
+                "discount": self.options.gamma * (~batch["next", keys.TERMINATED]).squeeze(-1).float(),
             },
             batch_size=batch.shape,
         )
@@ -235,38 +266,7 @@ class ReplayLearner(Learner):
         """Return which discrete actions may be taken in a sample's states, bool `[B, num_discrete]`; None: all."""
         return self.specs.allowed(sample["state"], sample.get("action_mask", None))
 
-    def start(self) -> None:
-        """Prepare for the first update, from the transitions that the warm-up stored."""
-
-    def explore(self, frames: int) -> None:
-        """Set the policy's exploration for `frames` steps after the warm-up."""
-
-    @abstractmethod
-    def train_step(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Make one update from a sample of `sample_batches`; return scalars to log."""
-        raise NotImplementedError
-
-    def minimise(
-        self, name: str, loss_of: LossFunction, *inputs: Inputs, max_grad_norm: float | None = None
-    ) -> dict[str, Tensor]:
-        """Take one step of the named optimizer down the gradient of a loss, see `Descent.step`; return its scalars."""
-        return self.descent.step(self.optimizers[name], loss_of, *inputs, max_grad_norm=max_grad_norm)
-
-
-def set_learning_rates(
-    optimizers: Mapping[str, torch.optim.Optimizer], rates: Mapping[str, float], fraction: float
-) -> None:
-    """Set the learning rate of each optimizer to a fraction of the rate of the same name."""
-    for name, rate in rates.items():
-        for group in optimizers[name].param_groups:
-            group["lr"] = rate * fraction
-
 
 def first_multiple(updates_per_step: float) -> int:
     """Return the number of steps, or of decisions, at which the first update is due."""
     return math.ceil(1.0 / updates_per_step - 1e-9)
-
-
-def linear_schedule(time: int, over: int, final: float) -> float:
-    """Return a fraction that falls linearly from 1 to `final` within a time `over`, in steps or decisions."""
-    return 1.0 + (final - 1.0) * min(1.0, time / max(1, over))

@@ -1,0 +1,35 @@
+"""How replay learners explore: noise on the parameters, and random actions in the place of some."""
+
+from __future__ import annotations
+
+import torch
+from pydantic import NonNegativeFloat, NonNegativeInt
+from torch import Tensor
+
+from hpamdp.settings import Fraction, Settings
+
+
+class ParameterNoiseOptions(Settings):
+    """Exploration by noise on the parameters."""
+
+    parameter_noise: NonNegativeFloat = 0.1
+    """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
+
+
+class EpsilonOptions(ParameterNoiseOptions):
+    """Exploration by noise on the parameters and by random actions."""
+
+    epsilon_final: Fraction = 0.05
+    """Probability of a random action at the end; it falls linearly from 1 to this value."""
+    epsilon_steps: NonNegativeInt = 40_000
+    """Steps after the warm-up within which the probability of a random action falls."""
+
+
+def with_exploring_noise(unit: Tensor, deviation: float) -> Tensor:
+    """Return parameters in [-1, 1], of any shape, with Gaussian noise of this standard deviation."""
+    return (unit + deviation * torch.randn_like(unit)).clamp(-1.0, 1.0)
+
+
+def linear_schedule(time: int, over: int, final: float) -> float:
+    """Return a fraction that falls linearly from 1 to `final` within a time `over`, in steps or decisions."""
+    return 1.0 + (final - 1.0) * min(1.0, time / max(1, over))
