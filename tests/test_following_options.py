@@ -308,6 +308,6 @@ def test_an_option_is_an_episode_of_the_natural_actor_critic_and_what_follows_be
     agent.learn(two_options(agent, 64))
     agent.learners[1].value = lambda observation: torch.full((len(observation),), 3.0)
     batch = two_options(agent, 64)
-    rows = learner._rows(agent.next_options.with_next_option(batch), batch[keys.OPTION] == 0)
+    rows = learner.rows(agent.next_options.with_next_option(batch), batch[keys.OPTION] == 0)
     assert rows["reward"][:, 0].tolist() == pytest.approx([GAMMA * 3.0] * 64)
     assert rows["done"].all() and rows["terminated"].all()

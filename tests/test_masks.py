@@ -126,7 +126,7 @@ def test_what_a_forbidden_action_is_worth_does_not_change_a_value(name):
     learner = make_learner(name, PAMDPSpecs.from_env(Forbidden(2)))
     observation = torch.eye(NUM_DISCRETE)
     if name == "qpamdp":
-        learner._warm_up(torch.rand(10, NUM_DISCRETE))
+        learner.warm_up(torch.rand(10, NUM_DISCRETE))
         learner.policy.w.normal_()
     mask = torch.arange(NUM_DISCRETE).expand(3, -1) != 1
 

@@ -333,7 +333,7 @@ def test_the_regression_is_least_squares_on_whole_episodes_across_batches():
         batch["next", keys.DONE] = done[:, 3 * i : 3 * i + 3].unsqueeze(-1)
         learner.learn(batch, torch.ones(40, 3, dtype=torch.bool))
     x, y = [], []
-    rows = learner._rows(torch.cat(batches, 1), torch.ones(40, 18, dtype=torch.bool))
+    rows = learner.rows(torch.cat(batches, 1), torch.ones(40, 18, dtype=torch.bool))
     for env in range(40):
         start = 0 if env % 2 == 0 else None
         for end in done[env].nonzero().flatten().tolist():

@@ -445,9 +445,9 @@ class QPAMDP(Learner):
         batch = batch.reshape(-1, batch.shape[-1])
         mask = mask.reshape(-1, mask.shape[-1])
         if self.frames < self.options.warmup_steps:
-            self._warm_up(batch[keys.OBSERVATION][mask])
+            self.warm_up(batch[keys.OBSERVATION][mask])
             return {}
-        rows = self._rows(batch, mask)
+        rows = self.rows(batch, mask)
         num_episodes = (rows["done"] & rows["mask"]).sum()
         self.window_return += (rows["reward"] * rows["mask"]).sum()
         self.window_episodes += num_episodes
@@ -517,7 +517,7 @@ class QPAMDP(Learner):
         self.window_return.zero_()
         self.window_episodes.zero_()
 
-    def _warm_up(self, observation: Tensor) -> None:
+    def warm_up(self, observation: Tensor) -> None:
         """Extend the ranges by observations `[N, observation_dim]`; fit the bases once there are enough."""
         self.frames += len(observation)
         self.low = torch.cat([observation, self.low.unsqueeze(0)]).amin(0)
@@ -540,7 +540,7 @@ class QPAMDP(Learner):
         logits = masked_logits(q / self.policy.temperature, self.specs.allowed(observation, action_mask))
         return (logits.softmax(-1) * q).sum(-1)
 
-    def _rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
+    def rows(self, batch: TensorDictBase, mask: Tensor) -> TensorDict:
         """Return what the phase's update needs of a batch `[N, T]`.
 
         A step with which an option ends inside its episode is `terminated` and `done`, and its reward includes the

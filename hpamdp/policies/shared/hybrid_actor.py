@@ -19,6 +19,9 @@ from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts
 from hpamdp.specs import PAMDPSpecs
 
+# The raw sample of the parameters, which a learner needs for its likelihood.
+RAW = "raw_parameters"
+
 
 class HybridDistribution(NamedTuple):
     """A categorical over the discrete actions and a Gaussian for all their parameters.
@@ -166,22 +169,40 @@ class HybridActor(nn.Module):
 
 
 class HybridPolicy(TensorDictModuleBase):
-    """Samples the action from the actor, or takes the most probable one when greedy."""
+    """Samples the action from the actor, or takes the most probable one when greedy.
 
-    def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
+    Args:
+        actor: gives the distribution.
+        specs: sizes and bounds of the problem.
+        writes_raw: whether to write the raw sample of the parameters as `RAW`, too.
+        samples_when_greedy: whether to sample greedy discrete actions as well; their parameters are the means.
+    """
+
+    def __init__(
+        self, actor: HybridActor, specs: PAMDPSpecs, *, writes_raw: bool = False, samples_when_greedy: bool = False
+    ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *([RAW] if writes_raw else [])]
         self.actor = actor
         self.specs = specs
+        self.writes_raw = writes_raw
+        self.samples_when_greedy = samples_when_greedy
 
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
+        """Write the discrete action `[*B]`, the parameters and maybe their raw sample, `[*B, num_parameters]` each."""
         observation = td.get(keys.OBSERVATION)
         allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(observation, allowed)
-        discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
+        if not is_greedy():
+            discrete, raw = distribution.sample()
+        elif self.samples_when_greedy:
+            discrete, raw = distribution.sample_discrete()
+        else:
+            discrete, raw = distribution.mode()
+        if self.writes_raw:
+            td.set(RAW, raw)
         parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -99,28 +99,13 @@ class OnPolicy(nn.Module):
         self.waiting = []
         return gathered
 
-    def make_passes(
-        self, rows: TensorDict, update: Callable[[Mapping[str, Tensor]], dict[str, Tensor]]
-    ) -> dict[str, float]:
-        """Normalise `advantage` over the gathered rows, then make `epochs` passes over them in random minibatches.
-
-        Args:
-            rows: `[M]`, with `advantage` `[M]`.
-            update: makes one optimisation step from a minibatch and returns scalars.
-
-        Returns:
-            The scalars, averaged over the optimisation steps.
-        """
-        advantage = rows["advantage"]
-        rows["advantage"] = (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
-        num_minibatches = len(rows) // self.options.minibatch_size
+    def minibatches(self, rows: TensorDict) -> Iterator[dict[str, Tensor]]:
+        """Yield random minibatches of the gathered rows `[M]`, in `epochs` passes over them."""
         columns = dict(rows.items())
-        scalars: list[dict[str, Tensor]] = []
         for _ in range(self.options.epochs):
             order = torch.randperm(len(rows), device=rows.device)
-            for indices in order.tensor_split(num_minibatches):
-                scalars.append(update({name: column.index_select(0, indices) for name, column in columns.items()}))
-        return {name: torch.stack([step[name] for step in scalars]).mean().item() for name in scalars[0]}
+            for indices in order.tensor_split(len(rows) // self.options.minibatch_size):
+                yield {name: column.index_select(0, indices) for name, column in columns.items()}
 
     def surrogate(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
         """Return the clipped surrogate `[B]` of one policy head from its log-ratios and the advantages, each `[B]`."""
@@ -128,6 +113,16 @@ class OnPolicy(nn.Module):
         clipped_ratio = ratio.clamp(1.0 - self.options.clip, 1.0 + self.options.clip)
         return torch.minimum(ratio * advantage, clipped_ratio * advantage)
 
-    def minimise(self, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
+    def gradient_step(self, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
         """Take one step of the optimizer down the gradient of a loss, see `Descent.step`; return its scalars."""
         return self.descent.step(self.optimizer, loss_of, *inputs, max_grad_norm=self.options.max_grad_norm)
+
+
+def normalised(advantage: Tensor) -> Tensor:
+    """Return advantages `[M]` with mean 0 and standard deviation 1."""
+    return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-6)
+
+
+def mean_scalars(steps: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
+    """Return the scalars of optimization steps, averaged over the steps."""
+    return {name: torch.stack([step[name] for step in steps]).mean().item() for name in steps[0]}
