@@ -385,12 +385,13 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
         scheme, _, folder = str(path).rpartition("://")
         if scheme in ("", "file") and not Path(folder).is_dir():
             raise ConfigError(f"hydra.searchpath={path}: there is no such folder")
-    recipe = names.get(RECIPE)
-    is_said = any(word.startswith(f"{RECIPE}=") for word in _words_of(node))
-    if recipe is None or (recipe == f"{names['env']}_{names['low']}" and not is_said):
-        return
-    if recipe not in names_of(RECIPE):
-        raise ConfigError(f"{RECIPE}={recipe}: {no_such(f'file in conf/{RECIPE}', recipe, names_of(RECIPE))}")
+    for group, level in ((RECIPE, "low"), (f"{RECIPE}/high", "high")):
+        recipe = names.get(group)
+        is_said = any(word.startswith(f"{group}=") for word in _words_of(node))
+        if recipe is None or (recipe == f"{names['env']}_{names[level]}" and not is_said):
+            continue
+        if recipe not in names_of(group):
+            raise ConfigError(f"{group}={recipe}: {no_such(f'file in conf/{group}', recipe, names_of(group))}")
 
 
 def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:

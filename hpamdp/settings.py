@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, PositiveInt, Strict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt, Strict
 from typing_extensions import Self
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -40,6 +40,7 @@ def _check_rate(rate: float) -> float:
 LearningRate = Annotated[float, AfterValidator(_check_rate)]
 # A tuple, so that the model cannot change; from Python a list will do.
 Widths = Annotated[tuple[PositiveInt, ...], Strict(False)]
+Indices = Annotated[tuple[NonNegativeInt, ...], Strict(False)]
 
 
 class Settings(BaseModel):

@@ -12,7 +12,7 @@ from hpamdp.policies.high_level.epsilon_greedy import EpsilonGreedy
 from hpamdp.policies.high_level.exp3 import PROBABILITY, Exp3
 from hpamdp.policies.high_level.thompson import Thompson
 from hpamdp.policies.high_level.ucb import UCB
-from hpamdp.policies.shared.bandit import Bandit, RewardStatistics
+from hpamdp.policies.shared.bandit import Bandit, BanditOptions, RewardStatistics
 
 MEMORIES = ("all", "discounted", "sliding_window")
 BANDITS = {
@@ -39,7 +39,7 @@ def share_of_right(options: torch.Tensor) -> float:
 
 
 def test_with_memory_all_every_reward_has_the_same_weight():
-    statistics = RewardStatistics(2, "all", 0.9, 3)
+    statistics = RewardStatistics(2, BanditOptions(memory="all", discount=0.9, window=3))
     for option, reward in ((0, 1.0), (1, 2.5), (0, 2.0), (0, 3.0)):
         statistics.add(torch.tensor([option]), torch.tensor([reward]))
     assert statistics.counts.tolist() == [3, 1] and statistics.means.tolist() == [2.0, 2.5]
@@ -50,7 +50,7 @@ def test_with_memory_all_every_reward_has_the_same_weight():
 @pytest.mark.parametrize("at_once", [1, 2, 3, 6])
 def test_discounted_rewards_are_weighted_by_their_age_in_decisions(at_once):
     options, rewards = torch.tensor([0, 1, 0, 0, 1, 0]), torch.tensor([1.0, 2.0, -3.0, 4.0, 5.0, -6.0])
-    statistics = RewardStatistics(2, "discounted", 0.9, 3)
+    statistics = RewardStatistics(2, BanditOptions(memory="discounted", discount=0.9, window=3))
     for some_options, some_rewards in zip(options.split(at_once), rewards.split(at_once), strict=True):
         statistics.add(some_options, some_rewards)
     weights = 0.9 ** torch.arange(5, -1, -1).double()
@@ -63,7 +63,7 @@ def test_discounted_rewards_are_weighted_by_their_age_in_decisions(at_once):
 
 @pytest.mark.parametrize("at_once", [1, 2, 3, 6])
 def test_a_sliding_window_holds_only_the_last_decisions(at_once):
-    statistics = RewardStatistics(2, "sliding_window", 0.9, 4)
+    statistics = RewardStatistics(2, BanditOptions(memory="sliding_window", discount=0.9, window=4))
     options, rewards = torch.tensor([0, 0, 1, 1, 0, 0]), torch.tensor([9.0, 9.0, 1.0, 2.0, 3.0, 5.0])
     for some_options, some_rewards in zip(options.split(at_once), rewards.split(at_once), strict=True):
         statistics.add(some_options, some_rewards)
@@ -71,7 +71,7 @@ def test_a_sliding_window_holds_only_the_last_decisions(at_once):
 
 
 def test_an_option_that_left_the_window_is_untried_again():
-    statistics = RewardStatistics(2, "sliding_window", 0.9, 2)
+    statistics = RewardStatistics(2, BanditOptions(memory="sliding_window", discount=0.9, window=2))
     statistics.add(torch.tensor([1, 0, 0]), torch.tensor([5.0, -1.0, -1.0]))
     assert statistics.is_untried.tolist() == [False, True] and statistics.best() == 0
 
@@ -159,14 +159,13 @@ def test_ucb_counts_choices_whose_rewards_are_not_yet_known():
 
 
 def test_ucb1_chooses_by_its_formula():
-    ucb = make("ucb")
     rewards = [1.0, 2.0, 3.0, 1.2]
-    ucb.learn(paid([0, 0, 0, 1], rewards))
     # Means 2 and 1.2 at decision 5: `even` is the factor for which the bounds from 3 rewards and from 1 are equal.
     deviation = torch.tensor(rewards).std(correction=0).item()
     even = (2.0 - 1.2) / (deviation * math.sqrt(2 * math.log(5)) * (1 - 1 / math.sqrt(3)))
     for factor, chosen in ((0.99, 0), (1.01, 1)):
-        ucb.exploration = factor * even
+        ucb = make("ucb", exploration=factor * even)
+        ucb.learn(paid([0, 0, 0, 1], rewards))
         assert ucb.select(due(1)).item() == chosen
 
 

@@ -12,6 +12,7 @@ from pydantic import Field, PositiveInt
 
 from hpamdp import config as config_module
 from hpamdp.config import GROUPS, ConfigError, component, load_class, read
+from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.low_level.random import Random
 from hpamdp.run.train import run
 from hpamdp.saved_config import read_saved
@@ -168,6 +169,7 @@ def test_an_argument_with_the_name_of_a_value_of_the_run_is_refused_in_one_line(
     [
         (["recipe=goal_pdqm"], "recipe=goal_pdqm: no such file in conf/recipe; did you mean goal_pdqn? It has "),
         (["recipe=boatdock_hyar"], "recipe=boatdock_hyar: no such file in conf/recipe; did you mean "),
+        (["recipe/high=boatdock_uc"], "recipe/high=boatdock_uc: no such file in conf/recipe/high; did you mean boatdock_ucb?"),
         (["hydra.searchpath=[/nowhere]"], "hydra.searchpath=/nowhere: there is no such folder"),
     ],
 )
@@ -332,9 +334,17 @@ def test_a_learner_gets_what_it_needs_on_a_problem_and_the_command_line_has_the_
     assert make_config(["low=dlpa"]).low.options["horizon"] != 6
 
 
-def test_every_recipe_is_of_a_problem_and_a_learner():
-    pairs = {f"{env}_{low}" for env in choices("env") for low in choices("low")}
-    assert {file.stem for file in CONF.glob("recipe/*.yaml")} <= pairs
+def test_a_selector_gets_what_it_needs_on_a_problem():
+    assert make_config(["high=ucb"]).high.options["exploration"] == 4.0
+    assert make_config(["high=ucb", "high.exploration=1.0"]).high.options["exploration"] == 1.0
+    assert make_config(["env=rooms", "high=ucb"]).high.options["exploration"] == UCB.Options().exploration
+    assert make_config(["env=rooms", "high=fixed", "recipe/high=boatdock_fixed"]).high.options["option"] == "congruent"
+
+
+@pytest.mark.parametrize(("group", "folder"), [("low", "recipe"), ("high", "recipe/high")])
+def test_every_recipe_is_of_a_problem_and_a_learner_or_a_selector(group, folder):
+    pairs = {f"{env}_{name}" for env in choices("env") for name in choices(group)}
+    assert {file.stem for file in CONF.glob(f"{folder}/*.yaml")} <= pairs
 
 
 def test_cuda_is_refused_in_one_line_where_there_is_none(monkeypatch):

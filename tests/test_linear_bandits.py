@@ -11,7 +11,7 @@ from hpamdp import keys
 from hpamdp.config import ConfigError, component
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
-from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit
+from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit, LinearBanditOptions
 from hpamdp.specs import PAMDPSpecs
 
 MEMORIES = ("all", "discounted", "sliding_window")
@@ -58,7 +58,7 @@ def test_polynomial_features_are_all_monomials_up_to_the_degree(num_inputs, degr
     observation = torch.randn(7, num_inputs).double()
     powers = [p for p in itertools.product(range(degree + 1), repeat=num_inputs) if sum(p) <= degree]
     expected = torch.stack([(observation ** torch.tensor(p)).prod(-1) for p in powers], -1)
-    features = ContextFeatures(wide(num_inputs), None, "polynomial", degree)
+    features = ContextFeatures(wide(num_inputs), LinearBanditOptions(features="polynomial", degree=degree))
     found = features(observation)
     assert features.num_features == len(powers) == found.shape[-1]
     torch.testing.assert_close(found[0].sort().values, expected[0].sort().values)
@@ -67,9 +67,9 @@ def test_polynomial_features_are_all_monomials_up_to_the_degree(num_inputs, degr
 
 def test_random_fourier_features_approximate_the_gaussian_kernel_and_are_the_same_in_every_run():
     torch.manual_seed(0)
-    first = ContextFeatures(wide(3), None, "random_fourier", 200)
+    first = ContextFeatures(wide(3), LinearBanditOptions(features="random_fourier", degree=200))
     torch.manual_seed(1)
-    second = ContextFeatures(wide(3), None, "random_fourier", 200)
+    second = ContextFeatures(wide(3), LinearBanditOptions(features="random_fourier", degree=200))
     x, y = torch.zeros(1, 3), torch.tensor([[0.6, 0.0, 0.0]])
     assert torch.equal(first(x), second(x)) and first(x).shape == (1, 201) and first(x)[0, -1] == 1.0
     # Twice the mean product of two cosines approximates the Gaussian kernel exp(-|x - y|^2 / 2).
@@ -78,7 +78,7 @@ def test_random_fourier_features_approximate_the_gaussian_kernel_and_are_the_sam
 
 
 def test_features_use_only_the_inputs():
-    features = ContextFeatures(wide(4), [2, 0], "polynomial", 1)
+    features = ContextFeatures(wide(4), LinearBanditOptions(inputs=[2, 0]))
     assert features(torch.tensor([5.0, 6.0, 7.0, 8.0])).tolist() == [7.0, 5.0, 1.0]
 
 

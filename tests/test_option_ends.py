@@ -183,7 +183,7 @@ def test_the_targets_of_the_option_critic_equal_those_by_hand(decides):
 
 
 def test_ends_that_are_sure_and_wrong_are_learned_anew():
-    critic = make_critic()
+    critic = make_critic(deliberation_cost=0.01)
     with torch.no_grad():
         critic.critic[-1].weight.zero_()
         critic.critic[-1].bias.copy_(torch.tensor([0.0, 0.2]))  # so that option 0 has to end, and option 1 has not
@@ -197,7 +197,6 @@ def test_ends_that_are_sure_and_wrong_are_learned_anew():
         },
         [64],
     )
-    critic.deliberation_cost = 0.01
     for _ in range(1000):
         critic._update_termination(rows)
     beta = critic._beta(rows["next_state"], rows["option"], None)

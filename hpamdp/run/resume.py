@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,7 @@ def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, whe
     choices = choices_of(saved)
     changes = [word for word in overrides if _key(word) not in GROUPS or _choice(word) != choices[_key(word)]]
     for word in changes:
-        if _key(word).split(".")[0] in _AGENT:
+        if re.split(r"[./]", _key(word))[0] in _AGENT:
             raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")
     return changes
 

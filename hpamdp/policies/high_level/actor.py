@@ -5,15 +5,15 @@ options; clipped surrogate: Schulman et al. 2017, *Proximal Policy Optimization 
 equation 7.
 
 Differs from the sources:
-- options end where the environment or a fixed length says so; their ends are not learned;
-- decisions with uniform options are weighted by the policy's probability over the uniform one, and the clip is around
-  the policy that they were made beside (the decoupled objective of Hilton, Cobbe and Schulman 2021, *Batch
+- the environment or a fixed length ends options; the ends are not learned;
+- decisions with uniform options are weighted by the ratio of the policy's probability to the uniform one. The clip is
+  around the policy at the time of the decision (the decoupled objective of Hilton, Cobbe and Schulman 2021, *Batch
   size-invariance for policy optimization*, arXiv 2110.00641);
-- the advantage is the option's return, bootstrapped if its episode goes on, minus a learned value of the state; an
-  episode that a time limit ends does not go on.
+- the advantage is the option's return minus a learned value of the state. It bootstraps if the episode goes on, but not
+  past a time limit.
 
-TorchRL's `ClipPPOLoss` computes the same loss and gradients, but wants both networks wrapped as tensordict modules and
-takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 times for 256), and H-PPO needs
+TorchRL's `ClipPPOLoss` computes the same loss and gradients. It needs both networks wrapped as tensordict modules and
+takes 1.3 times as long for an update of 1,024 decisions on one CPU core (1.6 times for 256). H-PPO needs
 `OnPolicy.surrogate` anyway, to clip the ratios of two policies separately.
 """
 
@@ -36,9 +36,9 @@ from hpamdp.settings import PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 # Of the held option at its decision, float32 [*B] each.
-LOG_PROB = "option_log_prob"  # by the policy, also where the option was chosen uniformly
-WEIGHT = "option_weight"  # its probability by the policy over the one with which it was chosen
-ALLOWED = "option_allowed"  # the options that could be chosen there, bool [*B, num_options], if not always all of them
+LOG_PROB = "option_log_prob"  # by the policy, also if the option was chosen uniformly
+WEIGHT = "option_weight"  # ratio of its probability by the policy to the probability with which it was chosen
+ALLOWED = "option_allowed"  # the options that were allowed, bool [*B, num_options], if the problem has an option mask
 
 
 class ActorOptions(OnPolicyOptions):
@@ -46,11 +46,11 @@ class ActorOptions(OnPolicyOptions):
 
     hidden_dims: Widths = (128, 128)
     """Hidden layers of the policy and of the value network."""
-    gamma: PositiveFraction = 1.0
+    gamma: PositiveFraction = 0.99
     """Discount of an environment step, both within an option's return and for the value of the next decision."""
     epochs: Annotated[int, Field(ge=1, le=1000)] = 4
     """Passes over the collected decisions in an update."""
-    minibatch_size: PositiveInt = 256
+    minibatch_size: PositiveInt = 64
     """Decisions in an optimisation step, and the least number of decisions that an update waits for."""
     entropy: NonNegativeFloat = 0.1
     """Weight of the entropy bonus. With 0.02 the policy settles on the option whose learner improves first."""

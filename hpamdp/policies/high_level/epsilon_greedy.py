@@ -8,45 +8,37 @@ Forgetting: see `RewardStatistics`.
 from __future__ import annotations
 
 import torch
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveFloat
 from torch import Tensor
 
 from hpamdp.policies.masks import random_choice
-from hpamdp.policies.shared.bandit import Bandit, Discount, Memory
+from hpamdp.policies.shared.bandit import Bandit, BanditOptions
 from hpamdp.settings import Fraction
-from hpamdp.specs import PAMDPSpecs
+
+
+class EpsilonGreedyOptions(BanditOptions):
+    """Settings of `EpsilonGreedy`."""
+
+    epsilon_scale: PositiveFloat = 100.0
+    """The probability of a random option is `epsilon_scale` / t at decision t of its own, at most 1."""
+    epsilon_final: Fraction = 0.1
+    """Lower bound of that probability; 0 suits stationary rewards."""
 
 
 class EpsilonGreedy(Bandit):
     """Choose a random option with probability epsilon(t), else the option with the highest mean reward.
 
-    Args:
-        specs: of the problem.
-        epsilon_scale: epsilon(t) = epsilon_scale / t at decision t, clipped to [`epsilon_final`, 1]; t counts the
-            decisions that were made, whether or not their rewards are known.
-        epsilon_final: lower bound of epsilon(t); 0 suits stationary rewards.
-        memory, discount, window: which rewards count, as in `RewardStatistics`.
+    t counts the decisions that were made, whether or not their rewards are known.
     """
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        epsilon_scale: PositiveFloat,
-        epsilon_final: Fraction,
-        memory: Memory,
-        discount: Discount,
-        window: PositiveInt,
-    ) -> None:
-        super().__init__(specs, memory, discount, window)
-        self.epsilon_scale = epsilon_scale
-        self.epsilon_final = epsilon_final
+    Options = EpsilonGreedyOptions
+    options: EpsilonGreedyOptions
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
-        """Return `num` choices; all are random as long as an allowed option is untried."""
+        """Return `num` choices. All are random until every allowed option has been tried."""
         device = self.statistics.counts.device
         time = self.num_decisions + self.pending.sum() + torch.arange(1, num + 1, device=device)
-        epsilon = (self.epsilon_scale / time.float()).clamp(self.epsilon_final, 1.0)
+        epsilon = (self.options.epsilon_scale / time.float()).clamp(self.options.epsilon_final, 1.0)
         is_random = torch.rand(num, device=device, dtype=torch.float32) < epsilon
         mask = None if allowed is None else allowed.expand(num, -1)
         anything = random_choice(torch.Size([num]), self.specs.num_options, mask, device)

@@ -5,55 +5,48 @@ Source: Auer, Cesa-Bianchi, Freund and Schapire 2002, *The nonstochastic multiar
 Differs from the source:
 - rewards are scaled to [0, 1] by the range seen so far;
 - gains may be discounted or limited to a window (see `RewardStatistics`), whereas Exp3.S mixes the weights;
-- many decisions are due at the same time; each reward is weighted by the probability its option was chosen with.
+- many decisions are due at the same time; each reward is divided by the probability of its choice.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import Bandit, Discount, Memory, RewardStatistics
+from hpamdp.policies.shared.bandit import Bandit, BanditOptions, RewardStatistics
 from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 PROBABILITY = "option_probability"  # of the held option at its decision, float32 [*B]
 
 
+class Exp3Options(BanditOptions):
+    """Settings of `Exp3`."""
+
+    exploration: PositiveFraction = 0.1
+    """Gamma of the source: the probability of a uniform choice, and the scale of the gains."""
+
+
 class Exp3(Bandit):
-    """Choose with probability (1 - exploration) softmax(exploration / K x gains) + exploration / K, for K options.
+    """Choose with probability (1 - exploration) softmax(exploration / K x gains) + exploration / K, for K options."""
 
-    Args:
-        specs: of the problem.
-        exploration: gamma of the source: the fraction of uniform choices, and the scale of the gains.
-        memory, discount, window: which rewards count, as in `RewardStatistics`.
-    """
-
+    Options = Exp3Options
+    options: Exp3Options
     modes: ClassVar[tuple[str, ...]] = ("train",)
 
     low: Tensor
     high: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        exploration: PositiveFraction,
-        memory: Memory,
-        discount: Discount,
-        window: PositiveInt,
-    ) -> None:
-        super().__init__(specs, memory, discount, window)
+    def __init__(self, specs: PAMDPSpecs, options: Exp3Options | None = None, **settings: Any) -> None:
+        super().__init__(specs, options, **settings)
         self.out_keys = [*self.out_keys, PROBABILITY]
-        self.exploration = exploration
-        # Of the scaled rewards over their probabilities, where `statistics` has the rewards themselves.
-        self.gains = RewardStatistics(specs.num_options, memory, discount, window)
+        # `statistics` holds the rewards, `gains` the scaled rewards divided by their probabilities.
+        self.gains = RewardStatistics(specs.num_options, self.options)
         self.register_buffer("low", torch.tensor(torch.inf, dtype=torch.float64))
         self.register_buffer("high", torch.tensor(-torch.inf, dtype=torch.float64))
 
@@ -61,11 +54,12 @@ class Exp3(Bandit):
     def probabilities(self) -> Tensor:
         """Probabilities of an exploring choice, `[num_options]`."""
         num = self.specs.num_options
-        weights = (self.exploration / num * self.gains.sums).softmax(0)
-        return (1.0 - self.exploration) * weights + self.exploration / num
+        exploration = self.options.exploration
+        weights = (exploration / num * self.gains.sums).softmax(0)
+        return (1.0 - exploration) * weights + exploration / num
 
     def best(self, allowed: Tensor | None = None) -> int:
-        """Return the option with the largest weight, among the allowed ones."""
+        """Return the allowed option with the largest weight."""
         return int(masked_values(self.gains.sums, allowed).argmax())
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
@@ -76,7 +70,7 @@ class Exp3(Bandit):
         return probabilities.multinomial(num, replacement=True)
 
     def choose(self, td: TensorDictBase) -> dict[str, Tensor]:
-        """Return the options and the probabilities they were chosen with, `[*B]` each."""
+        """Return options and their probabilities, `[*B]` each."""
         option = self.select(td)
         probability = self.probabilities.float()[option]
         mask = td.get(keys.OPTION_MASK, None)
@@ -97,7 +91,7 @@ class Exp3(Bandit):
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Add the importance-weighted rewards of finished decisions to the gains.
 
-        Return each option's mean reward, unweighted, and its probability.
+        Return each option's unweighted mean reward and its probability.
         """
         scalars = super().learn(decisions)
         rewards = decisions.get(("next", keys.OPTION_RETURN)).squeeze(-1).double()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -9,22 +11,30 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import allowed_or_first
+from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
 
 
-class Fixed(Selector):
-    """Choose the same option at every decision; the first allowed one where it is forbidden.
+class FixedOptions(Settings):
+    """Settings of `Fixed`."""
 
-    Args:
-        specs: of the problem.
-        option: name or number of the option.
+    option: str | int = 0
+    """Name or number of the option."""
+
+
+class Fixed(Selector):
+    """Choose the same option at every decision; if it is forbidden, the first allowed one.
 
     Raises:
         ValueError: the problem has no such option.
     """
 
-    def __init__(self, specs: PAMDPSpecs, *, option: str | int) -> None:
+    Options = FixedOptions
+
+    def __init__(self, specs: PAMDPSpecs, options: FixedOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)
+        self.options: FixedOptions = FixedOptions.of(options, settings)
+        option = self.options.option
         names = specs.option_names
         if option not in names and option not in range(specs.num_options):
             raise ValueError(f"option={option}: no such option; there are {', '.join(names)}")

@@ -20,9 +20,9 @@ from hpamdp.policies.shared.linear_bandit import LinearBandit
 class LinThompson(LinearBandit):
     """Choose the option with the highest sample from the posterior distributions of the expected rewards.
 
-    `exploration` is the factor of the posteriors' standard deviation, v in the source; 1 is Bayesian.
+    `exploration` is v in the source; 1 is Bayesian.
     """
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return samples of the expected rewards."""
-        return mean + self.exploration * deviation * torch.randn_like(mean)
+        return mean + self.options.exploration * deviation * torch.randn_like(mean)

@@ -11,17 +11,24 @@ Differs from the sources:
 
 from __future__ import annotations
 
+from pydantic import PositiveFloat
 from torch import Tensor
 
-from hpamdp.policies.shared.linear_bandit import LinearBandit
+from hpamdp.policies.shared.linear_bandit import LinearBandit, LinearBanditOptions
+
+
+class LinUCBOptions(LinearBanditOptions):
+    """Settings of `LinUCB`."""
+
+    exploration: PositiveFloat = 2.0
+    """Width of the bounds, in standard deviations of the prediction; alpha in the source."""
 
 
 class LinUCB(LinearBandit):
-    """Choose the option with the highest expected reward + exploration x its standard deviation.
+    """Choose the option with the highest expected reward + exploration x its standard deviation."""
 
-    `exploration` is the factor of the width, alpha in the source.
-    """
+    Options = LinUCBOptions
 
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
         """Return the upper confidence bounds."""
-        return mean + self.exploration * deviation
+        return mean + self.options.exploration * deviation

@@ -3,14 +3,14 @@
 Source: Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section 3.2. Exploration by the upper confidence
 bounds of an ensemble: Chen, Sidor, Abbeel and Schulman 2017, arXiv 1706.01502.
 
-Where the selector decides when options end, an option is interrupted as soon as another one is worth more (section 4 of
-the first source).
+If the selector decides when options end, it interrupts an option as soon as another one is worth more (section 4 of the
+first source).
 
-Differs from the sources: where a time limit ends an episode, nothing follows; exploring, options are also interrupted
-at random, with the probability of a random option.
-
-Differs from Chen et al.: which decisions a member of the ensemble learns from is drawn anew at every update, not once
-for each decision, and all members share one target, the mean of the target members.
+Differs from the sources:
+- values do not bootstrap past the end of an episode, also if a time limit ended it;
+- while exploring, options are also interrupted at random, with the probability of a random option;
+- which decisions a member of the ensemble learns from is drawn anew at every update, not once for each decision;
+- all members share one target, the mean of the target members.
 """
 
 from __future__ import annotations
@@ -30,73 +30,53 @@ from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.exported_policy import exported_ensemble
 from hpamdp.policies.shared.networks import EnsembleMLP, polyak_update
+from hpamdp.policies.shared.option_values import OptionValueOptions
 from hpamdp.policies.shared.replay import first_multiple
-from hpamdp.settings import Fraction, LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 
+class MetaCriticOptions(OptionValueOptions):
+    """Settings of `MetaCritic`; an update learns from stored decisions."""
+
+    num_members: PositiveInt = 3
+    """Number of critics in the ensemble."""
+    exploration: Literal["epsilon", "ucb"] = "epsilon"
+    """A random option with a decaying probability, or the option with the highest upper confidence bound."""
+    epsilon_decisions: NonNegativeInt = 1000
+    """Decisions after the warm-up over which the probability of a random option falls from 1 to `epsilon_final`."""
+    ucb_width: NonNegativeFloat = 2.0
+    """Width of the upper confidence bound, in standard deviations over the critics."""
+    updates_per_decision: PositiveFloat = 0.5
+    """Updates for each finished decision; with `mode=offline`, `offline.updates` counts them instead."""
+    warmup_decisions: NonNegativeInt = 100
+    """Decisions with random options before the first update, without those of a data set."""
+
+
 class MetaCritic(Selector):
-    """Choose the option with the highest mean Q of an ensemble.
+    """Choose the option with the highest mean Q of an ensemble."""
 
-    Args:
-        specs: of the problem.
-        device: where the networks live.
-        hidden_dims, num_members: of the ensemble.
-        exploration: `epsilon`: a random option with a probability that falls linearly from 1 to `epsilon_final` over
-            the `epsilon_decisions` decisions that end after the warm-up. `ucb`: the highest mean + `ucb_width` x
-            standard deviation over the members.
-        epsilon_final, epsilon_decisions, ucb_width: see `exploration`.
-        gamma: discount of an environment step, of the options' returns and of what follows them.
-        buffer_size: decisions that are stored. Returns change while the learners improve, so old ones mislead.
-        batch_size: decisions in an update.
-        updates_per_decision, max_updates: updates for each finished decision, and at most in one call of `learn`.
-        warmup_decisions: decisions with random options before the first update; those of a data set do not count.
-        lr: learning rate of Adam.
-        tau: step of the target critics towards the learned ones after each update.
-    """
-
+    Options = MetaCriticOptions
     ends_options: ClassVar[bool] = True
     num_decisions: Tensor
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: list[PositiveInt],
-        num_members: PositiveInt,
-        exploration: Literal["epsilon", "ucb"],
-        epsilon_final: Fraction,
-        epsilon_decisions: NonNegativeInt,
-        ucb_width: NonNegativeFloat,
-        gamma: PositiveFraction,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_decision: PositiveFloat,
-        max_updates: PositiveInt,
-        warmup_decisions: NonNegativeInt,
-        lr: LearningRate,
-        tau: PositiveFraction,
+        device: torch.device | str = "cpu",
+        options: MetaCriticOptions | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__(specs)
-        self.gamma = gamma
-        self.exploration = exploration
-        self.epsilon_final = epsilon_final
-        self.epsilon_decisions = epsilon_decisions
-        self.ucb_width = ucb_width
-        if batch_size > buffer_size:
-            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
-        self.batch_size = batch_size
-        self.updates_per_decision = updates_per_decision
-        self.max_updates = max_updates
-        self.warmup_decisions = warmup_decisions
-        self.tau = tau
-        self.critics = EnsembleMLP(num_members, specs.observation_dim, hidden_dims, specs.num_options)
+        self.options: MetaCriticOptions = MetaCriticOptions.of(options, settings)
+        self.gamma = self.options.gamma
+        self.critics = EnsembleMLP(
+            self.options.num_members, specs.observation_dim, self.options.hidden_dims, specs.num_options
+        )
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
         self.to(device)
-        self.optimizer = torch.optim.Adam(self.critics.parameters(), lr=lr, fused=True)
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+        self.optimizer = torch.optim.Adam(self.critics.parameters(), lr=self.options.lr, fused=True)
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(self.options.buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizer and the replay buffer."""
@@ -107,18 +87,18 @@ class MetaCritic(Selector):
         return {"buffer": self._rows(batch.flatten())}
 
     def exported(self) -> dict[str, Any]:
-        """Return the critics: see `hpamdp.policies.shared.exported_policy`."""
+        """Return the critics, see `hpamdp.policies.shared.exported_policy`."""
         return exported_ensemble(self.critics)
 
     @property
     def epsilon(self) -> float:
         """Probability of a random option."""
-        decisions_after_warmup = int(self.num_decisions) - self.warmup_decisions
+        decisions_after_warmup = int(self.num_decisions) - self.options.warmup_decisions
         if decisions_after_warmup < 0:
             return 1.0
-        if self.exploration == "ucb":
+        if self.options.exploration == "ucb":
             return 0.0
-        return linear_schedule(decisions_after_warmup, self.epsilon_decisions, self.epsilon_final)
+        return linear_schedule(decisions_after_warmup, self.options.epsilon_decisions, self.options.epsilon_final)
 
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:
@@ -128,8 +108,8 @@ class MetaCritic(Selector):
         q = self.critics(observation.flatten(0, -2))
         value = q.mean(0)
         if not is_greedy():
-            if self.exploration == "ucb":
-                value = value + self.ucb_width * q.std(0, correction=0)
+            if self.options.exploration == "ucb":
+                value = value + self.options.ucb_width * q.std(0, correction=0)
             is_random = torch.rand_like(value[:, :1]) < self.epsilon
             value = torch.where(is_random, torch.rand_like(value), value)
         value = masked_values(value, None if mask is None else mask.flatten(0, -2))
@@ -139,19 +119,19 @@ class MetaCritic(Selector):
     def ends(self, td: TensorDictBase) -> Tensor:
         """Return where another option is worth more than the held one, bool `[*B]`; exploring, also at random.
 
-        Otherwise an option that is believed to be the best one would leave no steps to the others.
+        If the option with the highest Q never ended, the other options would collect no data.
         """
         value = self.critics(td.get(keys.OBSERVATION).flatten(0, -2)).mean(0).reshape(*td.batch_size, -1)
         is_worse = masked_values(value, td.get(keys.OPTION_MASK, None)).argmax(-1) != td.get(keys.OPTION)
         if is_greedy():
             return is_worse
-        random_share = 1.0 if self.is_uniform else self.epsilon
-        return is_worse | (torch.rand(is_worse.shape, device=is_worse.device, dtype=torch.float32) < random_share)
+        random_probability = 1.0 if self.is_uniform else self.epsilon
+        return is_worse | (torch.rand(is_worse.shape, device=is_worse.device, dtype=torch.float32) < random_probability)
 
     def decisions_to_update(self) -> dict[str, int]:
         """Return the length of the warm-up and the number of decisions for one update."""
-        share = first_multiple(self.updates_per_decision)
-        return {"warmup_decisions": self.warmup_decisions, "updates_per_decision": share}
+        first_update = first_multiple(self.options.updates_per_decision)
+        return {"warmup_decisions": self.options.warmup_decisions, "updates_per_decision": first_update}
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Store finished decisions and, after the warm-up, make the updates that are due."""
@@ -159,18 +139,18 @@ class MetaCritic(Selector):
         before = int(self.num_decisions)
         now = before + len(decisions)
         self.num_decisions = self.num_decisions + len(decisions)
-        if now < self.warmup_decisions:
+        if now < self.options.warmup_decisions:
             return {}
-        due = int(now * self.updates_per_decision) - int(before * self.updates_per_decision)
-        return {**self.update(min(due, self.max_updates)), "epsilon": self.epsilon}
+        due = int(now * self.options.updates_per_decision) - int(before * self.options.updates_per_decision)
+        return {**self.update(min(due, self.options.max_updates)), "epsilon": self.epsilon}
 
     def add_demonstrations(self, decisions: TensorDictBase) -> None:
-        """Store the decisions; the exploration schedule stays where it is."""
+        """Store the decisions. They do not count for the warm-up or the decay of epsilon."""
         self.buffer.extend(self._rows(decisions))
 
     def update(self, num_updates: int) -> dict[str, float]:
         """Make updates from the stored decisions."""
-        losses = [self._update(self.buffer.sample(self.batch_size)) for _ in range(num_updates)]
+        losses = [self._update(self.buffer.sample(self.options.batch_size)) for _ in range(num_updates)]
         return {"critic": torch.stack(losses).mean().item()} if losses else {}
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
@@ -195,11 +175,11 @@ class MetaCritic(Selector):
             next_value = masked_values(next_q, rows.get("next_option_mask", None)).amax(-1)
             target = (rows["return"] + rows["discount"] * next_value).unsqueeze(-1)
             is_chosen = torch.zeros_like(q[0]).scatter(-1, rows["option"].unsqueeze(-1), 1.0)
-            # Each member sees a random half of the decisions, which keeps the members apart.
+            # Each member sees a random half of the decisions, so that the members stay different.
             is_seen = torch.rand(*q.shape[:2], 1, device=q.device, dtype=torch.float32) < 0.5 if len(q) > 1 else 1.0
         loss = ((q - target).square() * is_chosen * is_seen).sum(-1).mean()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         self.optimizer.step()
-        polyak_update(self.target_critics, self.critics, self.tau)
+        polyak_update(self.target_critics, self.critics, self.options.tau)
         return loss.detach()

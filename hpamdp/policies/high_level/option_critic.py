@@ -10,21 +10,21 @@ Deliberation Cost*, arXiv 1709.04571, equation 10, as a margin of the advantage 
 Differs from the sources:
 - the policies within the options are the agent's learners, with values and gradients of their own;
 - Q and beta are learned from a replay buffer of steps, Q with a target network;
-- the value of a state is max_o Q(s, o), without the share of random choices;
-- where a time limit ends an episode, nothing follows;
-- beta is learned by logistic regression, weighed by the size of the advantage: its gradient has the sign of the
-  source's, but does not vanish where beta is sure and wrong, as it can be from values learned early;
-- exploring, an option ends with `initial_termination` as often as options are random, else with beta;
-- greedily, an option ends where beta is above 1/2.
+- the value of a state is max_o Q(s, o), without the random choices;
+- values do not bootstrap past the end of an episode, also if a time limit ended it;
+- beta is learned by logistic regression, weighted by the size of the advantage. Its gradient has the sign of the
+  source's, but does not vanish if beta is close to 0 or 1 and wrong, as early values can make it;
+- while exploring, beta is mixed with `initial_termination`, by the probability of a random option;
+- if the policy is greedy, an option ends where beta is above 1/2.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -35,33 +35,37 @@ from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.masks import masked_values, random_choice
 from hpamdp.policies.shared.exploration import linear_schedule
 from hpamdp.policies.shared.networks import mlp, polyak_update
+from hpamdp.policies.shared.option_values import OptionValueOptions
 from hpamdp.policies.shared.replay import first_multiple
-from hpamdp.settings import Fraction, LearningRate, PositiveFraction
+from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 
+class OptionCriticOptions(OptionValueOptions):
+    """Settings of `OptionCritic`; an update learns from stored steps."""
+
+    batch_size: PositiveInt = 512
+    """Number of stored steps in an update."""
+    buffer_size: PositiveInt = 100_000
+    """Number of steps that are stored."""
+    deliberation_cost: NonNegativeFloat = 0.01
+    """How much better another option's return must be for the held option to end. With 0, most options end at once."""
+    initial_termination: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.3
+    """Probability that an untrained option ends at a step; it stays part of exploration."""
+    epsilon_steps: NonNegativeInt = 20_000
+    """Steps after the warm-up over which the probability of a random option falls from 1 to `epsilon_final`."""
+    updates_per_step: PositiveFloat = 0.02
+    """Updates for each step."""
+    warmup_steps: NonNegativeInt = 2000
+    """Steps with random options before the first update."""
+    termination_lr: LearningRate = 1e-3
+    """Learning rate of Adam for the terminations."""
+
+
 class OptionCritic(Selector):
-    """Choose the option with the highest Q, and learn where it ends.
+    """Choose the option with the highest Q, and learn where it ends."""
 
-    Args:
-        specs: of the problem.
-        device: where the networks live.
-        hidden_dims: of the option values and of the terminations.
-        gamma: discount of an environment step.
-        deliberation_cost: margin by which another option must be better for the held one to end, in units of the
-            return; 0: the option-critic of 2017, whose options tend to end at every step.
-        initial_termination: probability that an option ends with a step, at the start; also with the probability of a
-            random option, and always while options are uniform.
-        epsilon_final, epsilon_steps: the probability of a random option falls linearly from 1 to `epsilon_final` over
-            the `epsilon_steps` steps after the warm-up.
-        buffer_size: steps that are stored.
-        batch_size: steps in an update.
-        updates_per_step, max_updates: updates for each step, and at most in one call of `learn_from_steps`.
-        warmup_steps: steps with random options before the first update.
-        lr, termination_lr: learning rates of Adam.
-        tau: step of the target network towards the learned one after each update.
-    """
-
+    Options = OptionCriticOptions
     ends_options: ClassVar[bool] = True
     modes: ClassVar[tuple[str, ...]] = ("train",)
 
@@ -70,53 +74,28 @@ class OptionCritic(Selector):
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: list[PositiveInt],
-        gamma: PositiveFraction,
-        deliberation_cost: NonNegativeFloat,
-        initial_termination: PositiveFraction,
-        epsilon_final: Fraction,
-        epsilon_steps: NonNegativeInt,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_step: PositiveFloat,
-        max_updates: PositiveInt,
-        warmup_steps: NonNegativeInt,
-        lr: LearningRate,
-        termination_lr: LearningRate,
-        tau: PositiveFraction,
+        device: torch.device | str = "cpu",
+        options: OptionCriticOptions | None = None,
+        **settings: Any,
     ) -> None:
         super().__init__(specs)
-        if batch_size > buffer_size:
-            raise ValueError(f"batch_size={batch_size}: must be at most {buffer_size=}")
-        if initial_termination >= 1.0:
-            raise ValueError(f"initial_termination={initial_termination}: must be less than 1")
-        self.gamma = gamma
-        self.initial_termination = initial_termination
-        self.deliberation_cost = deliberation_cost
-        self.epsilon_final = epsilon_final
-        self.epsilon_steps = epsilon_steps
-        self.batch_size = batch_size
-        self.updates_per_step = updates_per_step
-        self.max_updates = max_updates
-        self.warmup_steps = warmup_steps
-        self.tau = tau
-        self.critic = mlp(specs.observation_dim, hidden_dims, specs.num_options)
+        self.options: OptionCriticOptions = OptionCriticOptions.of(options, settings)
+        self.gamma = self.options.gamma
+        self.critic = mlp(specs.observation_dim, self.options.hidden_dims, specs.num_options)
         self.target_critic = copy.deepcopy(self.critic).requires_grad_(False)
-        self.termination = mlp(specs.observation_dim, hidden_dims, specs.num_options)
+        self.termination = mlp(specs.observation_dim, self.options.hidden_dims, specs.num_options)
         last = self.termination[-1]
         assert isinstance(last, nn.Linear)
         with torch.no_grad():
             last.weight.mul_(0.01)
-            last.bias.fill_(torch.tensor(initial_termination, dtype=torch.float32).logit().item())
+            last.bias.fill_(torch.tensor(self.options.initial_termination, dtype=torch.float32).logit().item())
         self.register_buffer("num_steps", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizers = {
-            "critic": torch.optim.Adam(self.critic.parameters(), lr=lr, fused=True),
-            "termination": torch.optim.Adam(self.termination.parameters(), lr=termination_lr, fused=True),
+            "critic": torch.optim.Adam(self.critic.parameters(), lr=self.options.lr, fused=True),
+            "termination": torch.optim.Adam(self.termination.parameters(), lr=self.options.termination_lr, fused=True),
         }
-        self.buffer = ReplayBuffer(storage=LazyTensorStorage(buffer_size, device=device))
+        self.buffer = ReplayBuffer(storage=LazyTensorStorage(self.options.buffer_size, device=device))
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizers and the replay buffer."""
@@ -129,14 +108,14 @@ class OptionCritic(Selector):
     @property
     def epsilon(self) -> float:
         """Probability of a random option."""
-        steps_after_warmup = int(self.num_steps) - self.warmup_steps
+        steps_after_warmup = int(self.num_steps) - self.options.warmup_steps
         if steps_after_warmup < 0:
             return 1.0
-        return linear_schedule(steps_after_warmup, self.epsilon_steps, self.epsilon_final)
+        return linear_schedule(steps_after_warmup, self.options.epsilon_steps, self.options.epsilon_final)
 
     @torch.no_grad()
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return the choices `[*B]`: the highest Q if the policy is greedy, else a random option at times."""
+        """Return the options with the highest Q, `[*B]`; while exploring, some are random."""
         mask = td.get(keys.OPTION_MASK, None)
         best = masked_values(self.critic(td.get(keys.OBSERVATION)), mask).argmax(-1)
         if is_greedy():
@@ -146,33 +125,38 @@ class OptionCritic(Selector):
 
     @torch.no_grad()
     def ends(self, td: TensorDictBase) -> Tensor:
-        """Return where the held option ends, bool `[*B]`: sampled, or where it is likely if the policy is greedy.
+        """Return where the held option ends, bool `[*B]`: sampled, or where beta > 1/2 if the policy is greedy.
 
-        It does where it is forbidden.
+        Forbidden options always end.
         """
-        # An option that never ends leaves no steps to the others, and their values as wrong as those that beta was
-        # learned from. So beta counts as much as the values do in the choice.
-        random_share = 0.0 if is_greedy() else 1.0 if self.is_uniform else self.epsilon
-        beta = self._beta(td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_share)
+        # If one option never terminated, the others would collect no data. Their values would stay wrong, and so would
+        # the terminations learned from them. Therefore beta counts only as much as Q does in the choice.
+        random_probability = 0.0 if is_greedy() else 1.0 if self.is_uniform else self.epsilon
+        beta = self._beta(
+            td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_probability
+        )
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
 
     def decisions_to_update(self) -> dict[str, int]:
-        """Return the length of the warm-up and the number of steps for one update; this selector learns from steps."""
-        return {"warmup_steps": self.warmup_steps, "updates_per_step": first_multiple(self.updates_per_step)}
+        """Return the length of the warm-up and the number of steps for one update."""
+        return {
+            "warmup_steps": self.options.warmup_steps,
+            "updates_per_step": first_multiple(self.options.updates_per_step),
+        }
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
-        """Store the steps and, after the warm-up, make the updates that are due from stored ones."""
+        """Store the steps and, after the warm-up, make the updates that are due."""
         rows = self._rows(batch).flatten()
         self.buffer.extend(rows)
         before = int(self.num_steps)
         now = before + len(rows)
         self.num_steps = self.num_steps + len(rows)
-        if now < self.warmup_steps:
+        if now < self.options.warmup_steps:
             return {}
-        due = int(now * self.updates_per_step) - int(before * self.updates_per_step)
+        due = int(now * self.options.updates_per_step) - int(before * self.options.updates_per_step)
         history: dict[str, list[Tensor]] = {}
-        for _ in range(min(due, self.max_updates)):
-            sample = self.buffer.sample(self.batch_size)
+        for _ in range(min(due, self.options.max_updates)):
+            sample = self.buffer.sample(self.options.batch_size)
             history.setdefault("critic", []).append(self._update_critic(sample))
             if self.decides_ends:
                 history.setdefault("termination", []).append(self._update_termination(sample))
@@ -195,23 +179,23 @@ class OptionCritic(Selector):
             rows["next_option_mask"] = after.get(keys.OPTION_MASK)
         return TensorDict(rows, batch_size=batch.shape)
 
-    def _beta(self, state: Tensor, option: Tensor, mask: Tensor | None, random_share: float = 0.0) -> Tensor:
-        """Return the probabilities `[*B]` that options end: 1 where they are forbidden.
+    def _beta(self, state: Tensor, option: Tensor, mask: Tensor | None, random_probability: float = 0.0) -> Tensor:
+        """Return the probabilities `[*B]` that options end in states; 1 for forbidden options.
 
         Args:
-            state: where, `[*B, observation_dim]`.
-            option: `[*B]`.
-            mask: the options that may be chosen, bool `[*B, num_options]`; None: all.
-            random_share: of `initial_termination` in the probabilities, in [0, 1].
+            state: the observations, `[*B, observation_dim]`.
+            option: the held options, `[*B]`.
+            mask: the options that may be chosen, bool `[*B, num_options]`. If None, all may.
+            random_probability: weight of `initial_termination` in the mixture, in [0, 1].
         """
         beta = _of_option(self.termination(state), option).sigmoid()
-        beta = (1.0 - random_share) * beta + random_share * self.initial_termination
+        beta = (1.0 - random_probability) * beta + random_probability * self.options.initial_termination
         return beta if mask is None else torch.where(_of_option(mask, option), beta, 1.0)
 
     def _target(self, rows: TensorDictBase) -> Tensor:
         """Return r + discount ((1 - beta) Q'(s', o) + beta max Q'(s', .)), `[B]`.
 
-        Where others decide when options end, beta is 1 or 0: whether this one has.
+        If the selector does not decide when options end, beta is 1 if the option has ended, else 0.
         """
         with torch.no_grad():
             q = self.target_critic(rows["next_state"])
@@ -220,8 +204,8 @@ class OptionCritic(Selector):
             beta = rows["is_ended"].float()
             if self.decides_ends:
                 beta = self._beta(rows["next_state"], rows["option"], mask)
-            following = held.lerp(masked_values(q, mask).amax(-1), beta)
-            return rows["reward"] + rows["discount"] * following
+            next_value = held.lerp(masked_values(q, mask).amax(-1), beta)
+            return rows["reward"] + rows["discount"] * next_value
 
     def _update_critic(self, rows: TensorDictBase) -> Tensor:
         """Make one update of Q from steps `[batch_size]`; return the loss."""
@@ -230,23 +214,20 @@ class OptionCritic(Selector):
         self.optimizers["critic"].zero_grad(set_to_none=True)
         loss.backward()
         self.optimizers["critic"].step()
-        polyak_update(self.target_critic, self.critic, self.tau)
+        polyak_update(self.target_critic, self.critic, self.options.tau)
         return loss.detach()
 
     def _update_termination(self, rows: TensorDictBase) -> Tensor:
-        """Make one step of the terminations against the advantage of going on; return their mean probability.
+        """Make one update of the terminations from steps `[batch_size]`; return their mean probability.
 
-        The loss is the logistic one: of an end where going on is better, of no end where it is not, each weighed by how
-        much. Forbidden options end in any case.
-
-        Args:
-            rows: steps `[batch_size]`.
+        The loss is logistic: an option should end where going on has a negative advantage. Each row is weighted by the
+        size of the advantage. Forbidden options always end and do not count.
         """
         state, option, mask = rows["next_state"], rows["option"], rows.get("next_option_mask", None)
         with torch.no_grad():
             q = self.critic(state)
             best = masked_values(q, mask).amax(-1)
-            advantage = _of_option(q, option) - best + self.deliberation_cost
+            advantage = _of_option(q, option) - best + self.options.deliberation_cost
             is_open = rows["discount"] > 0.0
             if mask is not None:
                 is_open &= _of_option(mask, option)

@@ -5,46 +5,38 @@ Discounted and sliding-window UCB: Garivier and Moulines 2011, arXiv 0805.3415, 
 
 Differs from the sources:
 - rewards need not lie in [0, 1]: the width is in units of their standard deviation;
-- many environments decide at the same time. They are served one after another, and each choice narrows the width of its
-  option as if its reward were already known, until it is; otherwise all of them would choose the same option.
+- many environments decide at the same time. `UCB` simulates sequential decisions: each choice narrows the bound of its
+  option before the reward is known. Otherwise all environments would choose the same option.
 """
 
 from __future__ import annotations
 
 import torch
-from pydantic import PositiveFloat, PositiveInt
+from pydantic import PositiveFloat
 from torch import Tensor
 
-from hpamdp.policies.shared.bandit import Bandit, Discount, Memory
-from hpamdp.specs import PAMDPSpecs
+from hpamdp.policies.shared.bandit import Bandit, BanditOptions
+
+
+class UCBOptions(BanditOptions):
+    """Settings of `UCB`; with `memory=all` it is UCB1."""
+
+    exploration: PositiveFloat = 2.0
+    """Width of the bounds, in standard deviations of the rewards. It falls with every choice of an option."""
 
 
 class UCB(Bandit):
     """Choose the option with the highest mean reward + exploration x standard deviation x sqrt(2 ln t / n).
 
-    The mean is that of the known rewards; n counts the choices of the option, and t those of all options, whether or
-    not their rewards are known.
-
-    Args:
-        specs: of the problem.
-        exploration: factor of the width.
-        memory, discount, window: which rewards count, as in `RewardStatistics`; with `all` this is UCB1.
+    The mean is that of the known rewards. n counts the choices of the option and t the choices of all options, whether
+    or not their rewards are known.
     """
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        exploration: PositiveFloat,
-        memory: Memory,
-        discount: Discount,
-        window: PositiveInt,
-    ) -> None:
-        super().__init__(specs, memory, discount, window)
-        self.exploration = exploration
+    Options = UCBOptions
+    options: UCBOptions
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
-        """Return `num` choices made one after another, in random order."""
+        """Return `num` choices as if made one after another, in random order."""
         statistics = self.statistics
         chosen_before = statistics.counts + self.pending
         earlier_choices = torch.arange(num, device=chosen_before.device)
@@ -55,7 +47,7 @@ class UCB(Bandit):
         means = torch.where(statistics.is_untried, mean_of_all, statistics.means)
         # bounds[i, j] is the bound of option i after j of these choices. It falls with j, so choosing the highest bound
         # `num` times in a row means choosing the `num` highest bounds.
-        bounds = means.unsqueeze(-1) + self.exploration * statistics.deviation * width
+        bounds = means.unsqueeze(-1) + self.options.exploration * statistics.deviation * width
         if allowed is not None:
             bounds = bounds.masked_fill(~allowed.unsqueeze(-1), -torch.inf)
         chosen = bounds.flatten().topk(num).indices // num

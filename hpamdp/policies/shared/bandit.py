@@ -1,7 +1,7 @@
-"""What context-free bandits share: the statistics of each option's rewards, and the greedy choice.
+"""The base of context-free bandits, and the statistics of each option's rewards.
 
-The reward of a bandit is here the return of an option. Nothing else counts, so bandits are for options that last as
-long as their episodes.
+The reward of a bandit is here the return of an option. A bandit does not bootstrap, so its options must last as long as
+their episodes.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from pydantic import Field
+from pydantic import Field, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
@@ -19,10 +19,19 @@ from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.stored_rows import check_choices
+from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
 
-Memory = Literal["all", "discounted", "sliding_window"]
-Discount = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+class BanditOptions(Settings):
+    """Settings of a bandit's memory. Forgetting suits rewards that change while the low level learns."""
+
+    memory: Literal["all", "discounted", "sliding_window"] = "discounted"
+    """Which rewards count: `all` equally, recent ones more (`discounted`), or the last ones only (`sliding_window`)."""
+    discount: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.999
+    """Weight of a reward for each decision of its age; used with `discounted` only."""
+    window: PositiveInt = 2000
+    """Number of decisions that count; used with `sliding_window` only."""
 
 
 class RewardStatistics(nn.Module):
@@ -32,15 +41,12 @@ class RewardStatistics(nn.Module):
 
     Args:
         num_options: number of options.
-        memory: `all` gives every reward the weight 1, `discounted` the weight `discount` to the power of its age in
-            decisions, `sliding_window` forgets all but the last `window` decisions.
-        discount: used with `discounted` only.
-        window: used with `sliding_window` only.
+        options: which rewards count.
 
     Attributes:
         counts, sums, squares: of each option's rewards, float64 `[num_options]`.
-        recent_options, recent_rewards: of the last decisions, `[window]`, oldest first; the option is -1 where there is
-            no decision yet. Empty unless the memory is `sliding_window`.
+        recent_options, recent_rewards: of the last decisions, `[window]`, oldest first. The option is -1 if there is no
+            decision yet. Both are empty unless the memory is `sliding_window`.
     """
 
     counts: Tensor
@@ -49,15 +55,15 @@ class RewardStatistics(nn.Module):
     recent_options: Tensor
     recent_rewards: Tensor
 
-    def __init__(self, num_options: int, memory: Memory, discount: float, window: int) -> None:
+    def __init__(self, num_options: int, options: BanditOptions) -> None:
         super().__init__()
-        self.memory = memory
-        self.discount = discount if memory == "discounted" else 1.0
+        self.memory = options.memory
+        self.discount = options.discount if options.memory == "discounted" else 1.0
         # float64, because there may be 10^8 decisions to sum over.
         self.register_buffer("counts", torch.zeros(num_options, dtype=torch.float64))
         self.register_buffer("sums", torch.zeros(num_options, dtype=torch.float64))
         self.register_buffer("squares", torch.zeros(num_options, dtype=torch.float64))
-        size = window if memory == "sliding_window" else 0
+        size = options.window if options.memory == "sliding_window" else 0
         self.register_buffer("recent_options", torch.full((size,), -1, dtype=torch.long))
         self.register_buffer("recent_rewards", torch.zeros(size, dtype=torch.float64))
 
@@ -74,12 +80,16 @@ class RewardStatistics(nn.Module):
 
     @property
     def is_untried(self) -> Tensor:
-        """Whether no reward of an option is known, bool `[num_options]`; options become untried again if forgotten."""
+        """Whether an option has no known reward, bool `[num_options]`. Forgotten options are untried again."""
         return self.counts < 1e-9
 
     def best(self, allowed: Tensor | None = None) -> int:
-        """Return the option with the highest mean reward, among the allowed ones, bool `[num_options]`."""
-        # An untried option comes before a forbidden one, whose value is -inf.
+        """Return the option with the highest mean reward.
+
+        Args:
+            allowed: the options that may be chosen, bool `[num_options]`. If None, all may.
+        """
+        # Forbidden options have -inf, which is below the value of untried ones.
         means = torch.where(self.is_untried, torch.finfo(torch.float64).min, self.means)
         return int(masked_values(means, allowed).argmax())
 
@@ -108,34 +118,35 @@ class RewardStatistics(nn.Module):
 
 
 class Bandit(Selector):
-    """A selector that sees no context: it chooses by the rewards of the options alone. A subclass writes `sample`.
+    """A selector that chooses by the rewards of the options alone, without an observation.
 
-    Args:
-        specs: of the problem.
-        memory, discount, window: which rewards count, as in `RewardStatistics`.
+    A subclass writes `sample`. If it has settings of its own, it derives its `Options` from `BanditOptions`.
 
     Attributes:
-        statistics: of the rewards that are known.
-        num_decisions: how many decisions of its own have ended, forgotten ones included; those of a data set do not
-            count. With the `pending` ones they are the decisions that it has made.
+        statistics: of the known rewards.
+        num_decisions: how many of its own decisions have ended, forgotten ones included. Decisions of a data set do not
+            count.
     """
 
     is_bandit: ClassVar[bool] = True
+    Options: ClassVar[type[BanditOptions]] = BanditOptions
+    options: BanditOptions
 
     num_decisions: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, memory: Memory, discount: float, window: int) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: BanditOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)
-        self.statistics = RewardStatistics(specs.num_options, memory, discount, window)
+        self.options = self.Options.of(options, settings)
+        self.statistics = RewardStatistics(specs.num_options, self.options)
         self.register_buffer("num_decisions", torch.zeros((), dtype=torch.long))
 
     @abstractmethod
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
-        """Return `num` exploring choices, int64 `[num]`, for decisions that are due at the same time.
+        """Return exploring choices, int64 `[num]`, for decisions that are due at the same time.
 
         Args:
-            num: how many.
-            allowed: the options that may be chosen, bool `[num_options]`; None: all.
+            num: number of decisions.
+            allowed: the options that may be chosen, bool `[num_options]`. If None, all may.
         """
         raise NotImplementedError
 
@@ -144,7 +155,7 @@ class Bandit(Selector):
         return self.statistics.best(allowed)
 
     def select(self, td: TensorDictBase) -> Tensor:
-        """Return the choices `[*B]`: the best option if the policy is greedy, else samples where a decision is due."""
+        """Return the choices `[*B]`: the best option if the policy is greedy, else a sample for each due decision."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         mask = td.get(keys.OPTION_MASK, None)
         if mask is not None:
@@ -158,10 +169,10 @@ class Bandit(Selector):
         return choices
 
     def _select_allowed(self, is_decision: Tensor, mask: Tensor) -> Tensor:
-        """Return allowed choices `[*B]`: environments that allow the same options are served together.
+        """Return allowed choices `[*B]`. Environments that allow the same options are handled together.
 
         Args:
-            is_decision: where a choice is due, bool `[*B]`; elsewhere it is ignored.
+            is_decision: where a choice is due, bool `[*B]`. Elsewhere the choice is ignored.
             mask: the options that may be chosen, bool `[*B, num_options]`.
         """
         choices = torch.zeros_like(is_decision, dtype=torch.long)

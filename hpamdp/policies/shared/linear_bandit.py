@@ -1,4 +1,4 @@
-"""What linear contextual bandits share: features of the observation and a ridge regression for each option."""
+"""The base of linear contextual bandits: features of the observation, and a ridge regression for each option."""
 
 from __future__ import annotations
 
@@ -8,30 +8,38 @@ from abc import abstractmethod
 from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.bandit import Discount, Memory, RewardStatistics
+from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics
+from hpamdp.settings import Indices
 from hpamdp.specs import PAMDPSpecs
 
-Features = Literal["polynomial", "random_fourier"]
+
+class LinearBanditOptions(BanditOptions):
+    """Settings of linear bandits; `memory`, `discount` and `window` say which decisions count."""
+
+    inputs: Indices | None = None
+    """Indices of the observation entries that the features use. If None, all."""
+    features: Literal["polynomial", "random_fourier"] = "polynomial"
+    """All monomials of the inputs up to `degree`, or `degree` cosines in random directions."""
+    degree: PositiveInt = 1
+    """Degree of the polynomial, or number of the cosines."""
+    ridge: PositiveFloat = 1.0
+    """Number added to the diagonal of each option's Gram matrix."""
+    exploration: PositiveFloat = 1.0
+    """Factor of the prediction's standard deviation in exploring choices."""
 
 
 class ContextFeatures(nn.Module):
     """Features `[*B, num_features]` of some entries of the observation, with a constant 1 among them.
 
-    Source of the random Fourier features: Rahimi and Recht 2007, *Random Features for Large-Scale Kernel Machines*.
-
-    Args:
-        specs: of the problem.
-        inputs: indices of the entries; None: all of them.
-        features: `polynomial`: all monomials up to `degree`. `random_fourier`: `degree` cosines in random directions,
-            standard normal in the units of the entries and the same in every run.
-        degree: of the features.
+    The directions of random Fourier features are standard normal in the units of the entries, and the same in every
+    run. Source: Rahimi and Recht 2007, *Random Features for Large-Scale Kernel Machines*.
 
     Raises:
         ValueError: the observation has no such entry, or there would be more than 2,000 features.
@@ -42,15 +50,16 @@ class ContextFeatures(nn.Module):
     directions: Tensor
     phases: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, inputs: list[int] | None, features: Features, degree: int) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: LinearBanditOptions) -> None:
         super().__init__()
-        inputs = list(range(specs.observation_dim)) if inputs is None else inputs
+        inputs = list(range(specs.observation_dim) if options.inputs is None else options.inputs)
+        degree = options.degree
         if not inputs or not all(0 <= i < specs.observation_dim for i in inputs):
             last = specs.observation_dim - 1
             raise ValueError(f"inputs={inputs}: the observation has entries 0 to {last}; null: all")
         if len(set(inputs)) < len(inputs):
             raise ValueError(f"inputs={inputs}: names an entry twice")
-        self.is_polynomial = features == "polynomial"
+        self.is_polynomial = options.features == "polynomial"
         self.num_features = math.comb(len(inputs) + degree, degree) if self.is_polynomial else degree + 1
         if self.num_features > 2000:
             raise ValueError(f"degree={degree}: {self.num_features} features of {len(inputs)} inputs; at most 2000")
@@ -82,13 +91,6 @@ class LinearBandit(Selector):
     A subclass writes `sample`. Old decisions are forgotten as in `RewardStatistics`: by their age in decisions of any
     option.
 
-    Args:
-        specs: of the problem.
-        exploration: factor of the predictions' standard deviation in `sample`.
-        inputs, features, degree: as in `ContextFeatures`.
-        ridge: added to the diagonal of each option's Gram matrix.
-        memory, discount, window: which decisions count, as in `RewardStatistics`.
-
     Attributes:
         gram: sum of the features' outer products for each option, float64 `[num_options, num_features, num_features]`.
         moment: sum of features times reward for each option, float64 `[num_options, num_features]`.
@@ -96,29 +98,18 @@ class LinearBandit(Selector):
     """
 
     is_bandit: ClassVar[bool] = True
+    Options: ClassVar[type[LinearBanditOptions]] = LinearBanditOptions
+    options: LinearBanditOptions
 
     gram: Tensor
     moment: Tensor
     recent_features: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        *,
-        exploration: PositiveFloat,
-        inputs: list[NonNegativeInt] | None,
-        features: Features,
-        degree: PositiveInt,
-        ridge: PositiveFloat,
-        memory: Memory,
-        discount: Discount,
-        window: PositiveInt,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: LinearBanditOptions | None = None, **settings: Any) -> None:
         super().__init__(specs)
-        self.features = ContextFeatures(specs, inputs, features, degree)
-        self.exploration = exploration
-        self.ridge = ridge
-        self.statistics = RewardStatistics(specs.num_options, memory, discount, window)
+        self.options = self.Options.of(options, settings)
+        self.features = ContextFeatures(specs, self.options)
+        self.statistics = RewardStatistics(specs.num_options, self.options)
         num, dim = specs.num_options, self.features.num_features
         self.register_buffer("gram", torch.zeros(num, dim, dim, dtype=torch.float64))
         self.register_buffer("moment", torch.zeros(num, dim, dtype=torch.float64))
@@ -140,12 +131,12 @@ class LinearBandit(Selector):
         return x @ theta.T, noise * spread.square().sum(1).sqrt().T
 
     def _regression(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each option's coefficients `[num_options, num_features]`, and how its Gram matrix is factorised.
+        """Return each option's coefficients, the Cholesky factor of its scaled Gram matrix, and the features' scales.
 
-        The factor is that of the matrix scaled by the features' sizes, `[num_options, num_features]`.
+        Coefficients and scales are `[num_options, num_features]`.
         """
         identity = torch.eye(self.features.num_features, dtype=self.gram.dtype, device=self.gram.device)
-        gram = self.gram + self.ridge * identity
+        gram = self.gram + self.options.ridge * identity
         # The magnitudes of monomials may differ so much that rounding leaves a matrix that is not positive definite.
         # Therefore each feature is scaled by its own size, and a little is added to the diagonal.
         size = gram.diagonal(dim1=-2, dim2=-1).sqrt()
@@ -154,7 +145,7 @@ class LinearBandit(Selector):
         return theta, factor, size
 
     def exported(self) -> dict[str, Any] | None:
-        """Return the polynomials: see `hpamdp.policies.shared.exported_policy`; None for other features."""
+        """Return the polynomials, see `hpamdp.policies.shared.exported_policy`; None for other features."""
         if not self.features.is_polynomial:
             return None
         theta, _, _ = self._regression()
@@ -167,7 +158,7 @@ class LinearBandit(Selector):
 
     @abstractmethod
     def sample(self, mean: Tensor, deviation: Tensor) -> Tensor:
-        """Return a score for each option, `[B, num_options]`; exploring choices take the highest.
+        """Return a score of each option, `[B, num_options]`. Exploring choices take the highest.
 
         Args:
             mean: expected reward of each option, `[B, num_options]`.
