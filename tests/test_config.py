@@ -1,6 +1,5 @@
 """The config: what is accepted, and that whatever is wrong ends in one line that says so."""
 
-import inspect
 import re
 from typing import Annotated, Literal
 
@@ -11,7 +10,7 @@ from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
 from hpamdp import config as config_module
-from hpamdp.config import GROUPS, ConfigError, component, load_class, read
+from hpamdp.config import GROUPS, ConfigError, component, load_class, options_model, read
 from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.low_level.random import Random
 from hpamdp.run.train import run
@@ -169,7 +168,10 @@ def test_an_argument_with_the_name_of_a_value_of_the_run_is_refused_in_one_line(
     [
         (["recipe=goal_pdqm"], "recipe=goal_pdqm: no such file in conf/recipe; did you mean goal_pdqn? It has "),
         (["recipe=boatdock_hyar"], "recipe=boatdock_hyar: no such file in conf/recipe; did you mean "),
-        (["recipe/high=boatdock_uc"], "recipe/high=boatdock_uc: no such file in conf/recipe/high; did you mean boatdock_ucb?"),
+        (
+            ["recipe/high=boatdock_uc"],
+            "recipe/high=boatdock_uc: no such file in conf/recipe/high; did you mean ",
+        ),
         (["hydra.searchpath=[/nowhere]"], "hydra.searchpath=/nowhere: there is no such folder"),
     ],
 )
@@ -214,8 +216,7 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
     in_yaml = set(cfg[group]) - {"_target_", "budget", "checkpoint", "freeze"}
     assert chosen.name == name and set(chosen.options) == in_yaml
     if chosen.cls is not None:
-        arguments = set(list(inspect.signature(chosen.cls.__init__).parameters)[1:])
-        assert in_yaml == arguments - {*GROUPS[group]}
+        assert in_yaml == options_model(chosen.cls, GROUPS[group]).model_fields.keys()
     assert ("budget" in cfg[group]) == (group == "low")
     assert group != "low" or set(cfg[group].budget) == {"num_envs", "steps_per_batch", "total_frames", "eval_every"}
 
