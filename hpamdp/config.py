@@ -533,13 +533,13 @@ def component(group: str, name: str, node: Any) -> Component:
     file = _file(group, name)
     cls = None if target is None and group in _CAN_BE_NONE else _load_target(group, target, file)
     class_name = "none" if cls is None else cls.__name__
-    taken = [] if cls is None else [entry for entry in (TARGET, *own) if entry in constructor_arguments(cls)]
+    schema = create_model(class_name, __config__=_STRICT) if cls is None else options_model(cls, GROUPS[group])
+    taken = [entry for entry in (TARGET, *own) if entry in schema.model_fields]
     if taken:
         raise ConfigError(
             f"{group}={name}: {class_name} has an argument {taken[0]}, but {group}.{taken[0]} is a value of the run; "
             f"rename the argument ({file})"
         )
-    schema = create_model(class_name, __config__=_STRICT) if cls is None else options_model(cls, GROUPS[group])
     model = _validated(schema, options, f"{group}.", f"option of {class_name} ({file})", f"{class_name}, {file}")
     return Component(group, name, cls, {option: getattr(model, option) for option in schema.model_fields})
 

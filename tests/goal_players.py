@@ -68,13 +68,13 @@ SECOND = action(torch.ones(len(SHOTS), dtype=torch.long), SHOTS)
 
 def first_actions(env: GoalEnv) -> TensorDict:
     """Return the kicks and the shots."""
-    kicks = REPAIRED_KICKS if "kick_to" in env.repaired else KICKS
+    kicks = REPAIRED_KICKS if "kick_to" in env.options.repaired else KICKS
     return torch.cat([action(torch.zeros(len(kicks), dtype=torch.long), kicks), SECOND])
 
 
 def of_rows(env: GoalEnv, rows: Tensor, seed: int = 0) -> GoalEnv:
     """Return copies of some of the pitches, with noise of their own."""
-    copies = GoalEnv(len(rows), repaired=env.repaired, seed=seed)
+    copies = GoalEnv(len(rows), repaired=env.options.repaired, seed=seed)
     copies.reset()
     copies.set_env_state({name: column[rows] for name, column in env.env_state().items()})
     return copies

@@ -6,16 +6,16 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-import yaml
 from conftest import compose_config
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.config import conf_dir, read
+from hpamdp.config import read
 from hpamdp.env.boatdock import episode, harbour, physics, planner, rendering
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.gymnasium_faces import BoatDock, BoatDockVector
-from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Rules, chosen_boats
+from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Rules
 from hpamdp.run.assemble import assemble
 
 THREE = ["congruent", "incongruent1", "incongruent2"]
@@ -23,8 +23,8 @@ SIDEWAYS = {"sideways": [0.0, 90.0, 180.0]}
 
 
 def made(boats=None, switch_cost=None, controllers=None) -> Rules:
-    chosen = chosen_boats(boats, controllers)
-    return Rules(boats=chosen, switch_cost=switch_cost, motor_noise=(0.0,) * (2 if chosen is None else len(boats)))
+    controllers = CONTROLLER_DEGREES if controllers is None else controllers
+    return BoatDockOptions(boats=boats, switch_cost=switch_cost, controllers=controllers).rules
 
 
 def layouts(num) -> tuple[harbour.Layout, torch.Tensor]:
@@ -38,13 +38,12 @@ def press(env: BoatDockEnv, key: list[int], duration: list[float], option: list[
     return env.step(td)["next"]
 
 
-def test_the_yaml_has_the_controllers_that_the_code_knows():
-    table = yaml.safe_load((conf_dir() / "env/boatdock.yaml").read_text())["controllers"]
-    assert {name: tuple(map(float, degrees)) for name, degrees in table.items()} == CONTROLLER_DEGREES
+def test_the_settings_have_the_controllers_that_the_code_knows():
+    assert BoatDockOptions().controllers == CONTROLLER_DEGREES
 
 
 def test_the_controllers_are_peoples():
-    boats = chosen_boats(THREE)
+    boats = made(THREE).boats
     for table, row in zip(boats.directions, (2, 0, 1), strict=True):
         np.testing.assert_allclose(table, harbour.DIRECTIONS[row], atol=1e-12)
 
@@ -247,16 +246,15 @@ def test_gymnasium_has_the_boats_and_their_changes():
     many.reset(seed=0, options={"start": [[600, 512]] * 3, "goal": [[700, 512]] * 3})
     _, _, _, _, infos = many.step({"option": [0, 2, 3], "key": [0] * 3, "duration": np.full((3, 3), 0.1)})
     assert infos["controller"].tolist() == [0, 2, 3]
-    with pytest.raises(ValueError, match="there is no controller upwards"):
+    with pytest.raises(ValueError, match="no controller upwards"):
         BoatDock(boats=["congruent", "upwards"])
 
 
 def test_compiled_faces_take_other_boats():
     from hpamdp.env.boatdock.tensor_fleet import TensorFleet
 
-    rules = made(["congruent", "sideways"], 0.5, SIDEWAYS)
-    fleet = TensorFleet(2, rules, device="cpu", compile_rules=False)
-    assert fleet._env.rules == rules
+    options = BoatDockOptions(boats=["congruent", "sideways"], switch_cost=0.5, controllers=SIDEWAYS)
+    assert TensorFleet(2, options, device="cpu")._env.rules == options.rules
 
 
 def test_the_fuel_of_a_change_is_not_drawn_as_a_press():

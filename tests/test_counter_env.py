@@ -141,7 +141,7 @@ def test_the_limit_of_a_vehicle_may_terminate_instead(problem, by_kernel):
 
 
 def test_a_limit_of_another_name_is_refused():
-    with pytest.raises(ValueError, match="limit='cut', but must be truncated or terminated"):
+    with pytest.raises(ValueError, match="'truncated' or 'terminated'"):
         MovingEnv(limit="cut")
 
 
@@ -290,7 +290,7 @@ def test_evaluation_meets_no_start_of_training(problem):
 @pytest.mark.parametrize("problem", POINTS)
 def test_an_invalid_argument_is_refused_by_name(problem):
     for name in ("num_envs", "max_steps"):
-        with pytest.raises(ValueError, match=f"{problem.__name__}: {name}=0, but must be at least 1"):
+        with pytest.raises(ValueError, match=name):
             problem(**{name: 0})
 
 

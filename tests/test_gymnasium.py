@@ -291,7 +291,7 @@ def mistake_in(**options) -> str:
     [
         ({}, "set env.id=Name-v0 or env.entry_point=package.module:name; neither is set"),
         ({"id": "Toy-v0", "entry_point": TOY}, "both are set"),
-        ({"id": "Toy-v0", "max_steps": 0}, "max_steps=0, but must be at least 1 or null"),
+        ({"id": "Toy-v0", "max_steps": 0}, "max_steps=0: must be greater than 0"),
         ({"id": "Nowhere-v0"}, "Nowhere-v0: Environment `Nowhere` doesn't exist"),
         ({"id": "Toy-v3"}, "Toy-v3: Environment version `v3`"),
         ({"id": "nowhere:Toy-v0"}, "nowhere:Toy-v0: No module named 'nowhere'"),
@@ -300,7 +300,7 @@ def mistake_in(**options) -> str:
         ({"id": "CartPole-v1"}, "CartPole-v1: action space Discrete(2): not of these forms; accepted are "),
         ({"id": "Toy-v0", "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
         ({"entry_point": TOY, "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
-        ({"id": "hpamdp/CatchPoint-v0", "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
+        ({"id": "hpamdp/CatchPoint-v0", "kwargs": {"wide": 1}}, "hpamdp/CatchPoint-v0: wide=1: Extra inputs are not"),
         ({"entry_point": "nowhere:Toy"}, "nowhere:Toy: No module named 'nowhere'"),
         ({"entry_point": "toy_environments:Nobody"}, "there is no class or function Nobody in toy_environments"),
         ({"entry_point": "toy_environments"}, "must be a class or function, as package.module:name"),

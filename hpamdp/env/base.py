@@ -14,12 +14,14 @@ from torchrl.data import Binary, Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.geometry import PlaneGeometry, Symmetries
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from hpamdp.env.page import Page
+    from hpamdp.settings import Settings
 
 # Separates the seeds of an evaluation from the small ones that people give to training.
 _EVALUATION = 0x5EED0000
@@ -96,6 +98,11 @@ class PAMDPEnv(EnvBase):
         Metric("score", "Score"),
         Metric("success", "Episodes that succeed", "share"),
     )
+
+    @classmethod
+    def facts(cls, options: Settings) -> ProblemFacts | None:
+        """Return what these settings tell of the problem; None if only a built environment knows it."""
+        return None
 
     @property
     def title(self) -> str:

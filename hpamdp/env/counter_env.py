@@ -25,7 +25,9 @@ from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rows import Advance, Results, Rows
+from hpamdp.settings import Settings
 
 # What a tensordict has whose next root holds nothing else.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.ACTION}
@@ -56,99 +58,124 @@ EpisodeState = TypeVar("EpisodeState", bound=EpisodeColumns)
 class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     """`num_envs` copies of a problem in one batch dimension.
 
-    A subclass sets the class attributes below and defines `start`, `act` and `observe`. The parameters of the chosen
-    action are clipped to their bounds; NaN and infinite ones are refused, and so are unknown actions. The parameters
-    of the other actions are never read.
+    A subclass sets the attributes below, in its class or in `_prepare`, and defines `start`, `act` and `observe`. The
+    settings `max_steps` and `compile_rules` have their effect here. The parameters of the chosen action are clipped to
+    their bounds; NaN and infinite ones are refused, and so are unknown actions. The parameters of the other actions are
+    never read.
 
-    On the CPU a problem may hand over a kernel, `_use_kernel`, which then does the work of the three. Other devices,
-    compiled rules, subclasses that replace one of the three, and gradients (from the first parameters that require them
-    on) have the tensor functions. A kernel leaves the scripted action of `oracle` to them, too.
+    On the CPU the problem's `row_kernel`, if it has one, does the work of the three functions. The tensor functions do
+    it on other devices, with compiled rules, in subclasses that replace one of the three, and from the first parameters
+    on that require gradients. The scripted action of `oracle` is always a tensor function.
 
     Random numbers depend on the seed, the number of the environment and the episode. Training and evaluation draw
     theirs from separate streams, and so do the starts of episodes and the noise within them.
 
     Args:
         num_envs: number of environments.
-        max_steps: actions after which an episode is truncated.
-        parameter_low, parameter_high: bounds of the parameters of all discrete actions, side by side.
+        options: the problem's settings; None for the defaults.
         device: of the tensors.
         seed: of all random numbers; the global generators are neither read nor moved.
-        first_env: number of the first environment, where other processes have those before it.
-        oracle: also write the action of the hand-written player, `scripted_action`, under `oracle`.
-        compile_rules: compile `start`, `act` and `observe` (takes about half a minute) instead of using a kernel.
+        first_env: number of the first environment, if other processes have those before it.
+        settings: single settings by name, in place of those in `options`.
 
     Raises:
         ValueError: an argument or an action is invalid; the state is unchanged.
     """
 
+    Options: ClassVar[type[Settings]]
+    options: Any  # of the class Options
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
     observation_names: tuple[str, ...]
+    # Bounds of the parameters of all discrete actions, side by side.
+    parameter_low: Sequence[float]
+    parameter_high: Sequence[float]
+    row_kernel: ClassVar[Advance | None] = None  # stands for `start`, `act` and `observe` on the CPU
     result_keys = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
     rows: Rows | None = None  # what the kernel moves; None where the tensor functions do
     limit_terminates = False  # whether values stop at the time limit, as at any other end
+    _has_oracle = False
 
     def __init__(
         self,
-        num_envs: int,
+        num_envs: int = 1,
         *,
-        max_steps: int,
-        parameter_low: Sequence[float],
-        parameter_high: Sequence[float],
-        device: torch.device | str | None,
-        seed: int,
-        first_env: int,
-        oracle: bool = False,
-        compile_rules: bool = False,
+        options: Settings | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        **settings: Any,
     ) -> None:
-        for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
-            if value < 1:
-                raise ValueError(f"{type(self).__name__}: {name}={value}, but must be at least 1")
+        self.options = self.Options.of(options, settings)
+        if num_envs < 1:
+            raise ValueError(f"{type(self).__name__}: num_envs={num_envs}, but must be at least 1")
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
-        self.max_steps = max_steps
+        facts = self.facts(self.options)
+        self.option_names = facts.option_names
+        self.can_change_option = facts.can_change_option
+        self.plans_change_options = facts.plans_change_options
+        # Not every problem has these two settings.
+        if hasattr(self.options, "max_steps"):
+            self.max_steps = self.options.max_steps
+        self._is_compiled = getattr(self.options, "compile_rules", False)
+        self._prepare()
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         low, high = (
-            torch.tensor(parameter_low, device=self.device, dtype=torch.float32),
-            torch.tensor(parameter_high, device=self.device, dtype=torch.float32),
+            torch.tensor(side, device=self.device, dtype=torch.float32)
+            for side in (self.parameter_low, self.parameter_high)
         )
-        self._has_oracle = oracle
         self._make_specs(low, high)
         self._place_parameters(low, high)
-        self._is_compiled = compile_rules
         self._pure_step, self._pure_reset, self._pure_observe = self._advance, self._restart, self.observe
-        if compile_rules:
-            arguments: Any = counter_rng.COMPILE_ARGUMENTS
-            self._pure_step = torch.compile(self._advance, **arguments)
-            self._pure_reset = torch.compile(self._restart, **arguments)
-            self._pure_observe = torch.compile(self.observe, **arguments)
+        if self._is_compiled:
+            self._compile()
         self._set_seed(seed)
+        self._use_kernel()
 
-    def _use_kernel(self, advance: Advance, owner: type[CounterEnv], settings: Sequence[float]) -> None:
-        """Let a kernel move the environments on the CPU; to be called at the end of the constructor.
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem."""
+        return ProblemFacts(title=cls.__name__)
 
-        Nothing happens where the rules are compiled, or where a subclass has replaced them.
+    @property
+    def default_options(self) -> Mapping[str, Sequence[int | str]]:
+        """Options to begin with."""
+        return self.facts(self.options).default_options
 
-        Args:
-            advance: as in `hpamdp.env.kernels`.
-            owner: the class whose `start`, `act` and `observe` the kernel stands for.
-            settings: the problem's own numbers for it.
-        """
-        is_replaced = any(getattr(type(self), name) is not getattr(owner, name) for name in ("start", "act", "observe"))
-        if self.device.type != "cpu" or self._is_compiled or is_replaced:
+    def _prepare(self) -> None:
+        """Set what follows from the settings, such as the bounds of the parameters, before the specs are made."""
+
+    def _compile(self) -> None:
+        """Compile the tensor functions."""
+        arguments: Any = counter_rng.COMPILE_ARGUMENTS
+        self._pure_step = torch.compile(self._advance, **arguments)
+        self._pure_reset = torch.compile(self._restart, **arguments)
+        self._pure_observe = torch.compile(self.observe, **arguments)
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the problem's own numbers for its kernel."""
+        return ()
+
+    def _use_kernel(self) -> None:
+        """Let the kernel move the environments on the CPU, unless rules are compiled or replaced by a subclass."""
+        if self.row_kernel is None or self.device.type != "cpu" or self._is_compiled:
+            return
+        owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
+        if any(getattr(type(self), name) is not getattr(owner, name) for name in ("start", "act", "observe")):
             return
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
         state = self._columns
         num_integers = sum(not column.is_floating_point() for column in state)
         self.rows = Rows(
-            advance,
+            self.row_kernel,
             self.num_envs,
             num_columns=(len(state._fields) - num_integers, num_integers),
             observation_dim=len(self.observation_names),
             parameter_dims=self.parameter_dims,
             bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(),
-            settings=[self.max_steps, *settings],
+            settings=[self.max_steps, *self.kernel_settings()],
             first_env=int(self._environment[0]),
         )
         self.rows.set_seed(int(self._seed), self._streams)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -12,7 +12,9 @@ from torch import Tensor
 
 from hpamdp.env import point_pictures
 from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv, EpisodeColumns
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.point_agent import Located
+from hpamdp.settings import Settings
 
 
 class PointColumns(EpisodeColumns, Located, Protocol):
@@ -31,10 +33,33 @@ PointEpisode = TypeVar("PointEpisode", bound=PointColumns)
 
 
 class PointEnv(CounterEnv[PointEpisode], Generic[PointEpisode]):
-    """`num_envs` copies of a problem with a point and a target; see `CounterEnv`."""
+    """`num_envs` copies of a problem with a point and a target.
+
+    With `oracle`, the action of a hand-written player is written under `oracle` (`discrete`, `parameters` `[N, 1]`).
+    For the other arguments and errors see `CounterEnv`.
+    """
 
     target_radius: ClassVar[float]  # the distance that counts as a hit
     has_walls: ClassVar[bool] = False  # whether the agent must stay within the square
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        options: Settings | None = None,
+        device: torch.device | str | None = "cpu",
+        seed: int = 0,
+        first_env: int = 0,
+        oracle: bool = False,
+        **settings: Any,
+    ) -> None:
+        self._has_oracle = oracle
+        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem."""
+        return ProblemFacts(title=cls.__name__, has_oracle=True)
 
     @property
     def position(self) -> Tensor:

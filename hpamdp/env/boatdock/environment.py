@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -21,15 +21,17 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import Metric, PAMDPEnv
 from hpamdp.env.boatdock import episode, harbour, physics, planner
-from hpamdp.env.boatdock.episode import BoatState, Rules
+from hpamdp.env.boatdock.episode import BoatState
 from hpamdp.env.boatdock.fleet import Fleet, Readings
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
 from hpamdp.env.boatdock.layouts import layout_columns
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
-from hpamdp.env.boatdock.task import check_arguments, invalid_press, make_rules
+from hpamdp.env.boatdock.task import invalid_press
 from hpamdp.env.columns import check_range, cloned, from_arrays, overwrite, where
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:
@@ -66,31 +68,15 @@ class BoatDockEnv(PAMDPEnv):
       an episode's first press and held until its end; with a `switch_cost`, read at every press.
 
     Args:
-        num_envs: how many boats.
-        controller: `choose` (the agent picks), `congruent`, `incongruent` or the name of one of the `boats`, or
-            `random` (drawn for each episode).
-        keymap: of the incongruent boat: 1, 2 or `random`.
-        reward: `paper` (progress, 5 x fuel fraction on success, -1 on failure) or `sparse` (the success term alone).
-        observation: `scaled` to about [-1, 1] with goal - boat appended (`[N, 16]`), or the paper's `pixels`
-            (`[N, 14]`).
-        motor_noise: standard deviation of the log of the executed duration; or a list, of the incongruent and of the
-            congruent boat, or of each of the `boats`.
-        sensor_noise: standard deviation (px) of the observed positions.
-        slip: probability that a uniformly random key is pressed.
-        boats: the names of the boats, of those in `controllers`; None: people's two, `incongruent` and `congruent`.
-        controllers: more controllers that `boats` may name, beside `congruent`, `incongruent1` and `incongruent2` (its
-            two key maps): for each key the direction in which it pushes, degrees, 0 to the right, 90 down.
-        switch_cost: seconds of fuel for changing the boat at a press, where the option is another one than before;
-            None: a boat is kept for the episode.
-        recording: a file of `hpamdp play`, whose figures stand in tables and curves in place of people's.
-        compile_rules: compile the tensor functions of `episode` (takes about half a minute), for a GPU, instead
-            of using the kernel.
+        num_envs: number of boats.
+        options: the settings; None for the defaults.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
         device: where the boats live.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
-        first_env: number of the first boat, where other processes have those before.
+        first_env: number of the first boat, if other processes have those before it.
+        settings: single settings by name, in place of those in `options`.
 
     On the CPU the boats are moved by the kernel of `hpamdp.env.boatdock.kernel`; other devices, compiled rules, and
     gradients (from the first durations that require them on) have the tensor functions of `episode`. Numbers agree to
@@ -104,7 +90,7 @@ class BoatDockEnv(PAMDPEnv):
         RuntimeError: a step before the first reset, or before the one after `set_seed`.
     """
 
-    option_names: tuple[str, ...] = harbour.CONTROLLERS
+    Options = BoatDockOptions
     guarded_settings = ("recording",)
     parameter_dims = (1,) * harbour.NUM_KEYS
     max_steps = episode.MAX_PRESSES
@@ -138,42 +124,27 @@ class BoatDockEnv(PAMDPEnv):
         self,
         num_envs: int = 1,
         *,
-        controller: str = "choose",
-        keymap: Literal[1, 2, "random"] = 1,
-        reward: Literal["paper", "sparse"] = "paper",
-        observation: Literal["scaled", "pixels"] = "scaled",
-        motor_noise: float | list[float] = 0.0,
-        sensor_noise: float = 0.0,
-        slip: float = 0.0,
-        boats: list[str] | None = None,
-        controllers: dict[str, list[float]] | None = None,
-        switch_cost: float | None = None,
-        recording: str | None = None,
-        compile_rules: bool = False,
+        options: BoatDockOptions | None = None,
         oracle: bool = False,
         human: bool = False,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
+        **settings: Any,
     ) -> None:
-        rules = make_rules(
-            controller=controller,
-            keymap=keymap,
-            reward=reward,
-            observation=observation,
-            motor_noise=motor_noise,
-            sensor_noise=sensor_noise,
-            slip=slip,
-            boats=boats,
-            controllers=controllers,
-            switch_cost=switch_cost,
-        )
-        check_arguments(num_envs, rules)
-        if human or recording is not None:
-            _check_people(rules, "what they chose says nothing here" if human else f"{recording=} does not fit")
-        self.option_names = rules.names
-        self.can_change_option = self.plans_change_options = switch_cost is not None
-        self._played = None if recording is None else _figures_of(recording, controller)
+        options = self.options = BoatDockOptions.of(options, settings)
+        if num_envs < 1:
+            raise ValueError(f"BoatDockEnv: {num_envs=}, but must be at least 1")
+        if human and not options.are_peoples:
+            raise ValueError(
+                f"{options.unlike_peoples()}: people kept one of their two boats, so what they chose says nothing "
+                "here; leave it out"
+            )
+        facts, rules, compile_rules = self.facts(options), options.rules, options.compile_rules
+        self.option_names = facts.option_names
+        self.can_change_option = facts.can_change_option
+        self.plans_change_options = facts.plans_change_options
+        self._played = None if options.recording is None else _figures_of(options.recording, options.controller)
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.rules = rules
@@ -196,6 +167,11 @@ class BoatDockEnv(PAMDPEnv):
             self._oracle = BoatDockOracle(num_envs, rules, self.device)
             self.observation_spec["oracle"] = oracle_spec(num_envs, rules, self.device)
         self._set_seed(seed)
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem."""
+        return options.facts(cls.__name__)
 
     @property
     def has_choice(self) -> bool:
@@ -591,14 +567,6 @@ class BoatDockEnv(PAMDPEnv):
         if self._has_human:
             seen.set(keys.HUMAN_OPTION, human_shares(self._state))
         return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
-
-
-def _check_people(rules: Rules, so: str) -> None:
-    """Refuse what people did where they could not have done it; `so` says what does not go with these rules."""
-    if rules.are_peoples:
-        return
-    given = f"switch_cost={rules.switch_cost}" if rules.boats is None else f"boats={list(rules.names)}"
-    raise ValueError(f"BoatDockEnv: {given}: people kept one of their two boats, so {so}; leave it out")
 
 
 def _figures_of(recording: str, controller: str) -> dict[str, float]:

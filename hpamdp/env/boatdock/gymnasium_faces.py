@@ -10,7 +10,6 @@ Options of `reset`: `start` and `goal` `[2]` in screen px and, with these, `cont
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -18,7 +17,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from hpamdp.env.boatdock.numpy_boats import ActionFormat, NumpyBoats
-from hpamdp.env.boatdock.task import make_rules
+from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.faces import Face, VectorFace
 
 
@@ -26,10 +25,10 @@ class BoatDock(Face):
     """One boat to dock.
 
     Args:
-        controller, keymap, reward, observation, motor_noise, sensor_noise, slip, boats, controllers, switch_cost: the
-            task, as in BoatDockEnv.
+        options: the settings; None for the defaults.
         action_format: `dict` or `tuple`; see `hpamdp.env.boatdock.numpy_boats`.
         render_mode: None or `rgb_array` (`render` returns uint8 `[480, 480, 3]`).
+        settings: single settings by name, in place of those in `options`.
 
     `reset(seed=s)` starts with the first layout of seed s, `reset()` continues with the next one. The generators of
     torch, NumPy and Python are neither read nor moved.
@@ -41,31 +40,12 @@ class BoatDock(Face):
     def __init__(
         self,
         *,
-        controller: str = "choose",
-        keymap: Literal[1, 2, "random"] = 1,
-        reward: Literal["paper", "sparse"] = "paper",
-        observation: Literal["scaled", "pixels"] = "scaled",
-        motor_noise: float | Sequence[float] = 0.0,
-        sensor_noise: float = 0.0,
-        slip: float = 0.0,
-        boats: Sequence[str] | None = None,
-        controllers: Mapping[str, Sequence[float]] | None = None,
-        switch_cost: float | None = None,
+        options: BoatDockOptions | None = None,
         action_format: ActionFormat = "dict",
         render_mode: Literal["rgb_array"] | None = None,
+        **settings: Any,
     ) -> None:
-        rules = make_rules(
-            controller=controller,
-            keymap=keymap,
-            reward=reward,
-            observation=observation,
-            motor_noise=motor_noise,
-            sensor_noise=sensor_noise,
-            slip=slip,
-            boats=boats,
-            controllers=controllers,
-            switch_cost=switch_cost,
-        )
+        rules = BoatDockOptions.of(options, settings).rules
         super().__init__(NumpyBoats(rules, (), action_format), render_mode)
         self._rules = rules
 
@@ -92,13 +72,13 @@ class BoatDockVector(VectorFace):
 
     Args:
         num_envs: number of boats.
-        controller, keymap, reward, observation, motor_noise, sensor_noise, slip, boats, controllers, switch_cost: the
-            task, as in BoatDockEnv.
+        options: the settings; None for the defaults.
         action_format: `dict` or `tuple`; see `hpamdp.env.boatdock.numpy_boats`.
         autoreset_mode: when finished boats start again: in the next step (which ignores their actions), in the same
             step (the last observations and infos are `infos["final_obs"]` and `infos["final_info"]`), or only by
             `reset`.
-        compile_rules, device: as in BoatDockEnv.
+        device: as in BoatDockEnv.
+        settings: single settings by name, in place of those in `options`.
 
     `reset` takes one integer seed for all boats; the layouts of boat i depend only on the seed and i, not on
     `num_envs`. The options of `reset` have one row for each boat; `reset_mask` (bool `[N]`) resets only these boats.
@@ -111,37 +91,17 @@ class BoatDockVector(VectorFace):
         self,
         num_envs: int = 1,
         *,
-        controller: str = "choose",
-        keymap: Literal[1, 2, "random"] = 1,
-        reward: Literal["paper", "sparse"] = "paper",
-        observation: Literal["scaled", "pixels"] = "scaled",
-        motor_noise: float | Sequence[float] = 0.0,
-        sensor_noise: float = 0.0,
-        slip: float = 0.0,
-        boats: Sequence[str] | None = None,
-        controllers: Mapping[str, Sequence[float]] | None = None,
-        switch_cost: float | None = None,
+        options: BoatDockOptions | None = None,
         action_format: ActionFormat = "dict",
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        compile_rules: bool = False,
         device: Any = "cpu",
+        **settings: Any,
     ) -> None:
-        rules = make_rules(
-            controller=controller,
-            keymap=keymap,
-            reward=reward,
-            observation=observation,
-            motor_noise=motor_noise,
-            sensor_noise=sensor_noise,
-            slip=slip,
-            boats=boats,
-            controllers=controllers,
-            switch_cost=switch_cost,
-        )
+        options = BoatDockOptions.of(options, settings)
         make_fleet = None
-        if compile_rules or str(device) != "cpu":
+        if options.compile_rules or str(device) != "cpu":
             # It brings torch along.
             from hpamdp.env.boatdock.tensor_fleet import TensorFleet
 
-            make_fleet = partial(TensorFleet, device=device, compile_rules=compile_rules)
-        super().__init__(NumpyBoats(rules, (num_envs,), action_format, make_fleet), num_envs, autoreset_mode)
+            make_fleet = partial(TensorFleet, options=options, device=device)
+        super().__init__(NumpyBoats(options.rules, (num_envs,), action_format, make_fleet), num_envs, autoreset_mode)

@@ -79,7 +79,7 @@ class NumpyBoats(NumpyEnv):
         rules: of the environment.
         batch: see above.
         action_format: `dict` or `tuple`.
-        make_fleet: returns what moves the boats, given their number and the rules; the kernel by default.
+        make_fleet: returns what moves the boats, given their number; the kernel by default.
     """
 
     final_infos = ("score",)
@@ -89,19 +89,20 @@ class NumpyBoats(NumpyEnv):
         rules: Rules,
         batch: tuple[int, ...],
         action_format: ActionFormat,
-        make_fleet: Callable[[int, Rules], Any] | None = None,
+        make_fleet: Callable[[int], Any] | None = None,
     ) -> None:
         if action_format not in ("dict", "tuple"):
             raise ValueError(f"BoatDock: action_format={action_format!r}, but must be dict or tuple")
         num_boats = batch[0] if batch else 1
-        task.check_arguments(num_boats, rules)
+        if num_boats < 1:
+            raise ValueError(f"BoatDock: num_envs={num_boats}, but must be at least 1")
         self._rules = rules
         self.num_boats = num_boats
         self.is_reset = False
         self.has_choice = rules.controller == "choose"
         self.action_space = action_space(rules, action_format)
         self.observation_space = observation_space(rules)
-        self._fleet: Any = Fleet(num_boats, rules, first_env=0) if make_fleet is None else make_fleet(num_boats, rules)
+        self._fleet: Any = Fleet(num_boats, rules, first_env=0) if make_fleet is None else make_fleet(num_boats)
         self._batch = batch
         self._is_tuple = action_format == "tuple"
         self._leaf_names = ("option", "key", "duration") if self.has_choice else ("key", "duration")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from hpamdp.messages import invalid_action
@@ -40,7 +39,6 @@ CONTROLLER_DEGREES: dict[str, tuple[float, ...]] = {
     "incongruent1": (330.0, 210.0, 90.0),
     "incongruent2": (90.0, 330.0, 210.0),
 }
-_RESERVED = ("choose", "random")  # other values of `controller`
 
 # Indices of an episode's random numbers: three for each try at a layout, then the others.
 LAYOUT_TRIES = 4
@@ -143,118 +141,6 @@ class BoatState(NamedTuple):
     presses: Tensor
     outcome: Tensor
     episode: Tensor
-
-
-def chosen_boats(names: Sequence[str] | None, controllers: Mapping[str, Sequence[float]] | None = None) -> Boats | None:
-    """Return the boats with these names; arguments `boats` and `controllers` as in BoatDockEnv.
-
-    Raises:
-        ValueError: a boat has no controller, or a controller has no directions for the keys.
-    """
-    known: dict[str, tuple[float, ...]] = dict(CONTROLLER_DEGREES)
-    for name, degrees in (controllers or {}).items():
-        given = f"BoatDockEnv: controllers.{name}={list(degrees)}"
-        if name in _RESERVED:
-            raise ValueError(f"{given}, but {name} is no name for a controller; take another one")
-        if len(degrees) != NUM_KEYS or not all(math.isfinite(d) for d in degrees):
-            raise ValueError(f"{given}, but must be {NUM_KEYS} directions in degrees, one for each key")
-        degrees = tuple(float(d) for d in degrees)
-        if degrees != known.setdefault(name, degrees):
-            raise ValueError(f"{given}, but {name} has {list(known[name])}; take another name")
-    if names is None:
-        return None
-    given = f"BoatDockEnv: boats={list(names)}"
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise ValueError(f"{given}, but there is no controller {unknown[0]}; controllers has {', '.join(known)}")
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"{given}, but must be one or more different controllers")
-    return Boats(tuple(names), tuple(known[name] for name in names))
-
-
-def noise_of_each(motor_noise: float | Sequence[float], boats: Boats | None) -> tuple[float, ...]:
-    """Return the motor noise of each boat.
-
-    Raises:
-        ValueError: there are not as many as boats.
-    """
-    num = len(CONTROLLERS if boats is None else boats.names)
-    noises = (motor_noise,) * num if isinstance(motor_noise, int | float) else tuple(motor_noise)
-    if len(noises) != num:
-        allowed = "one number or two" if num == 2 else f"one number or {num}, one for each boat"
-        raise ValueError(f"BoatDockEnv: motor_noise={list(noises)}, but must be {allowed}")
-    return noises
-
-
-def make_rules(
-    *,
-    controller: str,
-    keymap: Literal[1, 2, "random"],
-    reward: RewardForm,
-    observation: ObservationForm,
-    motor_noise: float | Sequence[float],
-    sensor_noise: float,
-    slip: float,
-    boats: Sequence[str] | None,
-    controllers: Mapping[str, Sequence[float]] | None,
-    switch_cost: float | None,
-) -> Rules:
-    """Return the settings that a user gives, as BoatDockEnv explains them.
-
-    Raises:
-        ValueError: as `chosen_boats` and `noise_of_each`.
-    """
-    chosen = chosen_boats(boats, controllers)
-    noise = noise_of_each(motor_noise, chosen)
-    return Rules(controller, keymap, reward, observation, noise, sensor_noise, slip, chosen, switch_cost)
-
-
-def check_arguments(num_envs: int, rules: Rules) -> None:
-    """Check what a user sets.
-
-    Raises:
-        ValueError: a value is not allowed.
-    """
-    choices = {
-        "controller": ("choose", *(CONTROLLERS[::-1] if rules.boats is None else rules.names), "random"),
-        "keymap": (1, 2, "random"),
-        "reward": ("paper", "sparse"),
-        "observation": ("scaled", "pixels"),
-    }
-    for name, allowed in choices.items():
-        value = getattr(rules, name)
-        if value not in allowed:
-            raise ValueError(f"BoatDockEnv: {name}={value!r}, but must be one of {', '.join(map(str, allowed))}")
-    _check_boats(rules)
-    if num_envs < 1:
-        raise ValueError(f"BoatDockEnv: num_envs={num_envs}, but must be at least 1")
-    if not 0.0 <= rules.slip <= 1.0:
-        raise ValueError(f"BoatDockEnv: slip={rules.slip}, but must be a probability")
-    noises = (("motor_noise", rules.motor_noise, 10), ("sensor_noise", (rules.sensor_noise,), 1000))
-    for name, values, largest in noises:
-        for value in values:
-            if not 0.0 <= value <= largest:
-                raise ValueError(f"BoatDockEnv: {name}={value}, but must lie between 0 and {largest}")
-
-
-def _check_boats(rules: Rules) -> None:
-    """Check the settings of other boats and of changes between boats."""
-    names, cost = list(rules.names), rules.switch_cost
-    if rules.boats is not None and rules.keymap != 1:
-        raise ValueError(
-            f"BoatDockEnv: keymap={rules.keymap!r}: the controllers in boats={names} have none; leave it out"
-        )
-    if rules.controller == "choose" and len(names) < 2:
-        raise ValueError(f"BoatDockEnv: boats={names}: nothing to choose; name more, or use controller={names[0]}")
-    if cost is None:
-        return
-    if not 0.0 <= cost <= TANK:
-        raise ValueError(f"BoatDockEnv: switch_cost={cost}, but must lie between 0 and {TANK:g} seconds of fuel")
-    if rules.controller != "choose":
-        raise ValueError(
-            f"BoatDockEnv: switch_cost={cost}: controller={rules.controller} never changes boats; "
-            "use controller=choose or leave switch_cost out"
-        )
 
 
 def invalid_press(row: int, option: object, key: object, durations: object, num_options: int) -> ValueError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +13,8 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.episode import FUEL
 from hpamdp.env.boatdock.fleet import Readings
 from hpamdp.env.boatdock.kernel import OUTCOME
-from hpamdp.env.boatdock.task import SAILING, BoatState, Rules
+from hpamdp.env.boatdock.options import BoatDockOptions
+from hpamdp.env.boatdock.task import SAILING, BoatState
 
 
 class TensorFleet:
@@ -22,17 +22,12 @@ class TensorFleet:
 
     Args:
         num_boats: how many.
-        rules: of the environment.
-        device, compile_rules: as in BoatDockEnv.
+        options: the settings of the environment.
+        device: of the environment.
     """
 
-    def __init__(self, num_boats: int, rules: Rules, *, device: torch.device | str, compile_rules: bool) -> None:
-        settings: dict[str, Any] = {**rules._asdict(), "motor_noise": list(rules.motor_noise)}
-        del settings["is_evaluation"]
-        if rules.boats is not None:
-            settings["boats"] = list(rules.boats.names)
-            settings["controllers"] = {n: list(degrees) for n, degrees in zip(*rules.boats, strict=True)}
-        self._env = BoatDockEnv(num_boats, **settings, device=device, compile_rules=compile_rules)
+    def __init__(self, num_boats: int, options: BoatDockOptions, *, device: torch.device | str) -> None:
+        self._env = BoatDockEnv(num_boats, options=options, device=device)
 
     @property
     def floats(self) -> np.ndarray:

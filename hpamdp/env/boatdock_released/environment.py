@@ -10,10 +10,11 @@ observations and a new layout for each episode are possible.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
+from pydantic import PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical, Composite, Unbounded
@@ -25,6 +26,34 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock_released import rules as released
 from hpamdp.env.boatdock_released.rules import ReleasedState
 from hpamdp.env.columns import restored, where
+from hpamdp.env.facts import ProblemFacts
+from hpamdp.settings import Settings
+
+
+class ReleasedBoatDockOptions(Settings):
+    """Settings of `ReleasedBoatDockEnv`."""
+
+    controller: Literal["congruent", "incongruent"] = "congruent"
+    """Which boat it is. The agent cannot choose, so use high=none."""
+    keymap: Literal[0, 1] = 0
+    """Key map of the incongruent boat: 1, or 0, which is sampled from {0, 1} at every reset until it is 1.
+
+    0 has the keys of key map 2 of env=boatdock. The congruent boat observes -1.
+    """
+    test_mode: Literal[0, 1, None] = None
+    """1: only layouts whose bearing is within 30 degrees of the incongruent boat's directions; 0: only the others.
+
+    If None, all layouts.
+    """
+    frozen_layouts: bool = True
+    """Whether an environment keeps the layout of its first reset, as released, or has a new one every episode."""
+    observation: Literal["pixels", "scaled"] = "pixels"
+    """`pixels` `[N, 15]` as released, or `scaled` to about [-1, 1] with goal - boat appended, `[N, 17]`.
+
+    If scaled, fuel is log(1 + fuel / 5).
+    """
+    max_steps: PositiveInt = 999
+    """Steps after which an episode is truncated; released: 999."""
 
 
 class ReleasedBoatDockEnv(PAMDPEnv):
@@ -38,23 +67,16 @@ class ReleasedBoatDockEnv(PAMDPEnv):
     earns the decrease of the distance to the goal, as a share of the distance at the start. The step that ends an
     episode shows the boat and the distance from before it.
 
+    An environment keeps its controller for life, so that no selector goes with it.
+
     Args:
         num_envs: number of boats.
-        controller: `congruent` or `incongruent`. An environment keeps its controller for life, so no selector goes with
-            it.
-        keymap: of the incongruent boat: 1, or 0, which counts as unset and is sampled from {0, 1} at every reset until
-            it is 1 (0 has the keys of key map 2 of `BoatDockEnv`). The congruent boat observes -1.
-        test_mode: 1: only layouts whose bearing from start to goal is within 30 degrees of (0, 1) or (-+.87, -.5), the
-            incongruent boat's directions; 0: only the others; None: all.
-        frozen_layouts: an environment keeps the layout of its first reset, as released; otherwise every episode has a
-            new one. `set_seed` makes a new environment of each, with a new layout.
-        observation: `pixels`, as released (`[N, 15]`), or `scaled` to about [-1, 1] with goal - boat appended
-            (`[N, 17]`), where fuel is log(1 + fuel / 5).
-        max_steps: steps after which an episode is truncated; released: 999.
+        options: the settings; None for the defaults.
         dtype: `float32` or `float64`, of the computation and its results; durations are always rounded in float32.
         device: of the tensors.
         seed: of layouts and key maps; the global generators are neither read nor moved.
-        first_env: number of the first boat, where other processes have the boats before it.
+        first_env: number of the first boat, if other processes have those before it.
+        settings: single settings by name, in place of those in `options`.
 
     `reset` also takes layouts to play, and keep: a tensordict with `start` and `goal` `[N, 2]` in screen px and, for
     the incongruent boat, optionally `keymap` int `[N]`.
@@ -63,6 +85,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         ValueError: an argument, action or layout is invalid; the state is unchanged.
     """
 
+    Options = ReleasedBoatDockOptions
     parameter_dims = (1, 1, 1)
     result_keys = (keys.OUTCOME,)
     _state: ReleasedState
@@ -71,45 +94,41 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         self,
         num_envs: int = 1,
         *,
-        controller: Literal["congruent", "incongruent"] = "congruent",
-        keymap: Literal[0, 1] = 0,
-        test_mode: Literal[0, 1, None] = None,
-        frozen_layouts: bool = True,
-        observation: Literal["pixels", "scaled"] = "pixels",
-        max_steps: int = 999,
+        options: ReleasedBoatDockOptions | None = None,
         dtype: Literal["float32", "float64"] = "float32",
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
+        **settings: Any,
     ) -> None:
-        _check_choice("controller", controller, tuple(released.DIRECTIONS))
-        _check_choice("keymap", keymap, (0, 1))
-        _check_choice("test_mode", test_mode, (None, 0, 1))
-        _check_choice("observation", observation, ("pixels", "scaled"))
-        _check_choice("dtype", dtype, ("float32", "float64"))
-        for name, value in (("num_envs", num_envs), ("max_steps", max_steps)):
-            if value < 1:
-                raise ValueError(f"ReleasedBoatDockEnv: {name}={value}, but must be at least 1")
+        self.options = ReleasedBoatDockOptions.of(options, settings)
+        if dtype not in ("float32", "float64"):
+            raise ValueError(f"ReleasedBoatDockEnv: {dtype=}, but must be float32 or float64")
+        if num_envs < 1:
+            raise ValueError(f"ReleasedBoatDockEnv: {num_envs=}, but must be at least 1")
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
-        self.max_steps = max_steps
-        self.controller = controller
-        self.keymap = keymap
-        self.test_mode = test_mode
-        self.frozen_layouts = frozen_layouts
-        self.is_scaled = observation == "scaled"
+        self.max_steps = self.options.max_steps
+        self.is_scaled = self.options.observation == "scaled"
         self.float_type: torch.dtype = getattr(torch, dtype)
-        self._directions = torch.tensor(released.DIRECTIONS[controller], dtype=self.float_type, device=self.device)
+        self._directions = torch.tensor(
+            released.DIRECTIONS[self.options.controller], dtype=self.float_type, device=self.device
+        )
         self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
         self._make_specs()
         self._set_seed(seed)
+
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem."""
+        return ProblemFacts(title=cls.__name__)
 
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return layouts to `reset` with, one for each boat, from another stream than those of training."""
         episode = torch.zeros_like(self._environment)
         seed_tensor = counter_rng.seed_tensor(seed, self.device)
         rng = counter_rng.key_for(seed_tensor, counter_rng.EVALUATION, self._environment, episode)
-        points = released.sample_layouts(rng, self.test_mode).to(self.float_type)
+        points = released.sample_layouts(rng, self.options.test_mode).to(self.float_type)
         layout = {"start": points[:, :2], "goal": points[:, 2:]}
         return TensorDict(layout, batch_size=self.batch_size, device=self.device)
 
@@ -125,7 +144,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
 
     def summary_entries(self) -> dict[str, str]:
         """Return which `controller` the boats have."""
-        return {"controller": self.controller}
+        return {"controller": self.options.controller}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the shares of the outcomes other than success. There is no ceiling: idling refuels without limit."""
@@ -178,7 +197,8 @@ class ReleasedBoatDockEnv(PAMDPEnv):
             velocity_x=zeros,
             velocity_y=zeros,
             fuel=zeros,
-            keymap=integer_zeros + (self.keymap if self.controller == "incongruent" else released.NO_KEYMAP),
+            keymap=integer_zeros
+            + (self.options.keymap if self.options.controller == "incongruent" else released.NO_KEYMAP),
             steps=integer_zeros,
             outcome=integer_zeros,
             episode=integer_zeros - 1,
@@ -212,11 +232,13 @@ class ReleasedBoatDockEnv(PAMDPEnv):
 
     def _sampled_layout(self, rng: counter_rng.Key, mask: Tensor) -> dict[str, Tensor]:
         """Return the layout columns of the state, with new layouts in those rows of `mask` `[N]` that need one."""
-        is_due = mask & (self._state.episode < 0) if self.frozen_layouts else mask
+        is_due = mask & (self._state.episode < 0) if self.options.frozen_layouts else mask
         state = self._state
         points = torch.stack([state.start_x, state.start_y, state.goal_x, state.goal_y], -1)
         if is_due.any():
-            points[is_due] = released.sample_layouts(rng._replace(bits=rng.bits[is_due]), self.test_mode).to(points)
+            points[is_due] = released.sample_layouts(rng._replace(bits=rng.bits[is_due]), self.options.test_mode).to(
+                points
+            )
         start_x, start_y, goal_x, goal_y = points.unbind(-1)
         return {"start_x": start_x, "start_y": start_y, "goal_x": goal_x, "goal_y": goal_y}
 
@@ -243,7 +265,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         keymap = given.get("keymap", None)
         if keymap is None:
             return columns
-        if self.controller == "congruent":
+        if self.options.controller == "congruent":
             raise ValueError("reset: keymap is given, but the congruent boat has none")
         if keymap.shape != (self.num_envs,) or not ((keymap == 0) | (keymap == 1)).all():
             raise ValueError(f"reset: keymap must be 0 or 1 in shape [{self.num_envs}]")
@@ -271,15 +293,10 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         done = (outcome != released.SAILING).unsqueeze(-1)
         truncated = (outcome == released.TIME_LIMIT).unsqueeze(-1)
         leaves = {
-            keys.OBSERVATION: released.observe(self._state, self.controller == "congruent", self.is_scaled),
+            keys.OBSERVATION: released.observe(self._state, self.options.controller == "congruent", self.is_scaled),
             keys.OUTCOME: outcome,
             keys.DONE: done,
             keys.TERMINATED: done & ~truncated,
             keys.TRUNCATED: truncated,
         }
         return TensorDict(leaves, batch_size=self.batch_size, device=self.device)
-
-
-def _check_choice(name: str, value: object, allowed: tuple[object, ...]) -> None:
-    if value not in allowed:
-        raise ValueError(f"ReleasedBoatDockEnv: {name}={value!r}, but must be one of {', '.join(map(str, allowed))}")

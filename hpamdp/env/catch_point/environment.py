@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env import point_agent
@@ -18,9 +19,25 @@ from hpamdp.env.catch_point.rules import CatchPointState
 from hpamdp.env.counter_rng import Key
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
+from hpamdp.settings import Settings
 
 _TURNS = 8  # of all the turns, so many are declared
 _CEILING = {25: 0.964, 30: 0.997}  # of success, by the limit of steps: who starts too far away cannot arrive
+
+
+class CatchPointOptions(Settings):
+    """Settings of `CatchPointEnv`. The defaults are HyAR's version."""
+
+    max_steps: PositiveInt = 25
+    """Steps after which an episode is truncated."""
+    catches: PositiveInt = rules.PUBLISHED_CATCHES
+    """Catches that an episode allows. The published code allows 11, its papers say 10."""
+    late_end: bool = True
+    """Whether an episode without catches ends one step late, with reward 0, as in the published code."""
+    progress: bool = False
+    """Whether the agent observes its misses and the time, `[N, 6]` instead of `[N, 4]`, as in DLPA's code."""
+    compile_rules: bool = False
+    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
 
 class CatchPointEnv(PointEnv[CatchPointState]):
@@ -33,66 +50,31 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     The reward is minus the squared distance after each step, plus 20 for a catch within 0.2 of the target, which ends
     the episode. A catch elsewhere is a miss.
 
-    Args:
-        num_envs: number of planes.
-        max_steps: actions after which an episode is truncated; HyAR has 25.
-        catches: that an episode allows. The published code has 11, its papers 10.
-        late_end: whether an episode that has no catches left ends a step later, in which it earns 0, as the published
-            code does it.
-        progress: whether misses and time are observed, too, `[N, 6]` instead of `[N, 4]`, as DLPA has it.
-        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
-        oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
-        device: of the tensors.
-        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
-        first_env: number of the first plane, where other processes have the planes before it.
-
-    Raises:
-        ValueError: an argument or an action is invalid; the state is unchanged.
+    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `CounterEnv`.
     """
 
+    Options = CatchPointOptions
+    options: CatchPointOptions
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     parameter_dims = (1, 0)
+    parameter_low = (-1.0,)
+    parameter_high = (1.0,)
+    row_kernel = staticmethod(kernel.advance)
     target_radius = point_agent.HIT_RADIUS
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        max_steps: int = 25,
-        catches: int = rules.PUBLISHED_CATCHES,
-        late_end: bool = True,
-        progress: bool = False,
-        compile_rules: bool = False,
-        oracle: bool = False,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-    ) -> None:
-        if catches < 1:
-            raise ValueError(f"CatchPointEnv: catches={catches}, but must be at least 1")
-        self.observation_names = point_agent.OBSERVATION_NAMES + (rules.PROGRESS_NAMES if progress else ())
-        super().__init__(
-            num_envs,
-            max_steps=max_steps,
-            parameter_low=(-1.0,),
-            parameter_high=(1.0,),
-            device=device,
-            seed=seed,
-            first_env=first_env,
-            oracle=oracle,
-            compile_rules=compile_rules,
-        )
-        self.catches = catches
-        self.late_end = late_end
-        self.progress = progress
-        self._use_kernel(kernel.advance, CatchPointEnv, [catches, late_end, progress])
+    def _prepare(self) -> None:
+        self.observation_names = point_agent.OBSERVATION_NAMES + (rules.PROGRESS_NAMES if self.options.progress else ())
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the rules of catches, and whether progress is observed."""
+        return [self.options.catches, self.options.late_end, self.options.progress]
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[4]` or `[6]` each."""
         low, high = point_agent.observation_bounds(self.max_steps)
-        if not self.progress:
+        if not self.options.progress:
             return low, high
         return [*low, -1.0, -1.0], [*high, 1.0, self.max_steps / 12.0 - 0.99]
 
@@ -128,11 +110,13 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         self, state: CatchPointState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
     ) -> tuple[CatchPointState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
-        return rules.act(state, discrete, parameters.squeeze(-1), catches=self.catches, late_end=self.late_end)
+        return rules.act(
+            state, discrete, parameters.squeeze(-1), catches=self.options.catches, late_end=self.options.late_end
+        )
 
     def observe(self, state: CatchPointState) -> Tensor:
         """Return the observations `[N, 4]`, or `[N, 6]` with `progress`."""
-        return rules.observe(state, progress=self.progress)
+        return rules.observe(state, progress=self.options.progress)
 
     def scripted_action(self, state: CatchPointState) -> tuple[Tensor, Tensor]:
         """Return the action of the hand-written player and its parameter, `[N]` each."""
@@ -141,7 +125,11 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
         """Return the figures of the hand-written player, and the share of starts from which the target is in reach."""
         ceiling = {"ceiling": {"success": _CEILING[self.max_steps]}} if self.max_steps in _CEILING else {}
-        is_published = (self.max_steps, self.catches, self.late_end) == (25, rules.PUBLISHED_CATCHES, True)
+        is_published = (self.max_steps, self.options.catches, self.options.late_end) == (
+            25,
+            rules.PUBLISHED_CATCHES,
+            True,
+        )
         return ({"scripted": {"score": 8.73, "success": 0.964}} if is_published else {}) | ceiling
 
     def picture_note(self, state: CatchPointState) -> str:

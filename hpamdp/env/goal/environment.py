@@ -7,10 +7,11 @@ arXiv:2109.05490; see `hpamdp.env.goal.rules`, also for the differences.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import torch
+from pydantic import Field, PositiveInt, Strict
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -18,11 +19,45 @@ from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.goal import kernel, rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
 from hpamdp.geometry import Symmetries, make_symmetries
+from hpamdp.settings import Settings
 
-Slip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]  # the last is Hard Goal's alone
+Slip = Literal["kick_to", "goal_distance", "keeper_projection"]
+HardSlip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]
+
+
+class GoalOptions(Settings):
+    """Settings of `GoalEnv`."""
+
+    max_steps: PositiveInt = 100
+    """Steps after which an episode is truncated. The last one is not played, as in the published code."""
+    observation: Literal["scaled", "raw"] = "scaled"
+    """`scaled` to [-1, 1], which orientations and the ball can leave, or `raw` positions, velocities and angles."""
+    noise: Annotated[float, Field(ge=0.0, le=5.0)] = 1.0
+    """Factor on the published noise of all motions; 0 means no noise. From about 10 on, a run might never end."""
+    repaired: Annotated[tuple[Slip, ...], Strict(False)] = ()
+    """Slips of the published code to take out. With any of them, published scores do not compare.
+
+    `kick_to`: a kick to (x, y) goes to (x, x), so that y is never read. `goal_distance`: below the goal and behind its
+    line, the distance is 14.02 too large. `keeper_projection`: this observation is clipped to [-7.01, 14.02] instead of
+    [-7.01, 7.01].
+    """
+    compile_rules: bool = False
+    """Compile the ticks instead of using the kernel, for a GPU; the first action takes about a minute."""
+
+
+class HardGoalOptions(GoalOptions):
+    """Settings of `HardGoalEnv`."""
+
+    repaired: Annotated[tuple[HardSlip, ...], Strict(False)] = ()  # type: ignore[assignment]
+    """Slips of the published code to take out, those of Goal and `middle_shots`.
+
+    `middle_shots`: the middle stretch is a single point, y = 1.402, and not [-1.402, 1.402], so that no shot goes to
+    the middle of the goal.
+    """
 
 
 class GoalEnv(CounterEnv[GoalState]):
@@ -37,36 +72,20 @@ class GoalEnv(CounterEnv[GoalState]):
     The reward is 50 for a goal. An episode that ends otherwise, since the keeper catches the ball or the ball leaves
     the pitch, or at the time limit, costs the distance of the ball from the goal.
 
-    The rules are those behind all published numbers. That includes slips of the published code, which `repaired` takes
-    out:
-    - `kick_to`: a kick to (x, y) goes to (x, x), so that y is never read;
-    - `goal_distance`: behind the goal line below the goal, it is twice 7.01 too large;
-    - `keeper_projection`: this observation is clipped to [-7.01, 14.02] instead of [-7.01, 7.01].
-
-    Args:
-        num_envs: number of pitches.
-        max_steps: actions after which an episode is truncated. The last one is not played, as in gym-goal, which has
-            100.
-        observation: `scaled` to [-1, 1], which orientations and the ball can leave, or `raw`; `[N, 17]` both.
-        noise: factor on the published noise of the motions; 0 is none. Starts are random all the same. At most 5: from
-            about 10 on, a run towards -x gets nowhere on average, and an action may never end.
-        repaired: the slips to take out; `slips` are those that the problem has.
-        compile_rules: compile the ticks (takes about a minute) instead of using the kernel, for a GPU.
-        device: of the tensors.
-        seed: of starts and noise; the global generators are neither read nor moved.
-        first_env: number of the first pitch, where other processes have the pitches before it.
-
-    Raises:
-        ValueError: an argument or an action is invalid; the state is unchanged.
+    The rules are those behind all published numbers, with the slips of the published code; `options.repaired` takes
+    slips out. Starts are always random. For the constructor's arguments and errors see `CounterEnv`.
     """
 
+    Options: ClassVar[type[Settings]] = GoalOptions
+    options: GoalOptions
     discrete_names: tuple[str, ...] = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims: tuple[int, ...] = rules.PARAMETER_DIMS
-    parameter_low: ClassVar[tuple[float, ...]] = rules.PARAMETER_LOW
-    parameter_high: ClassVar[tuple[float, ...]] = rules.PARAMETER_HIGH
-    slips: ClassVar[tuple[str, ...]] = ("kick_to", "goal_distance", "keeper_projection")
+    parameter_low: Sequence[float] = rules.PARAMETER_LOW
+    parameter_high: Sequence[float] = rules.PARAMETER_HIGH
+    slips: ClassVar[tuple[str, ...]] = get_args(Slip)
+    row_kernel = staticmethod(kernel.advance)
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("success", "goals", "share"),
         Metric("return", "return"),
@@ -80,44 +99,28 @@ class GoalEnv(CounterEnv[GoalState]):
         Metric("return", "Return"),
     )
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        max_steps: int = 100,
-        observation: Literal["scaled", "raw"] = "scaled",
-        noise: float = 1.0,
-        repaired: Sequence[Slip] = (),
-        compile_rules: bool = False,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-    ) -> None:
-        self._check_arguments(observation, noise, repaired)
-        super().__init__(
-            num_envs,
-            max_steps=max_steps,
-            parameter_low=self.parameter_low,
-            parameter_high=self.parameter_high,
-            device=device,
-            seed=seed,
-            first_env=first_env,
-        )
-        self.noise = noise
-        self.repaired = tuple(repaired)
-        self._is_scaled = observation == "scaled"
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem; options to begin with are to carry the ball and to shoot."""
+        groups = {"carry": cls.discrete_names[:1], "shoot": cls.discrete_names[1:]}
+        return ProblemFacts(title=cls.__name__, default_options=groups)
+
+    def _prepare(self) -> None:
         self._tick, self._random_numbers = rules.masked_tick, rules.random_numbers
-        if compile_rules:
-            self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
-            self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
-        self._is_compiled = compile_rules
-        repairs = ("kick_to", "goal_distance", "keeper_projection", "middle_shots")
-        is_hard = self.parameter_dims != rules.PARAMETER_DIMS
-        self._use_kernel(
-            kernel.advance,
-            GoalEnv,
-            [noise, self._is_scaled, *(repair in self.repaired for repair in repairs), is_hard],
-        )
+
+    def _compile(self) -> None:
+        """Compile what a tick does; an action is a loop over ticks."""
+        self._tick = torch.compile(rules.masked_tick, **rules.COMPILE_ARGUMENTS)
+        self._random_numbers = torch.compile(rules.random_numbers, **rules.COMPILE_ARGUMENTS)
+
+    @property
+    def _is_scaled(self) -> bool:
+        return self.options.observation == "scaled"
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the noise, the form of the observation, which slips are repaired, and which problem it is."""
+        repaired = [slip in self.options.repaired for slip in get_args(HardSlip)]
+        return [self.options.noise, self._is_scaled, *repaired, isinstance(self, HardGoalEnv)]
 
     def start(self, episode: Tensor, rng: Key) -> GoalState:
         """Return the states in which episodes begin."""
@@ -136,15 +139,17 @@ class GoalEnv(CounterEnv[GoalState]):
             self._aim(discrete, parameters),
             ~is_idle,
             numbers,
-            noise=self.noise,
+            noise=self.options.noise,
             max_steps=self.max_steps,
             tick=self._tick,
         )
-        return after, rules.reward(state, after, repairs_distance="goal_distance" in self.repaired)
+        return after, rules.reward(state, after, repairs_distance="goal_distance" in self.options.repaired)
 
     def observe(self, state: GoalState) -> Tensor:
         """Return the observations `[N, 17]`."""
-        return rules.observe(state, is_scaled=self._is_scaled, repairs_projection="keeper_projection" in self.repaired)
+        return rules.observe(
+            state, is_scaled=self._is_scaled, repairs_projection="keeper_projection" in self.options.repaired
+        )
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return the published initial parameters, scaled to [-1, 1], as a linear function of the observation.
@@ -169,11 +174,6 @@ class GoalEnv(CounterEnv[GoalState]):
             bias = bias - weights @ ((high + low) / (high - low))
             weights = 2.0 * weights / (high - low)
         return weights, bias
-
-    @property
-    def default_options(self) -> Mapping[str, Sequence[int | str]]:
-        """Carry: the kick to a point; shoot: all shots."""
-        return {"carry": self.discrete_names[:1], "shoot": self.discrete_names[1:]}
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return how episodes `[M]` ended: `success` (a goal), `caught`, `out` and `time_limit`, all bool.
@@ -205,7 +205,7 @@ class GoalEnv(CounterEnv[GoalState]):
         An unrepaired kick goes to (x, x), on one side of the pitch; the distance from the goal is wrong on the other
         side alone, and the keeper's shadow is clipped differently on the two sides.
         """
-        if set(self.repaired) != set(self.slips):
+        if set(self.options.repaired) != set(self.slips):
             return None
         # y, vertical velocities and orientations change their sign.
         flips = torch.tensor([name.endswith(("_y", "_vy", "_angle", "_projection")) for name in self.observation_names])
@@ -236,17 +236,7 @@ class GoalEnv(CounterEnv[GoalState]):
         return torch.tensor([1.0] + [-1.0] * (len(self.parameter_low) - 1), dtype=torch.float32)
 
     def _aim(self, discrete: Tensor, parameters: Tensor) -> Aim:
-        return rules.goal_aim(discrete, parameters, kicks_to_point="kick_to" in self.repaired)
-
-    def _check_arguments(self, observation: str, noise: float, repaired: Sequence[str]) -> None:
-        name = type(self).__name__
-        if observation not in ("scaled", "raw"):
-            raise ValueError(f"{name}: observation={observation!r}, but must be scaled or raw")
-        if not 0.0 <= noise <= 5.0:
-            raise ValueError(f"{name}: noise={noise}, but must lie between 0 and 5")
-        unknown = [slip for slip in repaired if slip not in self.slips]
-        if unknown:
-            raise ValueError(f"{name}: repaired={list(repaired)}, but may only have {', '.join(self.slips)}")
+        return rules.goal_aim(discrete, parameters, kicks_to_point="kick_to" in self.options.repaired)
 
 
 class HardGoalEnv(GoalEnv):
@@ -256,19 +246,16 @@ class HardGoalEnv(GoalEnv):
     stretches from y = -7.01 to 7.01; `("action", "parameters")` float32 `[N, 12]` in [-1, 1]: the point to kick to,
     scaled from x in [0, 40] and y in [-15, 15], then one of each shot: where in its stretch, 1 being the lower end.
 
-    A further slip of the published code, beside those of `GoalEnv`, is `middle_shots`: the middle stretch is a single
-    point, y = 1.402, and not [-1.402, 1.402], so that no shot goes to the middle of the goal.
-
     The published code does not clip the shots' parameters; within [-1, 1] that makes no difference.
 
-    For the arguments and errors see `GoalEnv`.
     """
 
+    Options = HardGoalOptions
     discrete_names = rules.HARD_GOAL_ACTIONS
     parameter_dims = (2,) + (1,) * (len(rules.HARD_GOAL_ACTIONS) - 1)
     parameter_low = (-1.0,) * 12
     parameter_high = (1.0,) * 12
-    slips = ("kick_to", "goal_distance", "keeper_projection", "middle_shots")
+    slips = get_args(HardSlip)
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
         """Return None: there are no published ones."""
@@ -283,6 +270,6 @@ class HardGoalEnv(GoalEnv):
         return rules.hard_goal_aim(
             discrete,
             parameters,
-            kicks_to_point="kick_to" in self.repaired,
-            has_middle="middle_shots" in self.repaired,
+            kicks_to_point="kick_to" in self.options.repaired,
+            has_middle="middle_shots" in self.options.repaired,
         )

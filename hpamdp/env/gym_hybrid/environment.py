@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env.counter_rng import Key
@@ -16,47 +17,46 @@ from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
+from hpamdp.settings import Settings
+
+
+class VehicleOptions(Settings):
+    """Settings of `MovingEnv` and `SlidingEnv`."""
+
+    max_steps: PositiveInt = rules.PUBLISHED_STEPS
+    """Steps after which an episode ends."""
+    limit: Literal["truncated", "terminated"] = "truncated"
+    """Whether values bootstrap past this end (`truncated`) or stop there (`terminated`), as in the published code.
+
+    The time is observed, and the end costs 1.
+    """
+    compile_rules: bool = False
+    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
 
 class _VehicleEnv(PointEnv[VehicleState]):
     """What Moving and Sliding have in common; see `MovingEnv`."""
 
+    Options = VehicleOptions
+    options: VehicleOptions
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 0)
+    parameter_low = rules.PARAMETER_LOW
+    parameter_high = rules.PARAMETER_HIGH
+    row_kernel = staticmethod(kernel.advance)
     target_radius = rules.TARGET_RADIUS
     has_walls = True
     slides: ClassVar[bool]
     scripted_figures: ClassVar[dict[str, float]]  # of the hand-written player
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        max_steps: int = rules.PUBLISHED_STEPS,
-        limit: Literal["truncated", "terminated"] = "truncated",
-        compile_rules: bool = False,
-        oracle: bool = False,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-    ) -> None:
-        if limit not in ("truncated", "terminated"):
-            raise ValueError(f"{type(self).__name__}: {limit=}, but must be truncated or terminated")
-        super().__init__(
-            num_envs,
-            max_steps=max_steps,
-            parameter_low=rules.PARAMETER_LOW,
-            parameter_high=rules.PARAMETER_HIGH,
-            device=device,
-            seed=seed,
-            first_env=first_env,
-            oracle=oracle,
-            compile_rules=compile_rules,
-        )
-        self.limit_terminates = limit == "terminated"
-        self._use_kernel(kernel.advance, _VehicleEnv, [self.slides])
+    def _prepare(self) -> None:
+        self.limit_terminates = self.options.limit == "terminated"
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return whether the vehicle slides."""
+        return [self.slides]
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -127,18 +127,7 @@ class MovingEnv(_VehicleEnv):
     The reward is the way made towards the target, less 0.001 a step, plus 1 for stopping within 0.1 of it. Who leaves
     the field or runs out of time gets -1 instead. An episode terminates at rest in the target and outside the field.
 
-    Args:
-        num_envs: number of fields.
-        max_steps: actions after which an episode ends; gym-hybrid has 201.
-        limit: what this end counts as. `truncated`: values go on past it. `terminated`: they stop there.
-        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
-        oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
-        device: of the tensors.
-        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
-        first_env: number of the first field, where other processes have the fields before it.
-
-    Raises:
-        ValueError: an argument or an action is invalid; the state is unchanged.
+    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `CounterEnv`.
     """
 
     slides = False

@@ -12,9 +12,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from pydantic import PositiveInt, ValidationError, model_validator
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
@@ -28,6 +30,7 @@ from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
 from hpamdp.env.gymnasium.time_limit import with_limit
 from hpamdp.env.gymnasium.values import flag
 from hpamdp.messages import one_line
+from hpamdp.settings import Settings
 
 _SUCCESS = "success"
 # If an info has both entries, the first one counts.
@@ -35,6 +38,46 @@ _SUCCESS_ENTRIES = ("is_success", "success")
 _SEED = "seed"
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
+
+
+class GymnasiumOptions(Settings):
+    """Settings of `GymnasiumEnv`."""
+
+    id: str | None = None
+    """The registered name, as `gymnasium.make` takes it; `module:Name-v0` imports the module, which registers it."""
+    entry_point: str | None = None
+    """Instead of `id`, a class or function `package.module:name` that returns the environment.
+
+    The environment may have the interface of gym, with four values from `step`; `gym:make` makes environments that are
+    registered with gym.
+    """
+    kwargs: dict[str, Any] | None = None
+    """Arguments of the environment's constructor, as in `env.kwargs={size:5}`."""
+    max_steps: PositiveInt | None = None
+    """Steps after which an episode is truncated. If None, the limit of the `TimeLimit` wrapper or of the spec."""
+    parameter_dims: list[int] | None = None
+    """How many parameters each discrete action takes of one box for all, as in [1, 1, 0]. If None, the whole box."""
+    option_key: int | str | None = None
+    """The option's name in a `Dict` of actions or its number in a `Tuple`. If None, the entry `option`, if any."""
+    action_mask: MaskSource | None = None
+    """Where the environment says which actions it forbids. `info`: `action_mask` and `option_mask` in each info.
+
+    `ignore`: masks are ignored. If None, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
+    has them. A mask in another place, such as a method `action_masks()`, is refused unless masks are ignored.
+    """
+    observation_keys: list[int | str] | None = None
+    """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If None, all but masks."""
+    observation_scaling: Scaling = "bounds"
+    """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not."""
+    out_of_bounds: OutOfBounds = "refuse"
+    """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.id is None) == (self.entry_point is None):
+            given = "neither is" if self.id is None else "both are"
+            raise ValueError(f"set env.id=Name-v0 or env.entry_point=package.module:name; {given} set")
+        return self
 
 
 class GymnasiumEnv(PAMDPEnv):
@@ -51,33 +94,18 @@ class GymnasiumEnv(PAMDPEnv):
 
     Args:
         num_envs: number of copies.
-        id: as `gymnasium.make` takes it; with `module:Name-v0` the module, which registers the name, is imported.
-        entry_point: instead of `id`, a class or function `package.module:name` that returns the environment. An
-            environment that is no `gymnasium.Env` must have the four-value interface of `gym`: see `FourValueEnv`.
-        kwargs: passed to the environment's constructor.
-        max_steps: steps after which an episode is truncated. If None, the environment's own limit: see `with_limit`.
-        parameter_dims: how many parameters each discrete action takes of one box for all; None: each takes the whole
-            box.
-        option_key: the option's name in a `Dict` of actions, or its number in a `Tuple`; None: the entry `option`, if
-            there is one.
-        action_mask: where the environment says which discrete actions it forbids, and which options, as K numbers that
-            are 0 where one is: `info`: as `action_mask` and `option_mask` in the info of every reset and step;
-            `ignore`: masks are ignored; None: in the observation, a `Dict`, if it has these entries. Unless masks are
-            ignored, a mask in another place, such as a method `action_masks`, is refused.
-        observation_keys: of a `Tuple` (numbers from 0) or `Dict` (names) of observations, the entries to keep, in this
-            order; None: all but masks.
-        observation_scaling: `bounds`, `running` or `none`: see `ObservationSpace`.
-        out_of_bounds: what happens to observed numbers outside the bounds of their `Box`: `refuse` ends the run,
-            `clip` moves them to the bound, `allow` keeps them.
+        options: the settings; None for the defaults.
         device: of the tensors.
         seed: of the episodes, see above.
-        first_env: number of the first copy, where other processes have the copies before it.
+        first_env: number of the first copy, if other processes have those before it.
+        settings: single settings by name, in place of those in `options`.
 
     Raises:
         ValueError: an argument, a space or an action is invalid; after an invalid action no copy has moved.
         ProblemError: a copy gave what its own spaces do not have.
     """
 
+    Options = GymnasiumOptions
     result_keys = (_SUCCESS,)
     guarded_settings = ("id", "entry_point", "kwargs")
 
@@ -85,43 +113,38 @@ class GymnasiumEnv(PAMDPEnv):
         self,
         num_envs: int = 1,
         *,
-        id: str | None = None,
-        entry_point: str | None = None,
-        kwargs: dict[str, Any] | None = None,
-        max_steps: int | None = None,
-        parameter_dims: list[int] | None = None,
-        option_key: int | str | None = None,
-        action_mask: MaskSource | None = None,
-        observation_keys: list[int | str] | None = None,
-        observation_scaling: Scaling = "bounds",
-        out_of_bounds: OutOfBounds = "refuse",
+        options: GymnasiumOptions | None = None,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
         first_env: int = 0,
+        **settings: Any,
     ) -> None:
-        _check_arguments(num_envs, id, entry_point, max_steps)
+        options = self.options = GymnasiumOptions.of(options, settings)
+        if num_envs < 1:
+            raise ValueError(f"GymnasiumEnv: {num_envs=}, but must be at least 1")
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.first_env = first_env
-        self._name = f"GymnasiumEnv: {id if entry_point is None else entry_point}"
-        self.envs = [self._make(id, entry_point, kwargs or {}, max_steps) for _ in range(num_envs)]
+        self._name = f"GymnasiumEnv: {options.entry_point or options.id}"
+        self.envs = [self._make() for _ in range(num_envs)]
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         self._check_spaces()
         try:
-            self.envs, limits = map(list, zip(*[with_limit(env, max_steps) for env in self.envs], strict=True))
+            self.envs, limits = map(list, zip(*[with_limit(env, options.max_steps) for env in self.envs], strict=True))
             self.max_steps = max(limits)
-            self._options = OptionSpace(self.envs[0].action_space, option_key)
-            self._actions = ActionSpace(self._options.rest, parameter_dims)
+            self._options = OptionSpace(self.envs[0].action_space, options.option_key)
+            self._actions = ActionSpace(self._options.rest, options.parameter_dims)
             sizes = {
                 keys.ACTION_MASK: len(self._actions.parameter_dims),
                 keys.OPTION_MASK: self._options.num_options,
             }
-            self._masks = Masks(self.envs[0], num_envs, sizes, action_mask)
+            self._masks = Masks(self.envs[0], num_envs, sizes, options.action_mask)
+            observation_keys = options.observation_keys
             if self._masks.in_observation and observation_keys is None:
                 space = self.envs[0].observation_space
                 observation_keys = [name for name in getattr(space, "spaces", {}) if name not in self._masks.rows]
             self.observations = ObservationSpace(
-                self.envs[0].observation_space, observation_scaling, observation_keys, out_of_bounds
+                self.envs[0].observation_space, options.observation_scaling, observation_keys, options.out_of_bounds
             )
         except ValueError as error:
             raise ValueError(f"{self._name}: {error}") from error
@@ -197,19 +220,23 @@ class GymnasiumEnv(PAMDPEnv):
                 env.close()
         super().close(raise_if_closed=raise_if_closed)
 
-    def _make(
-        self, id: str | None, entry_point: str | None, kwargs: Mapping[str, Any], max_steps: int | None
-    ) -> gymnasium.Env:
-        kwargs = copy.deepcopy(dict(kwargs))  # the copies of the environment must not share what they may change
+    def _make(self) -> gymnasium.Env:
+        id, limit = self.options.id, self.options.max_steps
+        # The copies of the environment must not share what they may change.
+        kwargs = copy.deepcopy(self.options.kwargs or {})
         try:
-            if entry_point is None:
-                assert id is not None  # checked by `_check_arguments`
-                return checked(gymnasium.make(id, max_episode_steps=max_steps, disable_env_checker=True, **kwargs))
-            env = self._load(entry_point)(**kwargs)
+            if self.options.entry_point is None:
+                assert id is not None  # checked by the settings
+                return checked(gymnasium.make(id, max_episode_steps=limit, disable_env_checker=True, **kwargs))
+            env = self._load(self.options.entry_point)(**kwargs)
         except (gymnasium.error.Error, ImportError) as error:
             raise ValueError(f"{self._name}: {one_line(error)}") from error
         except (TypeError, ValueError) as error:
             cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
+            if isinstance(cause, ValidationError):  # a class with Options refuses a setting
+                wrong = cause.errors()[0]
+                given = "".join(f"{name}={wrong['input']}: " for name in wrong["loc"][:1])
+                raise ValueError(f"{self._name}: {given}{wrong['msg']}") from error
             # A constructor may pass unknown arguments on to another one, which then raises the error.
             is_unknown = any(f"unexpected keyword argument '{name}'" in str(cause) for name in kwargs)
             if not (is_unknown or _is_about_the_call(cause)):
@@ -363,16 +390,6 @@ class GymnasiumEnv(PAMDPEnv):
         # torch.tensor copies, so that the next step does not change what was returned.
         tensors = {name: torch.tensor(leaf, device=self.device) for name, leaf in leaves.items()}
         return self.check_masks(TensorDict(tensors, batch_size=self.batch_size, device=self.device))
-
-
-def _check_arguments(num_envs: int, id: str | None, entry_point: str | None, max_steps: int | None) -> None:
-    if num_envs < 1:
-        raise ValueError(f"GymnasiumEnv: num_envs={num_envs}, but must be at least 1")
-    if (id is None) == (entry_point is None):
-        given = "neither is" if id is None else "both are"
-        raise ValueError(f"GymnasiumEnv: set env.id=Name-v0 or env.entry_point=package.module:name; {given} set")
-    if max_steps is not None and max_steps < 1:
-        raise ValueError(f"GymnasiumEnv: max_steps={max_steps}, but must be at least 1 or null")
 
 
 def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:

@@ -6,19 +6,20 @@ Source: Li et al. 2022 (HyAR), arXiv:2109.05490; see `hpamdp.env.hard_move.rules
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal
 
 import torch
+from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env import point_agent
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.hard_move import kernel, rules
 from hpamdp.env.hard_move.rules import HardMoveState
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
-
-NumActuators = Literal[4, 6, 8, 10]
+from hpamdp.settings import Settings
 
 # Success by the limit of steps and the number of actuators: who starts too far away cannot arrive.
 _CEILING = {
@@ -26,6 +27,19 @@ _CEILING = {
     25: {4: 0.852, 6: 0.928, 8: 0.948, 10: 0.956},
 }
 _SCRIPTED = {4: 0.963, 6: 0.990, 8: 0.993, 10: 0.995}  # success of the hand-written player within 30 steps
+
+
+class HardMoveOptions(Settings):
+    """Settings of `HardMoveEnv`. The defaults are HyAR's version."""
+
+    n: Literal[4, 6, 8, 10] = 4
+    """Number of actuators."""
+    max_steps: PositiveInt = 30
+    """Steps after which an episode is truncated. HyAR has 30, DLPA's code 25."""
+    rounded_directions: bool = True
+    """Whether the actuators' directions are rounded to three decimals, as in the published code."""
+    compile_rules: bool = False
+    """Compile the tensor functions instead of using the kernel, for a GPU; takes about half a minute."""
 
 
 class HardMoveEnv(PointEnv[HardMoveState]):
@@ -37,76 +51,43 @@ class HardMoveEnv(PointEnv[HardMoveState]):
 
     The reward is minus the squared distance after each step, plus 20 within 0.2 of the target, which ends the episode.
 
-    Args:
-        num_envs: number of planes.
-        n: number of actuators.
-        max_steps: actions after which an episode is truncated; HyAR has 30, DLPA 25.
-        rounded_directions: whether the actuators' directions have three decimals, as published.
-        compile_rules: compile the tensor functions (takes about half a minute) instead of using the kernel.
-        oracle: also write the action of a hand-written player under `oracle` (`discrete`, `parameters` `[N, 1]`).
-        device: of the tensors.
-        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
-        first_env: number of the first plane, where other processes have the planes before it.
-
-    Raises:
-        ValueError: an argument or an action is invalid; the state is unchanged.
+    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `CounterEnv`.
     """
 
+    Options = HardMoveOptions
+    options: HardMoveOptions
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = point_agent.OBSERVATION_NAMES
     target_radius = point_agent.HIT_RADIUS
+    row_kernel = staticmethod(kernel.advance)
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        n: NumActuators = 4,
-        max_steps: int = 30,
-        rounded_directions: bool = True,
-        compile_rules: bool = False,
-        oracle: bool = False,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-    ) -> None:
-        if n not in get_args(NumActuators):
-            raise ValueError(f"HardMoveEnv: n={n}, but must be one of {', '.join(map(str, get_args(NumActuators)))}")
-        self.n = n
-        self.rounded_directions = rounded_directions
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem.
+
+        Options to begin with are the quadrants that sets push to with a positive parameter. Sets that push nowhere
+        belong to the first one.
+        """
+        quadrants = rules.quadrants(options.n, rounded=options.rounded_directions)
+        return ProblemFacts(title=cls.__name__, default_options=quadrants, has_oracle=True)
+
+    def _prepare(self) -> None:
+        n = self.options.n
         self.parameter_dims = (1,) * 2**n
+        self.parameter_low, self.parameter_high = (-1.0,) * 2**n, (1.0,) * 2**n
         self.discrete_names = tuple(f"{number:0{n}b}" for number in range(2**n))
-        motions = rules.motions(n, rounded=rounded_directions).to(device, torch.float32)
-        self._motions = motions
-        self._script = rules.Script(motions)
-        super().__init__(
-            num_envs,
-            max_steps=max_steps,
-            parameter_low=(-1.0,) * 2**n,
-            parameter_high=(1.0,) * 2**n,
-            device=device,
-            seed=seed,
-            first_env=first_env,
-            oracle=oracle,
-            compile_rules=compile_rules,
-        )
-        self._use_kernel(kernel.advance, HardMoveEnv, motions.flatten().tolist())
+        motions = rules.motions(n, rounded=self.options.rounded_directions)
+        self._motions = motions.to(self.device, torch.float32)
+        self._script = rules.Script(self._motions)
+
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the motions of all sets."""
+        return self._motions.flatten().tolist()
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
         """The lowest and the highest observation, `[4]` each."""
         return point_agent.observation_bounds(self.max_steps)
-
-    @property
-    def default_options(self) -> Mapping[str, Sequence[int | str]]:
-        """The quadrant that a set pushes to with a positive parameter; sets that push nowhere are in the first."""
-        x, y = self._motions.unbind(-1)
-        quadrants = {
-            "north_east": (x >= 0) & (y >= 0),
-            "north_west": (x < 0) & (y >= 0),
-            "south_west": (x < 0) & (y < 0),
-            "south_east": (x >= 0) & (y < 0),
-        }
-        return {name: is_in.nonzero().squeeze(-1).tolist() for name, is_in in quadrants.items()}
 
     @property
     def symmetries(self) -> Symmetries:
@@ -115,7 +96,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         With 4 actuators they hold to rounding, with 6, 8 and 10 to 1e-4 of the observation a step, since the published
         directions have three decimals; without `rounded_directions` to rounding.
         """
-        n = self.n
+        n = self.options.n
         plane = plane_maps(n)
         weight, offset = on_observations(plane, len(self.observation_names), point_agent.VECTORS)
         actuator = torch.arange(n)
@@ -164,9 +145,9 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         """Return the success of the hand-written player, and the share of starts from which the target is in reach."""
         if self.max_steps not in _CEILING:
             return {}
-        scripted = {"scripted": {"success": _SCRIPTED[self.n]}} if self.max_steps == 30 else {}
-        return scripted | {"ceiling": {"success": _CEILING[self.max_steps][self.n]}}
+        scripted = {"scripted": {"success": _SCRIPTED[self.options.n]}} if self.max_steps == 30 else {}
+        return scripted | {"ceiling": {"success": _CEILING[self.max_steps][self.options.n]}}
 
     def picture_note(self, state: HardMoveState) -> str:
         """Return the number of actuators."""
-        return f"{self.n} actuators"
+        return f"{self.options.n} actuators"

@@ -44,13 +44,28 @@ def motions(n: int, *, rounded: bool) -> Tensor:
         n: number of actuators.
         rounded: whether the directions have three decimals, as published.
     """
-    angles = [2.0 * math.pi * i / n for i in range(n)]
-    directions = [(math.cos(angle), math.sin(angle)) for angle in angles]
-    if rounded:
-        directions = [(round(x, 3), round(y, 3)) for x, y in directions]
+    directions = _directions(n, rounded)
     sets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=n)), dtype=torch.float64)
     sums = sets @ torch.tensor(directions, dtype=torch.float64)
     return sums / sums.norm(dim=-1).max()
+
+
+def quadrants(n: int, *, rounded: bool) -> dict[str, list[int]]:
+    """Return the sets of actuators that push into each quadrant; sets that push nowhere are in the first one."""
+    directions = _directions(n, rounded)
+    numbers: dict[str, list[int]] = {name: [] for name in ("north_east", "north_west", "south_west", "south_east")}
+    for number, members in enumerate(itertools.product((False, True), repeat=n)):
+        pushes = list(itertools.compress(directions, members))
+        east, north = (sum(push[axis] for push in pushes) >= 0.0 for axis in (0, 1))
+        numbers[f"{'north' if north else 'south'}_{'east' if east else 'west'}"].append(number)
+    return numbers
+
+
+def _directions(n: int, rounded: bool) -> list[tuple[float, float]]:
+    """Return the actuators' directions."""
+    angles = [2.0 * math.pi * i / n for i in range(n)]
+    directions = [(math.cos(angle), math.sin(angle)) for angle in angles]
+    return [(round(x, 3), round(y, 3)) for x, y in directions] if rounded else directions
 
 
 def start(episode: Tensor, rng: Key) -> HardMoveState:

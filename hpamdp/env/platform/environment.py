@@ -7,17 +7,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
+from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.platform import kernel, rendering, rules
 from hpamdp.env.platform.rules import PlatformState
+from hpamdp.settings import Settings
+
+
+class PlatformOptions(Settings):
+    """Settings of `PlatformEnv`."""
+
+    max_steps: PositiveInt = 200
+    """Steps after which an episode is truncated."""
+    noise: Annotated[float, Field(ge=0.0, le=100.0)] = 1.0
+    """Factor on the published noise of jumps, of the agent's speed and of the enemies' speed; 0 means no noise."""
 
 
 class PlatformEnv(CounterEnv[PlatformState]):
@@ -31,51 +43,27 @@ class PlatformEnv(CounterEnv[PlatformState]):
     The reward is the distance covered as a share of the course, so an agent that arrives has the return 1. An episode
     terminates at the end of the course, in a gap or at an enemy.
 
-    Args:
-        num_envs: number of courses.
-        max_steps: actions after which an episode is truncated; gym-platform has 200.
-        noise: factor on the published noise of jumps, of the agent's speed and of the enemies' speed; 0 is none.
-        device: of the tensors.
-        seed: of the noise; the global generators are neither read nor moved. Nothing else is random.
-        first_env: number of the first course, where other processes have the courses before it.
-
-    Raises:
-        ValueError: an argument or an action is invalid; the state is unchanged.
+    Only the noise is random. For the constructor's arguments and errors see `CounterEnv`.
     """
 
+    Options = PlatformOptions
+    options: PlatformOptions
     discrete_names = rules.ACTIONS
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = rules.OBSERVATION_NAMES
     parameter_dims = (1, 1, 1)
+    parameter_low = (0.0, 0.0, 0.0)
+    parameter_high = rules.PARAMETER_HIGH
+    row_kernel = staticmethod(kernel.advance)
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        max_steps: int = 200,
-        noise: float = 1.0,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-    ) -> None:
-        if not 0.0 <= noise <= 100.0:
-            raise ValueError(f"PlatformEnv: noise={noise}, but must lie between 0 and 100")
-        super().__init__(
-            num_envs,
-            max_steps=max_steps,
-            parameter_low=(0.0, 0.0, 0.0),
-            parameter_high=rules.PARAMETER_HIGH,
-            device=device,
-            seed=seed,
-            first_env=first_env,
-        )
-        self.noise = noise
-        self._use_kernel(kernel.advance, PlatformEnv, [noise])
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem; options to begin with are run and jump."""
+        return ProblemFacts(title=cls.__name__, default_options={"run": ["run"], "jump": ["hop", "leap"]})
 
-    @property
-    def default_options(self) -> Mapping[str, Sequence[int | str]]:
-        """Run and jump."""
-        return {"run": ["run"], "jump": ["hop", "leap"]}
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the factor on the noise."""
+        return [self.options.noise]
 
     def initial_parameters(self) -> tuple[Tensor, Tensor]:
         """Return constants: run 3, hop 10, leap 400."""
@@ -103,7 +91,7 @@ class PlatformEnv(CounterEnv[PlatformState]):
         # Rows that do not move simulate a run, which is shorter than a jump.
         simulated = torch.where(is_idle, rules.RUN, discrete)
         normal = partial(counter_rng.normal, rng)
-        after = rules.act(state, simulated, parameters.squeeze(-1), normal, self.noise)
+        after = rules.act(state, simulated, parameters.squeeze(-1), normal, self.options.noise)
         return after, (after.x - state.x) / rules.END
 
     def observe(self, state: PlatformState) -> Tensor:

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from pydantic import PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.counter_rng import Key
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rooms import rendering, rules
 from hpamdp.env.rooms.rules import RoomsState
+from hpamdp.settings import Settings
+
+
+class RoomsOptions(Settings):
+    """Settings of `RoomsEnv`."""
+
+    max_steps: PositiveInt = 50
+    """Steps after which an episode is truncated."""
 
 
 class RoomsEnv(CounterEnv[RoomsState]):
@@ -26,17 +36,11 @@ class RoomsEnv(CounterEnv[RoomsState]):
 
     The reward is -0.02 a step, and 1 at the goal, which ends the episode. It begins anywhere in the first room.
 
-    Args:
-        num_envs: number of houses.
-        max_steps: actions after which an episode is truncated.
-        device: of the tensors.
-        seed: of the starts; the global generators are neither read nor moved. Nothing else is random.
-        first_env: number of the first house, where other processes have the houses before it.
-
-    Raises:
-        ValueError: an argument or an action is invalid; the state is unchanged.
+    Only the start is random. For the constructor's arguments and errors see `CounterEnv`.
     """
 
+    Options = RoomsOptions
+    options: RoomsOptions
     outcomes: ClassVar[tuple[str, ...]] = rules.OUTCOMES
     observation_names = (
         "x",
@@ -44,29 +48,16 @@ class RoomsEnv(CounterEnv[RoomsState]):
         *(f"x_{i}" for i in range(rules.SIZE)),
         *(f"y_{i}" for i in range(rules.SIZE)),
     )
-    option_names = ("skates", "boots")
     discrete_names = ("up", "right", "down", "left")
     parameter_dims = (1, 1, 1, 1)
+    parameter_low = (0.0,) * 4
+    parameter_high = (1.0,) * 4
     _option: Tensor
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        *,
-        max_steps: int = 50,
-        device: torch.device | str | None = "cpu",
-        seed: int = 0,
-        first_env: int = 0,
-    ) -> None:
-        super().__init__(
-            num_envs,
-            max_steps=max_steps,
-            parameter_low=(0.0,) * 4,
-            parameter_high=(1.0,) * 4,
-            device=device,
-            seed=seed,
-            first_env=first_env,
-        )
+    @classmethod
+    def facts(cls, options: Any) -> ProblemFacts:
+        """Return what these settings tell of the problem: the agent chooses between skates and boots."""
+        return ProblemFacts(title=cls.__name__, option_names=("skates", "boots"), has_choice=True)
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:

@@ -1,0 +1,33 @@
+"""What is known of a problem before it is built, from its settings alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class ProblemFacts:
+    """What a run must know of a problem to check settings of other groups against it.
+
+    Attributes:
+        title: what errors call the problem.
+        option_names: the problem's own options.
+        has_choice: whether the agent chooses among these options.
+        can_change_option: whether an option may end before its episode.
+        plans_change_options: whether the planned actions under `oracle` assume such changes.
+        is_shardable: whether several processes can each step some of the environments.
+        default_options: options to begin with, as for `PAMDPEnv.group_actions`; empty if the problem suggests none.
+        has_oracle: whether the constructor takes `oracle`.
+        has_human: whether the constructor takes `human`.
+    """
+
+    title: str
+    option_names: tuple[str, ...] = ()
+    has_choice: bool = False
+    can_change_option: bool = True
+    plans_change_options: bool = False
+    is_shardable: bool = True
+    default_options: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
+    has_oracle: bool = False
+    has_human: bool = False
