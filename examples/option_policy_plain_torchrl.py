@@ -24,7 +24,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.choice import OptionChoiceEnv
+from hpamdp.env.option_choice import OptionChoiceEnv
 
 NUM_ENVS = 256
 EPISODES_PER_BATCH = 1024

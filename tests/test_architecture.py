@@ -76,7 +76,7 @@ def test_the_modules_are_found():
     assert "hpamdp.policies.base" in {name.rpartition(".")[0] for name in imports(f"{LOW}.random")}
 
 
-@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.messages", "hpamdp.files", "hpamdp.env.streams"])
+@pytest.mark.parametrize("module", ["hpamdp.keys", "hpamdp.messages", "hpamdp.files", "hpamdp.env.rng_streams"])
 def test_the_foundations_import_nothing_of_ours(module):
     assert not [name for name in imports(module) if is_in(name, "hpamdp")]
 
@@ -87,14 +87,14 @@ def test_the_physics_imports_only_the_constants_of_the_task():
 
 
 def test_what_a_boat_for_gymnasium_runs_through_imports_no_torch():
-    for module in ("task", "layouts", "kernel", "fleet", "numpy_boats", "gymnasium_faces"):
+    for module in ("task", "layouts", "kernel", "fleet", "numpy_boats", "gymnasium_adapter"):
         loaded = loaded_with(f"hpamdp.env.boatdock.{module}")
         assert not [name for name in loaded if any(is_in(name, library) for library in TORCH)], module
 
 
 def test_imports_through_other_modules_are_found():
     assert "torch" in loaded_with("hpamdp.env.boatdock.environment")
-    assert any(is_in(name, "numba") for name in loaded_with("hpamdp.env.boatdock.gymnasium_faces"))
+    assert any(is_in(name, "numba") for name in loaded_with("hpamdp.env.boatdock.gymnasium_adapter"))
 
 
 GENERIC = [module for module in FILES if not any(is_in(module, room) for room in BOATS)]

@@ -12,7 +12,7 @@ from toy_options import Crossing
 from hpamdp import keys
 from hpamdp.config import Config, ConfigError
 from hpamdp.env.base import ProblemError
-from hpamdp.env.choice import OptionChoiceEnv
+from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import Parts, assemble

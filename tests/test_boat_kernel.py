@@ -153,9 +153,9 @@ def test_a_million_random_steps_agree():
 def test_random_numbers_are_the_same_bit_for_bit():
     @njit
     def draw(seed, stream, environments, episodes, drawn):
-        key, step = kernels.stream_key(seed, stream), kernels.stream_step(stream)
+        key, step = kernels.stream_hash(seed, stream), kernels.stream_step(stream)
         for row in range(len(environments)):
-            bits = kernels.episode_key(key, environments[row], episodes[row])
+            bits = kernels.episode_hash(key, environments[row], episodes[row])
             for index in range(drawn.shape[1]):
                 drawn[row, index] = kernels.uniform(bits, step, index)
 
@@ -166,7 +166,7 @@ def test_random_numbers_are_the_same_bit_for_bit():
         for stream in range(4):
             draw(kernels.folded(seed), stream, environments, episodes, drawn)
             where = torch.from_numpy(environments), torch.from_numpy(episodes)
-            key = counter_rng.key_for(counter_rng.seed_tensor(seed), stream, *where)
+            key = counter_rng.rng_key(counter_rng.seed_tensor(seed), stream, *where)
             right = torch.stack([counter_rng.uniform(key, index) for index in range(30)], -1)
             assert np.array_equal(drawn, right.numpy())
 

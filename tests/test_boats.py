@@ -13,7 +13,7 @@ from hpamdp import keys
 from hpamdp.config import read
 from hpamdp.env.boatdock import episode, harbour, physics, planner, rendering
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.gymnasium_faces import BoatDock, BoatDockVector
+from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Rules
 from hpamdp.run.assemble import assemble
@@ -250,7 +250,7 @@ def test_gymnasium_has_the_boats_and_their_changes():
         BoatDock(boats=["congruent", "upwards"])
 
 
-def test_compiled_faces_take_other_boats():
+def test_compiled_adapters_take_other_boats():
     from hpamdp.env.boatdock.tensor_fleet import TensorFleet
 
     options = BoatDockOptions(boats=["congruent", "sideways"], switch_cost=0.5, controllers=SIDEWAYS)

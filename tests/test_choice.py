@@ -14,8 +14,8 @@ from toy_options import Crossing, WholeStep, steppers
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.policies.high_level.fixed import Fixed

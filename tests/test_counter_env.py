@@ -1,4 +1,4 @@
-"""Environments over columns and counters keep the framework's contract, and so do their Gymnasium faces."""
+"""Environments over columns and counters keep the framework's contract, and so do their Gymnasium adapters."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from torchrl.envs.utils import check_env_specs
 from hpamdp import keys
 from hpamdp.env import counter_rng, point_pictures
 from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.counter_adapter import CounterAdapter
 from hpamdp.env.counter_env import GOING_ON, CounterEnv
-from hpamdp.env.counter_faces import CounterFace
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform import rendering
@@ -256,15 +256,15 @@ def test_evaluation_draws_starts_and_noise_from_streams_of_its_own_until_the_nex
     env._columns, env.rows = env.state, None
     streams = []
 
-    drawn = counter_rng.key_for
+    drawn = counter_rng.rng_key
 
-    def key_for(seed, stream, environment, episode):
+    def rng_key(seed, stream, environment, episode):
         streams.append(stream)
         return drawn(seed, stream, environment, episode)
 
     actions = random_player()(env)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(counter_rng, "key_for", key_for)
+        patch.setattr(counter_rng, "rng_key", rng_key)
         for seed_it, expected in (
             (env.set_seed, {counter_rng.TRAINING, counter_rng.NOISE}),
             (env.seed_evaluation, {counter_rng.EVALUATION, counter_rng.EVALUATION_NOISE}),
@@ -313,10 +313,10 @@ def test_gymnasiums_checker_finds_nothing(env_id):
 
 
 @pytest.mark.parametrize("env_id", ["hpamdp/CatchPoint-v0", "hpamdp/Moving-v0", "hpamdp/Platform-v0"])
-def test_a_face_plays_as_the_environment_does(env_id):
-    face, env = gymnasium.make(env_id), IDS[env_id](1)
+def test_a_adapter_plays_as_the_environment_does(env_id):
+    adapter, env = gymnasium.make(env_id), IDS[env_id](1)
     env.set_seed(4, static_seed=True)
-    observation, info = face.reset(seed=4)
+    observation, info = adapter.reset(seed=4)
     reading = env.reset()
     player = random_player(1)
     for _ in range(10):
@@ -324,7 +324,7 @@ def test_a_face_plays_as_the_environment_does(env_id):
         actions = player(env)
         parts = actions[keys.PARAMETERS][0].split(list(env.parameter_dims))
         taken = int(actions[keys.DISCRETE][0]), tuple(part.numpy() for part in parts)
-        observation, reward, terminated, truncated, info = face.step(taken)
+        observation, reward, terminated, truncated, info = adapter.step(taken)
         reading = env.step(actions)["next"]
         assert (reward, terminated, truncated) == tuple(
             reading[name].item() for name in (keys.REWARD, keys.TERMINATED, keys.TRUNCATED)
@@ -336,17 +336,19 @@ def test_a_face_plays_as_the_environment_does(env_id):
 
 
 def test_a_vector_starts_its_finished_episodes_again():
-    face = gymnasium.make_vec("hpamdp/CatchPoint-v0", num_envs=16, vectorization_mode="vector_entry_point", max_steps=3)
-    face.reset(seed=0)
+    adapter = gymnasium.make_vec(
+        "hpamdp/CatchPoint-v0", num_envs=16, vectorization_mode="vector_entry_point", max_steps=3
+    )
+    adapter.reset(seed=0)
     moves = (np.zeros(16, np.int64), (np.zeros((16, 1)), np.zeros((16, 0))))
     for _ in range(3):
-        observations, _, terminations, truncations, infos = face.step(moves)
+        observations, _, terminations, truncations, infos = adapter.step(moves)
     assert truncations.all() and not terminations.any()
     assert infos["_is_success"].all() and not infos["is_success"].any()
-    fresh, rewards, terminations, truncations, infos = face.step(moves)
+    fresh, rewards, terminations, truncations, infos = adapter.step(moves)
     assert (fresh[:, :2] == 0.0).all() and not (terminations | truncations).any()
     assert (rewards == 0.0).all() and (infos["steps"] == 0).all() and "is_success" not in infos
-    assert observations in face.observation_space and fresh in face.observation_space
+    assert observations in adapter.observation_space and fresh in adapter.observation_space
 
 
 @each_problem
@@ -361,13 +363,13 @@ def test_observations_stay_in_their_bounds(problem):
         reading = env.step(player(env))["next"]
 
 
-def test_bad_actions_and_options_of_a_face_are_refused_in_one_line():
-    face = gymnasium.make("hpamdp/CatchPoint-v0").unwrapped
+def test_bad_actions_and_options_of_a_adapter_are_refused_in_one_line():
+    adapter = gymnasium.make("hpamdp/CatchPoint-v0").unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded):
-        face.step((0, (np.zeros(1), np.zeros(0))))
+        adapter.step((0, (np.zeros(1), np.zeros(0))))
     with pytest.raises(ValueError, match=r"unknown options .'start'.; there are none"):
-        face.reset(options={"start": 1})
-    face.reset(seed=0)
+        adapter.reset(options={"start": 1})
+    adapter.reset(seed=0)
     for bad, message in (
         (0, r"the action must be a tuple \(discrete, parameters\), but is a int"),
         ((0, np.zeros(1)), "parameters must be a tuple of length 2, but is a ndarray"),
@@ -375,21 +377,21 @@ def test_bad_actions_and_options_of_a_face_are_refused_in_one_line():
         ((0.5, (np.zeros(1), np.zeros(0))), "discrete has type float64, but must be integer"),
     ):
         with pytest.raises(ValueError, match=message):
-            face.step(bad)
+            adapter.step(bad)
     with pytest.raises(ValueError, match="render_mode='human', but must be None or rgb_array"):
-        CounterFace("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
+        CounterAdapter("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
 
 
 @pytest.mark.parametrize(
     "env_id", ["hpamdp/Platform-v0", "hpamdp/CatchPoint-v0", "hpamdp/HardMove4-v0", "hpamdp/Sliding-v0"]
 )
 def test_a_picture_shows_the_progress_of_the_episode(env_id):
-    face = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)
-    face.action_space.seed(3)
-    face.reset(seed=0)
-    before = face.render()
-    face.step(face.action_space.sample())
-    after = face.render()
+    adapter = gymnasium.make(env_id, render_mode="rgb_array", disable_env_checker=True)
+    adapter.action_space.seed(3)
+    adapter.reset(seed=0)
+    before = adapter.render()
+    adapter.step(adapter.action_space.sample())
+    after = adapter.render()
     assert before.shape == after.shape == (480, 480, 3)
     assert before.dtype == np.uint8
     assert (before != after).any()

@@ -211,7 +211,7 @@ def test_a_new_episode_is_counted_and_has_the_keys_of_the_tensor_functions():
     def begin(integers, settings, bits, steps):
         for row in range(integers.shape[1]):
             bits[0, row], steps[0] = kernels.new_episode(integers, row, settings)
-            bits[1, row], steps[1] = kernels.noise_key(settings, row, integers[-1, row])
+            bits[1, row], steps[1] = kernels.noise_rng(settings, row, integers[-1, row])
 
     seed, first_env, num = 2**35 + 3, 7, 50
     streams = (counter_rng.EVALUATION, counter_rng.EVALUATION_NOISE)
@@ -223,6 +223,6 @@ def test_a_new_episode_is_counted_and_has_the_keys_of_the_tensor_functions():
     assert (integers[0] == 9).all() and (integers[1:3] == 0).all() and (integers[3] == episode + 1).all()
     environment = torch.arange(first_env, first_env + num, dtype=torch.int32)
     for i, stream in enumerate(streams):
-        key = counter_rng.key_for(counter_rng.seed_tensor(seed), stream, environment, torch.from_numpy(integers[3]))
+        key = counter_rng.rng_key(counter_rng.seed_tensor(seed), stream, environment, torch.from_numpy(integers[3]))
         assert np.array_equal(bits[i].view(np.int32), key.bits.numpy())
         assert steps[i] == key.step & 0xFFFFFFFF

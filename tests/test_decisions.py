@@ -9,8 +9,8 @@ from toy_options import Crossing, Toll, best_value, earned, steppers
 
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Selector
 from hpamdp.policies.high_level.actor import Actor

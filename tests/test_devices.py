@@ -121,7 +121,7 @@ def test_rules_stay_on_their_device(problem):
     if problem is HardMoveEnv:
         env._motions = env._motions.to(META)
     number = torch.zeros(4, dtype=torch.int32, device=META)
-    rng = counter_rng.key_for(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
+    rng = counter_rng.rng_key(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
     state = env.start(number, rng)
     parameters = torch.zeros(4, max(env.parameter_dims), device=META)
     after, reward = env.act(state, number.long(), parameters, rng, number.bool())

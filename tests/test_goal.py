@@ -196,7 +196,7 @@ def test_without_noise_the_same_start_has_one_future():
 
 def test_numbers_of_an_episode_are_never_drawn_twice():
     one = torch.tensor([12345], dtype=torch.int32)
-    rng = counter_rng.key_for(one[0], counter_rng.NOISE, one, one)
+    rng = counter_rng.rng_key(one[0], counter_rng.NOISE, one, one)
     ticks = torch.arange(400, dtype=torch.int32)
     drawn = [rules.random_numbers(rng, torch.tensor([steps], dtype=torch.int32), ticks) for steps in range(100)]
     numbers = torch.stack(drawn).flatten()

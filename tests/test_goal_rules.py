@@ -61,8 +61,8 @@ def test_recorded_ticks_are_met_one_by_one(domain):
     assert len(after) > 50
 
 
-def key(episode: Tensor) -> counter_rng.Key:
-    return counter_rng.key_for(episode[0], counter_rng.TRAINING, torch.zeros_like(episode), episode)
+def key(episode: Tensor) -> counter_rng.RngKey:
+    return counter_rng.rng_key(episode[0], counter_rng.TRAINING, torch.zeros_like(episode), episode)
 
 
 def state_with(num: int = 1, **columns: float | Tensor) -> GoalState:

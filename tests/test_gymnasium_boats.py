@@ -1,4 +1,4 @@
-"""The Gymnasium faces of the boats keep Gymnasium's contract and play the same task as BoatDockEnv."""
+"""The Gymnasium adapters of the boats keep Gymnasium's contract and play the same task as BoatDockEnv."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import hpamdp
 from hpamdp.env import counter_rng
-from hpamdp.env.boatdock.gymnasium_faces import BoatDock, BoatDockVector
+from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.rendering import Leg, Scene, draw
 
 ID = "hpamdp/BoatDock-v0"

@@ -20,10 +20,10 @@ def counter(num: int) -> torch.Tensor:
     return torch.arange(num, dtype=torch.int32)
 
 
-def keys_for(num: int, stream: int = counter_rng.TRAINING, seed: int = 0, episode: int = 0) -> counter_rng.Key:
+def keys_for(num: int, stream: int = counter_rng.TRAINING, seed: int = 0, episode: int = 0) -> counter_rng.RngKey:
     """Return the random keys of the environments 0 to num - 1, `[num]`."""
     episodes = torch.full_like(counter(num), episode)
-    return counter_rng.key_for(counter_rng.seed_tensor(seed), stream, counter(num), episodes)
+    return counter_rng.rng_key(counter_rng.seed_tensor(seed), stream, counter(num), episodes)
 
 
 def distance_between_distributions(a: np.ndarray, b: np.ndarray) -> float:

@@ -14,7 +14,7 @@ from filelock import FileLock
 from play_players import docked
 
 from hpamdp.env.boatdock.play.boat_page import BoatPage
-from hpamdp.env.page import EpisodeError
+from hpamdp.env.play_page import EpisodeError
 from hpamdp.run import page_server
 from hpamdp.run.page_server import EpisodeFile, PageServer
 

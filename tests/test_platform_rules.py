@@ -105,7 +105,7 @@ def numbers_of_next_action(env: PlatformEnv, seed: int) -> list[list[float]]:
     """Return the random numbers of every environment's next action, `[N, NUMBERS]`."""
     state = env.env_state()
     environment = torch.arange(env.num_envs, dtype=torch.int32)
-    rng = counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.NOISE, environment, state["episode"])
+    rng = counter_rng.rng_key(counter_rng.seed_tensor(seed), counter_rng.NOISE, environment, state["episode"])
     index = (state["steps"] * NUMBERS).unsqueeze(-1) + torch.arange(NUMBERS, dtype=torch.int32)
     return counter_rng.normal(rng._replace(bits=rng.bits.unsqueeze(-1)), index).tolist()
 

@@ -15,7 +15,7 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
 from hpamdp.env.boatdock.play.replay import HELD, Press, settle
-from hpamdp.env.page import EpisodeError
+from hpamdp.env.play_page import EpisodeError
 from hpamdp.run.players import load_player
 
 NODE = shutil.which("node")

@@ -22,7 +22,7 @@ from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.play.boat_page import BoatPage
-from hpamdp.env.page import EpisodeError
+from hpamdp.env.play_page import EpisodeError
 from hpamdp.run.page_server import EpisodeFile
 from hpamdp.run.train import run
 

@@ -6,8 +6,8 @@ from tensordict.nn import TensorDictModuleBase
 
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.policies.high_level.uniform import Uniform

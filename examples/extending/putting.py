@@ -19,7 +19,7 @@ from torchrl.data import Composite, Unbounded
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import Metric, PAMDPEnv
-from hpamdp.env.columns import where
+from hpamdp.env.state_columns import where
 
 PUTTER, WEDGE = range(2)
 HOLE = 0.15  # m
@@ -108,7 +108,7 @@ class PuttingEnv(PAMDPEnv):
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         episode = self._ball.episode + 1
-        chance = counter_rng.key_for(self._seed, counter_rng.TRAINING, self._number, episode)
+        chance = counter_rng.rng_key(self._seed, counter_rng.TRAINING, self._number, episode)
         distance = 1.0 + (FARTHEST - 1.0) * counter_rng.uniform(chance, 0)
         fresh = Ball(distance, torch.zeros_like(episode), episode)
         self._ball = where(self.reset_mask(tensordict), fresh, self._ball)
@@ -119,7 +119,7 @@ class PuttingEnv(PAMDPEnv):
         ball = self._ball
         is_over = (ball.distance.abs() < HOLE) | (ball.strokes >= self.max_steps)
         power, chip, spin = tensordict.get(keys.PARAMETERS).clamp(-1.0, 1.0).unbind(-1)
-        chance = counter_rng.key_for(self._seed, counter_rng.NOISE, self._number, ball.episode)
+        chance = counter_rng.rng_key(self._seed, counter_rng.NOISE, self._number, ball.episode)
         gust = 1.0 + self.wind * counter_rng.normal(chance, ball.strokes)
         is_putt = tensordict.get(keys.DISCRETE) == PUTTER
         length = torch.where(is_putt, 8.0 * power.clamp(min=0.0), 25.0 * chip.clamp(min=0.0) * gust + spin)

@@ -20,7 +20,7 @@ from hpamdp.geometry import PlaneGeometry, Symmetries
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from hpamdp.env.page import Page
+    from hpamdp.env.play_page import PlayPage
     from hpamdp.settings import Settings
 
 # Separates the seeds of an evaluation from the small ones that people give to training.
@@ -281,7 +281,7 @@ class PAMDPEnv(EnvBase):
         """
         return ()
 
-    def page(self, seed: int) -> Page | None:
+    def page(self, seed: int) -> PlayPage | None:
         """Return the page on which people play this problem in a browser; None if there is none.
 
         Args:

@@ -23,10 +23,10 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.rows import Advance, Results, Rows
+from hpamdp.env.kernel_rows import Advance, KernelRows, Results
+from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import Settings
 
 # What a tensordict has whose next root holds nothing else.
@@ -93,7 +93,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     result_keys = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
-    rows: Rows | None = None  # what the kernel moves; None where the tensor functions do
+    rows: KernelRows | None = None  # what the kernel moves; None where the tensor functions do
     limit_terminates = False  # whether values stop at the time limit, as at any other end
     _has_oracle = False
 
@@ -168,7 +168,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         bounds = self.full_action_spec_unbatched[keys.PARAMETERS].space
         state = self._columns
         num_integers = sum(not column.is_floating_point() for column in state)
-        self.rows = Rows(
+        self.rows = KernelRows(
             self.row_kernel,
             self.num_envs,
             num_columns=(len(state._fields) - num_integers, num_integers),
@@ -196,7 +196,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             overwrite(self._state, state)
 
     @abstractmethod
-    def start(self, episode: Tensor, rng: Key) -> EpisodeState:
+    def start(self, episode: Tensor, rng: RngKey) -> EpisodeState:
         """Return the states in which episodes begin.
 
         Args:
@@ -206,7 +206,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     @abstractmethod
     def act(
-        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
     ) -> tuple[EpisodeState, Tensor]:
         """Return the states after one action in every environment, and the rewards `[N]`.
 
@@ -330,7 +330,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             self.rows.set_seed(int(self._seed), self._streams)
 
     def _start(self, episode: Tensor) -> EpisodeState:
-        return self.start(episode, counter_rng.key_for(self._seed, self._streams[0], self._environment, episode))
+        return self.start(episode, counter_rng.rng_key(self._seed, self._streams[0], self._environment, episode))
 
     def _restart(self, state: EpisodeState, mask: Tensor) -> EpisodeState:
         """Return the states with new episodes in the rows of `mask` `[N]`."""
@@ -340,7 +340,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         self, state: EpisodeState, discrete: Tensor, parameters: Tensor, is_idle: Tensor
     ) -> tuple[EpisodeState, Tensor]:
         """Return the states after one action, with the time limit, and the rewards; idle rows stay as they are."""
-        rng = counter_rng.key_for(self._seed, self._streams[1], self._environment, state.episode)
+        rng = counter_rng.rng_key(self._seed, self._streams[1], self._environment, state.episode)
         after, reward = self.act(state, discrete, parameters, rng, is_idle)
         is_out_of_time = (after.steps >= self.max_steps) & (after.outcome == GOING_ON)
         after = replaced(after, outcome=torch.where(is_out_of_time, len(self.outcomes) - 1, after.outcome))

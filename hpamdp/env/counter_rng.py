@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from hpamdp.env.streams import EVALUATION, EVALUATION_NOISE, NOISE, STEPS, TRAINING
+from hpamdp.env.rng_streams import EVALUATION, EVALUATION_NOISE, NOISE, STEPS, TRAINING
 
 # How to compile functions that draw random numbers. Each operation of the hash reads its input twice, and the
 # compiler's default of inlining them into one another takes it two minutes. Measured with 16,384 environments: with
@@ -25,7 +25,7 @@ COMPILE_ARGUMENTS: dict[str, Any] = {
 }
 
 
-class Key(NamedTuple):
+class RngKey(NamedTuple):
     """What all random numbers of an episode derive from.
 
     Attributes:
@@ -49,7 +49,7 @@ def _mix(h: Tensor) -> Tensor:
     return h ^ _shift_right(h, 16)
 
 
-def key_for(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> Key:
+def rng_key(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> RngKey:
     """Return the key `[*B]` of an episode.
 
     Args:
@@ -60,24 +60,24 @@ def key_for(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> 
     """
     h = _mix(seed ^ (0x2545F491 + 0x01234567 * stream))
     h = _mix(h ^ environment)
-    return Key(_mix(h ^ episode), STEPS[stream])
+    return RngKey(_mix(h ^ episode), STEPS[stream])
 
 
-def uniform(key: Key, index: int | Tensor) -> Tensor:
+def uniform(key: RngKey, index: int | Tensor) -> Tensor:
     """Return float32 in (0, 1): number `index` of each key; an `index` that is an int32 tensor broadcasts with them."""
     # 23 bits: with 24, adding a half would round up to 1 in the upper half of the interval.
     bits = _shift_right(_mix(key.bits + index * key.step), 9)
     return (bits.to(torch.float32) + 0.5) * 2.0**-23
 
 
-def normal(key: Key, index: int | Tensor) -> Tensor:
+def normal(key: RngKey, index: int | Tensor) -> Tensor:
     """Return standard normal float32 `[*B]` (Box-Muller), from the uniform numbers `2 index` and `2 index + 1`."""
     radius = (-2.0 * uniform(key, 2 * index).log()).sqrt()
     return radius * (2.0 * math.pi * uniform(key, 2 * index + 1)).cos()
 
 
 def seed_tensor(seed: int, device: torch.device | None = None) -> Tensor:
-    """Fold a Python integer of any size into the int32 scalar that `key_for` takes."""
+    """Fold a Python integer of any size into the int32 scalar that `rng_key` takes."""
     folded = (seed ^ (seed >> 32)) & 0xFFFFFFFF
     signed = folded - (1 << 32) if folded >= 1 << 31 else folded
     return torch.tensor(signed, dtype=torch.int32, device=device)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numba import int32, njit, uint32, uint64
 
-from hpamdp.env.streams import STEPS
+from hpamdp.env.rng_streams import STEPS
 
 _STREAM_STEPS = tuple(step & 0xFFFFFFFF for step in STEPS)
 # The multipliers of `counter_rng`.
@@ -112,7 +112,7 @@ def _mix(h: Any) -> Any:
 
 
 @inlined
-def stream_key(seed: Any, stream: Any) -> Any:
+def stream_hash(seed: Any, stream: Any) -> Any:
     """Return what a folded seed and a stream contribute to the keys of all episodes."""
     return _mix(uint32(seed) ^ uint32(0x2545F491 + 0x01234567 * stream))
 
@@ -124,8 +124,8 @@ def stream_step(stream: Any) -> Any:
 
 
 @inlined
-def episode_key(key: Any, environment: Any, episode: Any) -> Any:
-    """Return the bits of an episode's key, from a `stream_key`."""
+def episode_hash(key: Any, environment: Any, episode: Any) -> Any:
+    """Return the bits of an episode's key, from a `stream_hash`."""
     return _mix(_mix(key ^ uint32(environment)) ^ uint32(episode))
 
 
@@ -242,16 +242,16 @@ def parameter(parameters: Any, row: Any, number: Any, action: Any, places: Any, 
 
 
 @inlined
-def _row_key(settings: Any, stream_place: Any, row: Any, episode: Any) -> Any:
+def _row_rng(settings: Any, stream_place: Any, row: Any, episode: Any) -> Any:
     stream = int32(settings[stream_place])
-    base = stream_key(settings[SEED], stream)
-    return episode_key(base, int32(settings[FIRST_ENV]) + row, episode), stream_step(stream)
+    base = stream_hash(settings[SEED], stream)
+    return episode_hash(base, int32(settings[FIRST_ENV]) + row, episode), stream_step(stream)
 
 
 @inlined
-def noise_key(settings: Any, row: Any, episode: Any) -> Any:
+def noise_rng(settings: Any, row: Any, episode: Any) -> Any:
     """Return bits and step of the random numbers within an episode, which `uniform` and `normal` take."""
-    return _row_key(settings, NOISE_STREAM, row, episode)
+    return _row_rng(settings, NOISE_STREAM, row, episode)
 
 
 @inlined
@@ -259,7 +259,7 @@ def new_episode(integers: Any, row: Any, settings: Any) -> Any:
     """Count a row's new episode, with no steps yet; return bits and step of the random numbers of its start."""
     episode = integers[EPISODE_ROW, row] + 1
     integers[STEPS_ROW, row], integers[OUTCOME_ROW, row], integers[EPISODE_ROW, row] = 0, 0, episode
-    return _row_key(settings, EPISODE_STREAM, row, episode)
+    return _row_rng(settings, EPISODE_STREAM, row, episode)
 
 
 @inlined

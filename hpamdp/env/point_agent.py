@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 
 OBSERVATION_NAMES = ("vx", "vy", "target_dx", "target_dy")
 VECTORS = ((0, 1), (2, 3))  # of the observation
@@ -59,7 +59,7 @@ class PointState(Located, Protocol):
         """Of the target."""
 
 
-def start(rng: Key) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def start(rng: RngKey) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return x and y of the agent and of the target, uniform in (-1, 1), `[N]` each."""
     x, y, target_x, target_y = (2.0 * counter_rng.uniform(rng, index) - 1.0 for index in range(4))
     return x, y, target_x, target_y

@@ -38,7 +38,7 @@ def register_counter_env(env_id: str, problem: str, **settings: Any) -> None:
     # No max_episode_steps: the environment itself truncates after its last step.
     gymnasium.register(
         id=env_id,
-        entry_point="hpamdp.env.counter_faces:CounterFace",
-        vector_entry_point="hpamdp.env.counter_faces:CounterVectorFace",
+        entry_point="hpamdp.env.counter_adapter:CounterAdapter",
+        vector_entry_point="hpamdp.env.counter_adapter:CounterVectorAdapter",
         kwargs={"problem": problem, **settings},
     )

@@ -18,8 +18,8 @@ from hpamdp.config import Component, Config, ConfigError, constructor_arguments
 from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.errors import DataError
 from hpamdp.env.base import PAMDPEnv, checked_option_names
-from hpamdp.env.choice import OptionChoiceEnv
 from hpamdp.env.decisions import with_decisions
+from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
 from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent

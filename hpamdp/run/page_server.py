@@ -21,7 +21,7 @@ from urllib.parse import urlsplit
 
 from filelock import FileLock
 
-from hpamdp.env.page import EpisodeError, Page
+from hpamdp.env.play_page import EpisodeError, PlayPage
 from hpamdp.files import read_regular, regular_size
 from hpamdp.json_lines import MAX_LINE_BYTES, LineError, left_out, lines_of, read_json
 from hpamdp.messages import one_line, reason_of, warn
@@ -67,7 +67,7 @@ class EpisodeFile:
         EpisodeError: the file holds no episode, it cannot be written, or its folder is missing.
     """
 
-    def __init__(self, path: Path, page: Page) -> None:
+    def __init__(self, path: Path, page: PlayPage) -> None:
         self.path = path
         self.page = page
         self.num_added = 0
@@ -201,7 +201,9 @@ class PageServer(ThreadingHTTPServer):
     daemon_threads = True
     allow_reuse_address = True
 
-    def __init__(self, address: tuple[str, int], page: Page, data: Mapping[str, Any], episodes: EpisodeFile) -> None:
+    def __init__(
+        self, address: tuple[str, int], page: PlayPage, data: Mapping[str, Any], episodes: EpisodeFile
+    ) -> None:
         self.page = page
         self.episodes = episodes
         self.contents = {f"/{name}": (page.folder / name).read_bytes() for name in page.files}

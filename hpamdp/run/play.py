@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
-from hpamdp.env.page import EpisodeError, Page
+from hpamdp.env.play_page import EpisodeError, PlayPage
 from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, reason_of, say, warn
 from hpamdp.run.assemble import make_env
@@ -77,7 +77,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     return serve(page, data, options)
 
 
-def _page(config: Config, seed: int) -> Page:
+def _page(config: Config, seed: int) -> PlayPage:
     torch.set_num_threads(config.run.threads)
     env = make_env(config, 1, config.run.resolve_device(), 0)
     try:
@@ -155,7 +155,7 @@ def _agent(path: Path, player: Player) -> dict[str, Any] | None:
     }
 
 
-def export(page: Page, data: dict[str, Any], folder: Path) -> None:
+def export(page: PlayPage, data: dict[str, Any], folder: Path) -> None:
     """Write the page to a folder, which need not be empty.
 
     Raises:
@@ -172,7 +172,7 @@ def export(page: Page, data: dict[str, Any], folder: Path) -> None:
         raise ConfigError(f"--export {folder}: {reason_of(error)}") from error
 
 
-def serve(page: Page, data: dict[str, Any], options: argparse.Namespace) -> int:
+def serve(page: PlayPage, data: dict[str, Any], options: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C."""
     try:
         episodes = EpisodeFile(options.to, page)

@@ -17,7 +17,7 @@ from hpamdp.data.human.released_file import EPISODES_PER_BLOCK, FRAMES_PER_SECON
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.play import episodes as played
 from hpamdp.env.boatdock.play.episodes import Episode
-from hpamdp.env.page import EpisodeError
+from hpamdp.env.play_page import EpisodeError
 
 SUFFIX = ".jsonl"
 

@@ -30,8 +30,8 @@ from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import invalid_press
-from hpamdp.env.columns import check_range, cloned, from_arrays, overwrite, where
 from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.state_columns import check_range, cloned, from_arrays, overwrite, where
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:

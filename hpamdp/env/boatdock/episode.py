@@ -32,7 +32,7 @@ from hpamdp.env.boatdock.task import (
     RewardForm,
     Rules,
 )
-from hpamdp.env.columns import where
+from hpamdp.env.state_columns import where
 
 
 class Reading(NamedTuple):
@@ -74,8 +74,8 @@ def step(
     is_valid = (key == allowed_key) & duration.isfinite()
     if rules.controller == "choose":
         is_valid = is_valid & (option >= 0) & (option < len(rules.names))
-    noise_key = _noise_key(state, seed, environment, rules)
-    moved = _press(state, option.to(torch.int32), allowed_key.to(torch.int32), duration, noise_key, rules)
+    noise_rng = _noise_rng(state, seed, environment, rules)
+    moved = _press(state, option.to(torch.int32), allowed_key.to(torch.int32), duration, noise_rng, rules)
     over = state.outcome != physics.SAILING
     reward = torch.where(over, 0.0, reward_of(state, moved, rules))
     return where(over, state, moved), reward, is_valid
@@ -85,21 +85,21 @@ def reset(state: BoatState, mask: Tensor, seed: Tensor, environment: Tensor, rul
     """Start a new episode in the rows of `mask` `[N]`; its layout is a function of (seed, environment, episode)."""
     episode = state.episode + 1
     stream = counter_rng.EVALUATION if rules.is_evaluation else counter_rng.TRAINING
-    key = counter_rng.key_for(seed, stream, environment, episode)
-    layout = harbour.sample_layout(key)
+    rng = counter_rng.rng_key(seed, stream, environment, episode)
+    layout = harbour.sample_layout(rng)
     zeros = torch.zeros_like(layout.start_x)
     integer_zeros = torch.zeros_like(episode)
     if rules.controller == "random":
         num = len(rules.names)
         # The last boat for the smallest numbers, as there were two at first and the second for those under a half.
-        drawn = (counter_rng.uniform(key, harbour.INDEX_CONTROLLER) * num).to(torch.int32)
+        drawn = (counter_rng.uniform(rng, harbour.INDEX_CONTROLLER) * num).to(torch.int32)
         controller = (num - 1 - drawn).clamp(min=0)
     elif rules.controller == "choose":
         controller = integer_zeros + harbour.NOT_CHOSEN
     else:
         controller = integer_zeros + rules.names.index(rules.controller)
     if rules.keymap == "random":
-        keymap = 1 + (counter_rng.uniform(key, harbour.INDEX_KEYMAP) < 0.5).to(torch.int32)
+        keymap = 1 + (counter_rng.uniform(rng, harbour.INDEX_KEYMAP) < 0.5).to(torch.int32)
     else:
         keymap = integer_zeros + rules.keymap
     fresh = BoatState(
@@ -118,19 +118,19 @@ def reset(state: BoatState, mask: Tensor, seed: Tensor, environment: Tensor, rul
     return where(mask, fresh, state)
 
 
-def _noise_key(state: BoatState, seed: Tensor, environment: Tensor, rules: Rules) -> counter_rng.Key:
+def _noise_rng(state: BoatState, seed: Tensor, environment: Tensor, rules: Rules) -> counter_rng.RngKey:
     stream = counter_rng.EVALUATION_NOISE if rules.is_evaluation else counter_rng.NOISE
-    return counter_rng.key_for(seed, stream, environment, state.episode)
+    return counter_rng.rng_key(seed, stream, environment, state.episode)
 
 
 def _press(
-    state: BoatState, option: Tensor, key: Tensor, duration: Tensor, noise_key: counter_rng.Key, rules: Rules
+    state: BoatState, option: Tensor, key: Tensor, duration: Tensor, noise_rng: counter_rng.RngKey, rules: Rules
 ) -> BoatState:
     """Return the states after a press of allowed keys with finite durations, as if no episode were over."""
     first = state.presses * NUMBERS_PER_PRESS
     if rules.slip > 0.0:
-        random_key = (counter_rng.uniform(noise_key, first + SLIPPED_KEY) * harbour.NUM_KEYS).to(torch.int32)
-        key = torch.where(counter_rng.uniform(noise_key, first + SLIP) < rules.slip, random_key, key)
+        random_key = (counter_rng.uniform(noise_rng, first + SLIPPED_KEY) * harbour.NUM_KEYS).to(torch.int32)
+        key = torch.where(counter_rng.uniform(noise_rng, first + SLIP) < rules.slip, random_key, key)
     duration = duration.clamp(0.0, physics.MAX_DURATION)
     fuel = state.fuel
     if rules.switch_cost is None:
@@ -143,7 +143,7 @@ def _press(
         deviation = torch.full(controller.shape, rules.motor_noise[0], device=controller.device, dtype=torch.float32)
         for boat, noise in enumerate(rules.motor_noise[1:], start=1):
             deviation = torch.where(controller == boat, noise, deviation)
-        duration = duration * (deviation * counter_rng.normal(noise_key, first // 2 + MOTOR)).exp()
+        duration = duration * (deviation * counter_rng.normal(noise_rng, first // 2 + MOTOR)).exp()
         duration = duration.clamp(max=physics.MAX_DURATION)
     dir_x, dir_y = harbour.direction_of(rules, controller, state.keymap, key)
     pressed = physics.press(state.x, state.y, fuel, state.goal_x, state.goal_y, dir_x, dir_y, duration)
@@ -184,9 +184,9 @@ def read(state: BoatState, seed: Tensor, environment: Tensor, rules: Rules) -> R
     """Return what the environments observe in this state."""
     points = [state.start_x, state.start_y, state.goal_x, state.goal_y, state.x, state.y]
     if rules.sensor_noise > 0.0:
-        noise_key = _noise_key(state, seed, environment, rules)
+        noise_rng = _noise_rng(state, seed, environment, rules)
         first = state.presses * (NUMBERS_PER_PRESS // 2) + SENSOR
-        points = [p + rules.sensor_noise * counter_rng.normal(noise_key, first + i) for i, p in enumerate(points)]
+        points = [p + rules.sensor_noise * counter_rng.normal(noise_rng, first + i) for i, p in enumerate(points)]
     start_x, start_y, goal_x, goal_y, x, y = points
     distance = ((goal_x - x).square() + (goal_y - y).square()).sqrt()
     # Clamped, because sensor noise can bring start and goal together.

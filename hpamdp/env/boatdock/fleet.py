@@ -11,7 +11,7 @@ from hpamdp.env.boatdock import kernel, task
 from hpamdp.env.boatdock.kernel import PRESS, PRESS_AND_RESTART, PRESS_OR_RESTART, RESTART
 from hpamdp.env.boatdock.task import BoatState, Rules
 from hpamdp.env.kernels import folded
-from hpamdp.env.streams import EVALUATION, EVALUATION_NOISE, NOISE, TRAINING
+from hpamdp.env.rng_streams import EVALUATION, EVALUATION_NOISE, NOISE, TRAINING
 
 
 class Readings(NamedTuple):

@@ -76,7 +76,7 @@ class Layout(NamedTuple):
     goal_y: Tensor
 
 
-def sample_layout(key: counter_rng.Key) -> Layout:
+def sample_layout(rng: counter_rng.RngKey) -> Layout:
     """Sample start and goal uniformly in the disc, again while they are less than MIN_SEPARATION apart.
 
     A try samples the two squared radii and the angle between the points: the distance depends on nothing else. The
@@ -84,14 +84,14 @@ def sample_layout(key: counter_rng.Key) -> Layout:
     their goal on the far side of the centre, which avoids a loop that depends on the data.
 
     Args:
-        key: `[*B]` from `counter_rng.key_for`.
+        rng: `[*B]` from `counter_rng.rng_key`.
     """
 
     def attempt(first_index: int) -> tuple[Tensor, Tensor, Tensor]:
         return (
-            counter_rng.uniform(key, first_index),
-            counter_rng.uniform(key, first_index + 1),
-            2.0 * math.pi * counter_rng.uniform(key, first_index + 2),
+            counter_rng.uniform(rng, first_index),
+            counter_rng.uniform(rng, first_index + 1),
+            2.0 * math.pi * counter_rng.uniform(rng, first_index + 2),
         )
 
     def is_near(start: Tensor, goal: Tensor, turn: Tensor) -> Tensor:
@@ -110,7 +110,7 @@ def sample_layout(key: counter_rng.Key) -> Layout:
         goal = torch.where(is_too_near, goal, each[1])
         turn = torch.where(is_too_near, turn, each[2])
 
-    angle = 2.0 * math.pi * counter_rng.uniform(key, INDEX_ANGLE)
+    angle = 2.0 * math.pi * counter_rng.uniform(rng, INDEX_ANGLE)
     start_radius = LAYOUT_RADIUS * start.sqrt()
     goal_radius = LAYOUT_RADIUS * goal.sqrt()
     goal_angle = angle + turn
@@ -131,7 +131,7 @@ def fixed_layouts(num: int, seed: int) -> Layout:
     """Return `num` layouts for evaluation; training meets none of them, since they come from a stream of their own."""
     rows = torch.arange(num, dtype=torch.int32)
     episode = torch.zeros(num, dtype=torch.int32)
-    return sample_layout(counter_rng.key_for(counter_rng.seed_tensor(seed), counter_rng.EVALUATION, rows, episode))
+    return sample_layout(counter_rng.rng_key(counter_rng.seed_tensor(seed), counter_rng.EVALUATION, rows, episode))
 
 
 def bearing_offset(layout: Layout) -> Tensor:

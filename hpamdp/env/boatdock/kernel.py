@@ -23,13 +23,13 @@ from hpamdp.env.kernels import (
     ZERO,
     all_below,
     all_finite,
-    episode_key,
+    episode_hash,
     inlined,
     kernel,
     normal,
     part,
     sin_cos,
-    stream_key,
+    stream_hash,
     stream_step,
     uniform,
     unsigned,
@@ -277,13 +277,13 @@ def _aim(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
 @part
 def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
     """Let keys slip and durations vary, as `episode` does."""
-    base = stream_key(settings[SEED], int32(settings[NOISE_STREAM]))
+    base = stream_hash(settings[SEED], int32(settings[NOISE_STREAM]))
     step = stream_step(int32(settings[NOISE_STREAM]))
     slip = _F(settings[SLIP_CHANCE])
     has_motor_noise = _has_motor_noise(settings)
     for j in range(count):
         environment = int32(settings[FIRST_ENV]) + first + j
-        bits = episode_key(base, environment, numbers[EPISODE * _BLOCK + j])
+        bits = episode_hash(base, environment, numbers[EPISODE * _BLOCK + j])
         index = numbers[PRESSES * _BLOCK + j] * task.NUMBERS_PER_PRESS
         if slip > ZERO and uniform(bits, step, index + task.SLIP) < slip:
             drawn = uniform(bits, step, index + task.SLIPPED_KEY) * _F(task.NUM_KEYS)
@@ -336,7 +336,7 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
 @part
 def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
     """Start new episodes in the marked rows of a block: `episode.reset` and `harbour.sample_layout`."""
-    base = stream_key(settings[SEED], int32(settings[EPISODE_STREAM]))
+    base = stream_hash(settings[SEED], int32(settings[EPISODE_STREAM]))
     step = stream_step(int32(settings[EPISODE_STREAM]))
     first_env = int32(settings[FIRST_ENV]) + int32(first)
     start_at, goal_at, turn_at = _SEEN * _BLOCK, (_SEEN + 1) * _BLOCK, (_SEEN + 2) * _BLOCK  # free at this moment
@@ -346,7 +346,7 @@ def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
     if is_any == 0:
         return
     for j in range(count):
-        bits = episode_key(base, first_env + int32(j), numbers[EPISODE * _BLOCK + j] + int32(1))
+        bits = episode_hash(base, first_env + int32(j), numbers[EPISODE * _BLOCK + j] + int32(1))
         start, goal, turn, is_near = _attempt(bits, step, 0)
         scratch[start_at + j], scratch[goal_at + j], scratch[turn_at + j] = start, goal, turn
         numbers[_BITS * _BLOCK + j] = int32(bits)
@@ -400,11 +400,11 @@ def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
 def _add_sensor_noise(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
     """Write the six coordinates as noisy sensors see them to the first columns of the observation."""
     deviation = _F(settings[SENSOR_NOISE])
-    base = stream_key(settings[SEED], int32(settings[NOISE_STREAM]))
+    base = stream_hash(settings[SEED], int32(settings[NOISE_STREAM]))
     step = stream_step(int32(settings[NOISE_STREAM]))
     for j in range(count):
         environment = int32(settings[FIRST_ENV]) + first + j
-        bits = episode_key(base, environment, numbers[EPISODE * _BLOCK + j])
+        bits = episode_hash(base, environment, numbers[EPISODE * _BLOCK + j])
         index = numbers[PRESSES * _BLOCK + j] * (task.NUMBERS_PER_PRESS // 2) + task.SENSOR
         for i in range(6):
             scratch[(_SEEN + i) * _BLOCK + j] = scratch[i * _BLOCK + j] + deviation * normal(bits, step, index + i)

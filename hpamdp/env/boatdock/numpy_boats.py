@@ -22,7 +22,7 @@ from hpamdp.env.boatdock import kernel, task
 from hpamdp.env.boatdock.fleet import Fleet, Readings
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.task import OBSERVATION_NAMES, SCALED_NAMES, BoatState, Rules
-from hpamdp.env.faces import After, NumpyEnv, as_array, describe
+from hpamdp.env.gymnasium_adapter import After, NumpyEnv, as_array, describe
 
 ActionFormat = Literal["dict", "tuple"]
 

@@ -14,6 +14,6 @@ def register() -> None:
     # No max_episode_steps: the environment itself truncates after its last press.
     gymnasium.register(
         id=BOAT_DOCK_ID,
-        entry_point="hpamdp.env.boatdock.gymnasium_faces:BoatDock",
-        vector_entry_point="hpamdp.env.boatdock.gymnasium_faces:BoatDockVector",
+        entry_point="hpamdp.env.boatdock.gymnasium_adapter:BoatDock",
+        vector_entry_point="hpamdp.env.boatdock.gymnasium_adapter:BoatDockVector",
     )

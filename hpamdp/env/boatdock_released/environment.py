@@ -25,8 +25,8 @@ from hpamdp.env.actions import check_action_values
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock_released import rules as released
 from hpamdp.env.boatdock_released.rules import ReleasedState
-from hpamdp.env.columns import restored, where
 from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.state_columns import restored, where
 from hpamdp.settings import Settings
 
 
@@ -127,7 +127,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         """Return layouts to `reset` with, one for each boat, from another stream than those of training."""
         episode = torch.zeros_like(self._environment)
         seed_tensor = counter_rng.seed_tensor(seed, self.device)
-        rng = counter_rng.key_for(seed_tensor, counter_rng.EVALUATION, self._environment, episode)
+        rng = counter_rng.rng_key(seed_tensor, counter_rng.EVALUATION, self._environment, episode)
         points = released.sample_layouts(rng, self.options.test_mode).to(self.float_type)
         layout = {"start": points[:, :2], "goal": points[:, 2:]}
         return TensorDict(layout, batch_size=self.batch_size, device=self.device)
@@ -209,7 +209,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         given = {} if tensordict is None else self._given_layout(tensordict)
         before = self._state
         episode = before.episode + 1
-        rng = counter_rng.key_for(self._seed, counter_rng.TRAINING, self._environment, episode)
+        rng = counter_rng.rng_key(self._seed, counter_rng.TRAINING, self._environment, episode)
         layout = given or self._sampled_layout(rng, mask)
         if "keymap" in layout:
             keymap = layout["keymap"]
@@ -230,7 +230,7 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         self._state = where(mask, fresh, before)
         return self._read()
 
-    def _sampled_layout(self, rng: counter_rng.Key, mask: Tensor) -> dict[str, Tensor]:
+    def _sampled_layout(self, rng: counter_rng.RngKey, mask: Tensor) -> dict[str, Tensor]:
         """Return the layout columns of the state, with new layouts in those rows of `mask` `[N]` that need one."""
         is_due = mask & (self._state.episode < 0) if self.options.frozen_layouts else mask
         state = self._state

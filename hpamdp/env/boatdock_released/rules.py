@@ -88,11 +88,11 @@ class ReleasedState(NamedTuple):
     episode: Tensor
 
 
-def sample_layouts(rng: counter_rng.Key, test_mode: int | None) -> Tensor:
+def sample_layouts(rng: counter_rng.RngKey, test_mode: int | None) -> Tensor:
     """Sample starts and goals `[M, 4]` (screen px, float64) that are far enough apart and of the test mode.
 
     Args:
-        rng: `[M]` from `counter_rng.key_for`.
+        rng: `[M]` from `counter_rng.rng_key`.
         test_mode: see `ReleasedBoatDockEnv`.
     """
     low = torch.tensor([*LOW, *LOW], dtype=torch.float64, device=rng.bits.device)

@@ -16,7 +16,7 @@ from torch import Tensor
 from hpamdp.env import point_agent
 from hpamdp.env.catch_point import kernel, rules
 from hpamdp.env.catch_point.rules import CatchPointState
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
 from hpamdp.settings import Settings
@@ -102,12 +102,12 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         """The speed and the way to the target; where a move points is its parameter."""
         return PlaneGeometry(vectors=point_agent.VECTORS)
 
-    def start(self, episode: Tensor, rng: Key) -> CatchPointState:
+    def start(self, episode: Tensor, rng: RngKey) -> CatchPointState:
         """Return states with agent and target anywhere in the square."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: CatchPointState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+        self, state: CatchPointState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
     ) -> tuple[CatchPointState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
         return rules.act(

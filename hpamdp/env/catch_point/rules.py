@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 
 MOVE, CATCH = range(2)
 ACTIONS = ("move", "catch")
@@ -39,7 +39,7 @@ class CatchPointState(NamedTuple):
     episode: Tensor
 
 
-def start(episode: Tensor, rng: Key) -> CatchPointState:
+def start(episode: Tensor, rng: RngKey) -> CatchPointState:
     """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
     x, y, target_x, target_y = point_agent.start(rng)
     zeros = torch.zeros_like(x)

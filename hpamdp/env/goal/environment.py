@@ -18,7 +18,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env.base import Metric
 from hpamdp.env.counter_env import CounterEnv
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.goal import kernel, rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
@@ -122,12 +122,12 @@ class GoalEnv(CounterEnv[GoalState]):
         repaired = [slip in self.options.repaired for slip in get_args(HardSlip)]
         return [self.options.noise, self._is_scaled, *repaired, isinstance(self, HardGoalEnv)]
 
-    def start(self, episode: Tensor, rng: Key) -> GoalState:
+    def start(self, episode: Tensor, rng: RngKey) -> GoalState:
         """Return the states in which episodes begin."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: GoalState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+        self, state: GoalState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
     ) -> tuple[GoalState, Tensor]:
         """Return the states after one action, and the rewards `[N]`."""
 

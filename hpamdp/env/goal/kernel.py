@@ -386,7 +386,7 @@ def _act(floats: Any, integers: Any, discrete: Any, rows: Any, aims: Any, settin
                     lanes[column * _LANES + j] = floats[column, row]
                 lanes[_AIM_X * _LANES + j], lanes[_AIM_Y * _LANES + j] = aims[0, row], aims[1, row]
                 numbers[_IS_KICK * _LANES + j] = discrete[row] == rules.KICK_TO
-                bits, _ = kernels.noise_key(settings, row, integers[EPISODE_ROW, row])
+                bits, _ = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
                 numbers[_BITS * _LANES + j] = int32(bits)
                 numbers[_INDEX * _LANES + j] = (integers[STEPS_ROW, row] - 1) * rules._NUMBERS_PER_ACTION
         if num_ended == num_rows:
@@ -411,7 +411,7 @@ def advance(
     flags: Any,
     rewards: Any,
 ) -> int:
-    """Act or restart in every row, in place; see `hpamdp.env.rows`."""
+    """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 
 KICK_TO, SHOOT_LEFT, SHOOT_RIGHT = range(3)
 ACTIONS = ("kick to", "shoot left", "shoot right")
@@ -176,12 +176,12 @@ class Motion(NamedTuple):
 Tick = Callable[[Motion, Tensor, float], Motion]  # as `masked_tick`
 
 
-def start(episode: Tensor, rng: Key, dtype: torch.dtype = torch.float32) -> GoalState:
+def start(episode: Tensor, rng: RngKey, dtype: torch.dtype = torch.float32) -> GoalState:
     """Return the states in which the episodes with these numbers, int32 `[N]`, begin.
 
     Args:
         episode: numbers of the episodes, int32 `[N]`.
-        rng: their keys `[N]` from `counter_rng.key_for`.
+        rng: their keys `[N]` from `counter_rng.rng_key`.
         dtype: of the positions.
     """
     zeros = torch.zeros_like(episode, dtype=dtype)
@@ -257,11 +257,11 @@ def _aim(is_kick: Tensor, kick_x: Tensor, kick_y: Tensor, shot: Tensor, kicks_to
     )
 
 
-def random_numbers(rng: Key, steps: Tensor, ticks: Tensor) -> Tensor:
+def random_numbers(rng: RngKey, steps: Tensor, ticks: Tensor) -> Tensor:
     """Return the numbers in (-1, 1), float32 `[K, 6, M]`, of ticks of the next action.
 
     Args:
-        rng: keys `[M]` from `counter_rng.key_for`.
+        rng: keys `[M]` from `counter_rng.rng_key`.
         steps: how many actions the episode has had, int32 `[M]`.
         ticks: int32 `[K]`.
     """

@@ -12,7 +12,7 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor
 
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
 from hpamdp.env.point_env import PointEnv
@@ -84,12 +84,12 @@ class _VehicleEnv(PointEnv[VehicleState]):
         """The places of vehicle and target, and the heading."""
         return PlaneGeometry(vectors=rules.VECTORS)
 
-    def start(self, episode: Tensor, rng: Key) -> VehicleState:
+    def start(self, episode: Tensor, rng: RngKey) -> VehicleState:
         """Return states with vehicle and target anywhere in the field, at rest."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: VehicleState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+        self, state: VehicleState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
     ) -> tuple[VehicleState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
         return rules.act(state, discrete, parameters.squeeze(-1), slides=self.slides, max_steps=self.max_steps)

@@ -208,7 +208,7 @@ def advance(
     flags: Any,
     rewards: Any,
 ) -> int:
-    """Act or restart in every row, in place; see `hpamdp.env.rows`."""
+    """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid

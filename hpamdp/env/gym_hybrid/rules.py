@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 
 ACCELERATE, TURN, BRAKE = range(3)
 ACTIONS = ("accelerate", "turn", "brake")
@@ -62,7 +62,7 @@ class VehicleState(NamedTuple):
     episode: Tensor
 
 
-def start(episode: Tensor, rng: Key) -> VehicleState:
+def start(episode: Tensor, rng: RngKey) -> VehicleState:
     """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
     target_x, target_y = (_START_BOUND * (2.0 * counter_rng.uniform(rng, index) - 1.0) for index in range(2))
     x, y = (2.0 * counter_rng.uniform(rng, index) - 1.0 for index in range(2, 4))

@@ -13,7 +13,7 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.hard_move import kernel, rules
 from hpamdp.env.hard_move.rules import HardMoveState
@@ -123,12 +123,12 @@ class HardMoveEnv(PointEnv[HardMoveState]):
             has_mirror=True,
         )
 
-    def start(self, episode: Tensor, rng: Key) -> HardMoveState:
+    def start(self, episode: Tensor, rng: RngKey) -> HardMoveState:
         """Return states with agent and target anywhere in the square."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: HardMoveState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+        self, state: HardMoveState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
     ) -> tuple[HardMoveState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
         return rules.act(state, discrete, parameters.squeeze(-1), self._motions)

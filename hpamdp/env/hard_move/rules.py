@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 
 OUTCOMES = ("going on", "reached", "time limit")
 GOING_ON, REACHED, TIME_LIMIT = range(3)
@@ -68,7 +68,7 @@ def _directions(n: int, rounded: bool) -> list[tuple[float, float]]:
     return [(round(x, 3), round(y, 3)) for x, y in directions] if rounded else directions
 
 
-def start(episode: Tensor, rng: Key) -> HardMoveState:
+def start(episode: Tensor, rng: RngKey) -> HardMoveState:
     """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
     x, y, target_x, target_y = point_agent.start(rng)
     zeros = torch.zeros_like(x)

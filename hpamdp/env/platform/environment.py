@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hpamdp.env import counter_rng
 from hpamdp.env.counter_env import CounterEnv
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.platform import kernel, rendering, rules
 from hpamdp.env.platform.rules import PlatformState
@@ -80,12 +80,12 @@ class PlatformEnv(CounterEnv[PlatformState]):
         """The lowest and the highest observation, `[9]` each."""
         return [-1.0] * len(self.observation_names), [1.0] * len(self.observation_names)
 
-    def start(self, episode: Tensor, rng: Key) -> PlatformState:
+    def start(self, episode: Tensor, rng: RngKey) -> PlatformState:
         """Return the states at the beginning of the course; nothing about them is random."""
         return rules.start(episode)
 
     def act(
-        self, state: PlatformState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+        self, state: PlatformState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
     ) -> tuple[PlatformState, Tensor]:
         """Return the states after one action, and the distances covered as shares of the course, `[N]`."""
         # Rows that do not move simulate a run, which is shorter than a jump.

@@ -156,7 +156,7 @@ def advance(
     flags: Any,
     rewards: Any,
 ) -> int:
-    """Act or restart in every row, in place; see `hpamdp.env.rows`."""
+    """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
     invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
     if invalid >= 0:
         return invalid
@@ -166,7 +166,7 @@ def advance(
         if mode != kernels.RESTART and mask[row] and not was_over:
             action, steps, before = discrete[row], integers[STEPS_ROW, row], floats[_X, row]
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
-            bits, step = kernels.noise_key(settings, row, integers[EPISODE_ROW, row])
+            bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
             outcome = _act(floats, row, action, given, steps * rules._NUMBERS_PER_ACTION, bits, step, noise)
             if outcome == rules.ON_THE_WAY and steps + 1 >= settings[kernels.MAX_STEPS]:
                 outcome = rules.TIME_LIMIT

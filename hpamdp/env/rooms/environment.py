@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.counter_env import CounterEnv
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rooms import rendering, rules
 from hpamdp.env.rooms.rules import RoomsState
@@ -69,12 +69,12 @@ class RoomsEnv(CounterEnv[RoomsState]):
         """The cells of the agents, `[N, 2]`."""
         return torch.stack([self.state.x, self.state.y], -1).float()
 
-    def start(self, episode: Tensor, rng: Key) -> RoomsState:
+    def start(self, episode: Tensor, rng: RngKey) -> RoomsState:
         """Return states with the agent anywhere in the first room."""
         return rules.start(episode, rng)
 
     def act(
-        self, state: RoomsState, discrete: Tensor, parameters: Tensor, rng: Key, is_idle: Tensor
+        self, state: RoomsState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
     ) -> tuple[RoomsState, Tensor]:
         """Return the states after one move and the rewards `[N]`."""
         return rules.act(state, self._option, discrete, parameters.squeeze(-1))

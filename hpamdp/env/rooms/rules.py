@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import counter_rng
-from hpamdp.env.counter_rng import Key
+from hpamdp.env.counter_rng import RngKey
 
 OUTCOMES = ("going on", "arrived", "time limit")
 GOING_ON, ARRIVED, TIME_LIMIT = range(3)
@@ -74,7 +74,7 @@ def move(x: Tensor, y: Tensor, option: Tensor, direction: Tensor, fraction: Tens
     return x, y
 
 
-def start(episode: Tensor, rng: Key) -> RoomsState:
+def start(episode: Tensor, rng: RngKey) -> RoomsState:
     """Return the states in which the episodes with these numbers, int32 `[N]`, begin: anywhere in the first room."""
     x, y = ((counter_rng.uniform(rng, i) * WALL).floor().clamp(max=WALL - 1).int() for i in range(2))
     none = torch.zeros_like(episode)

@@ -20,7 +20,7 @@ from hpamdp.env.boatdock.reference import (
     OFFSET_EDGES,
 )
 from hpamdp.env.boatdock.task import Boats
-from hpamdp.env.page import EpisodeError
+from hpamdp.env.play_page import EpisodeError
 
 BLOCK, NUM_BLOCKS = 60, 6  # as people had them
 _PRACTICE, _FREE = 10, 120

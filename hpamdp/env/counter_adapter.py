@@ -22,11 +22,19 @@ from tensordict import TensorDict
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv
-from hpamdp.env.faces import After, Face, NumpyEnv, RenderMode, VectorFace, as_array, describe
+from hpamdp.env.gymnasium_adapter import (
+    After,
+    GymnasiumAdapter,
+    GymnasiumVectorAdapter,
+    NumpyEnv,
+    RenderMode,
+    as_array,
+    describe,
+)
 from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
 
 
-class CounterFace(Face):
+class CounterAdapter(GymnasiumAdapter):
     """One environment of a `CounterEnv`.
 
     Args:
@@ -44,12 +52,12 @@ class CounterFace(Face):
         return self._env.draw(self._track)
 
 
-class CounterVectorFace(VectorFace):
+class CounterVectorAdapter(GymnasiumVectorAdapter):
     """`num_envs` environments of a `CounterEnv`.
 
     Args:
         problem: the environment's class as text, `package.module:Class`.
-        num_envs, autoreset_mode: as in `VectorFace`.
+        num_envs, autoreset_mode: as in `GymnasiumVectorAdapter`.
         settings: what the class takes besides, such as `device`.
     """
 

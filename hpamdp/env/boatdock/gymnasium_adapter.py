@@ -18,10 +18,10 @@ from gymnasium.vector import AutoresetMode
 
 from hpamdp.env.boatdock.numpy_boats import ActionFormat, NumpyBoats
 from hpamdp.env.boatdock.options import BoatDockOptions
-from hpamdp.env.faces import Face, VectorFace
+from hpamdp.env.gymnasium_adapter import GymnasiumAdapter, GymnasiumVectorAdapter
 
 
-class BoatDock(Face):
+class BoatDock(GymnasiumAdapter):
     """One boat to dock.
 
     Args:
@@ -67,7 +67,7 @@ class BoatDock(Face):
         )
 
 
-class BoatDockVector(VectorFace):
+class BoatDockVector(GymnasiumVectorAdapter):
     """`num_envs` boats to dock.
 
     Args:

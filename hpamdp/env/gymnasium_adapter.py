@@ -1,4 +1,4 @@
-"""Gymnasium environments over batched ones: `Face` (one environment) and `VectorFace` (many).
+"""Gymnasium environments over batched ones: `GymnasiumAdapter` (one environment) and `GymnasiumVectorAdapter` (many).
 
 Nothing here needs torch, which takes seconds to import and microseconds for each operation.
 """
@@ -63,7 +63,7 @@ class NumpyEnv(Protocol):
         return {name: value.item(0) for name, value in values.items()}
 
 
-class Face(gymnasium.Env):
+class GymnasiumAdapter(gymnasium.Env):
     """One environment.
 
     Args:
@@ -122,7 +122,7 @@ class Face(gymnasium.Env):
         raise NotImplementedError
 
 
-class VectorFace(VectorEnv):
+class GymnasiumVectorAdapter(VectorEnv):
     """`num_envs` environments in one batch.
 
     Args:

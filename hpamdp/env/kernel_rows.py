@@ -10,7 +10,7 @@ import numpy as np
 from hpamdp.env import kernels
 from hpamdp.env.kernels import ACT, ACT_AND_RESTART, ACT_OR_RESTART, RESTART
 
-# Moves all rows; its arguments are those of `Rows.advance`, in this order.
+# Moves all rows; its arguments are those of `KernelRows.advance`, in this order.
 Advance = Callable[..., int]
 
 
@@ -27,7 +27,7 @@ class Results(NamedTuple):
     rewards: np.ndarray
 
 
-class Rows:
+class KernelRows:
     """The state of N rows, and the kernel that moves them.
 
     Args:

@@ -11,7 +11,7 @@ class EpisodeError(ValueError):
     """An episode that cannot have been played, or is none at all; the message is one line."""
 
 
-class Page(Protocol):
+class PlayPage(Protocol):
     """A page in a browser on which people play a problem.
 
     Attributes:
