@@ -41,13 +41,14 @@ def test_every_choice_has_a_page_that_names_it_and_shows_its_settings(group, nam
     assert f"- {file.relative_to(DOCS).as_posix()}\n" in (ROOT / "mkdocs.yml").read_text()
     source = f"conf/{group}/{name}.yaml"
     values = yaml.safe_load((ROOT / source).read_text())
-    values = {**hooks.fields_of(source, values.pop("_target_")), **values}
+    defaults = {name: field[1] for name, field in hooks.fields_of(source, values.pop("_target_")).items()}
+    values = {**defaults, **values}
     if not values:
         return
     assert source in text
     table = hooks.settings_of(source)
     for key, value in values.items():
-        for setting in [f"{key}.{inner}" for inner in value] if isinstance(value, dict) else [key]:
+        for setting in [f"{key}.{inner}" for inner in value] if value and isinstance(value, dict) else [key]:
             assert f"| `{setting}` |" in table
             assert f"| `{setting}` |  |  |" not in table
 
