@@ -8,63 +8,58 @@ TorchRL's BCLoss does not fit: it reads a single action leaf.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
-from hpamdp.settings import LearningRate
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy, ScaleOptions
+from hpamdp.policies.shared.replay import BufferOptions, ReplayLearner, ReplayOptions
+from hpamdp.settings import LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
+class BCOptions(ScaleOptions, BufferOptions):
+    """Settings of `BC`."""
+
+    hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
+    """Hidden layers of the actor."""
+    buffer_size: PositiveInt = 200_000
+    """Largest number of transitions that are kept."""
+    batch_size: PositiveInt = 512
+    """Transitions in an update."""
+    lr: LearningRate = 1e-3
+    """Learning rate of AdamW."""
+    weight_decay: NonNegativeFloat = 1e-2
+    """Weight decay of AdamW."""
+
+
 class BC(ReplayLearner):
-    """Maximum-likelihood imitation; learns from data sets alone.
+    """Maximum-likelihood imitation; learns from data sets alone."""
 
-    Args:
-        specs: sizes and bounds of the problem.
-        device: where the network lives.
-        hidden_dims: sizes of the actor's hidden layers.
-        min_scale, max_scale: range of the Gaussian's standard deviation, in units where the bounds are [-1, 1].
-        buffer_size: largest number of transitions that are kept.
-        batch_size: transitions in an update.
-        lr: learning rate.
-        weight_decay: of AdamW.
-    """
-
+    Options = BCOptions
     stores_own_parameters = True
     modes: ClassVar[tuple[str, ...]] = ("offline",)
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
-        min_scale: PositiveFloat,
-        max_scale: PositiveFloat,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        lr: LearningRate,
-        weight_decay: NonNegativeFloat,
+        device: torch.device | str = "cpu",
+        options: BCOptions | None = None,
+        **settings: Any,
     ) -> None:
-        if not min_scale < max_scale:
-            raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
-        options = ReplayOptions(
-            gamma=1.0,
-            warmup_steps=0,
-            buffer_size=buffer_size,
-            batch_size=batch_size,
-            updates_per_step=1.0,
-        )
-        super().__init__(specs, device, options)
-        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
+        options = BCOptions.of(options, settings)
+        sizes = ReplayOptions(buffer_size=options.buffer_size, batch_size=options.batch_size, warmup_steps=0)
+        super().__init__(specs, device, sizes)
+        initial_scale = (options.min_scale * options.max_scale) ** 0.5
+        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range, initial_scale)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
-        optimizer = torch.optim.AdamW(self.actor.parameters(), lr=lr, weight_decay=weight_decay, fused=True)
+        optimizer = torch.optim.AdamW(
+            self.actor.parameters(), lr=options.lr, weight_decay=options.weight_decay, fused=True
+        )
         self.optimizers = {"actor": optimizer}
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
@@ -72,6 +67,7 @@ class BC(ReplayLearner):
         return self.gradient_step("actor", self._loss, sample, self.allowed(sample))
 
     def _loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the negative log-likelihood of the data's actions, and scalars."""
         distribution: HybridDistribution = self.actor(sample["state"], allowed)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
         scalars = {"discrete_log_prob": discrete_log_prob.mean(), "parameter_log_prob": parameter_log_prob.mean()}

@@ -8,26 +8,26 @@ Games*, 2019, arXiv 1912.11077 (parameterised actions, two temperatures). Tuned 
 arXiv 1812.05905, section 5. Exact expectation over discrete actions: Christodoulou 2019, arXiv 1910.07207.
 
 Differs from the source:
-- the critics are multi-pass (Bester, James and Konidaris 2019, arXiv 1905.04388): the value of a discrete action sees
-  its own parameters alone, so the others neither receive false gradients nor add noise to the target;
-- each temperature has a target entropy: a fraction of the uniform distribution's for the discrete action, and nats for
-  each parameter of the executed action, so actions with more parameters, or none, need no target of their own;
-- the actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477).
+- The critics are multi-pass (Bester, James and Konidaris 2019, arXiv 1905.04388): the value of a discrete action sees
+  its own parameters alone. So the others neither receive false gradients nor add noise to the target.
+- Each temperature has a target entropy: a fraction of the uniform distribution's for the discrete action, and nats for
+  each parameter of the executed action. So actions with more parameters, or none, need no target of their own.
+- The actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477).
 
-TorchRL's SACLoss does not fit: it sums the log-probabilities of all action leaves under one temperature; nor does its
-DiscreteSACLoss, which has no parameters: the expectation over discrete actions here also weighs their log-densities.
+TorchRL's SACLoss does not fit: it sums the log-probabilities of all action leaves under one temperature. Its
+DiscreteSACLoss has no parameters, and the expectation over discrete actions here also weighs their log-densities.
 Sampling parameters with their densities from TorchRL's TanhNormal takes 2 to 4 times as long as the
-`HybridDistribution` used here, and its densities are wrong near the bounds, where it inverts the tanh.
+`HybridDistribution` used here. Its densities are wrong near the bounds, where it inverts the tanh.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -35,7 +35,8 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_logits, random_choice
-from hpamdp.policies.shared.hybrid_actor import HybridDistribution
+from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
+from hpamdp.policies.shared.hybrid_actor import HybridDistribution, ScaleOptions
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
@@ -44,35 +45,52 @@ from hpamdp.policies.shared.networks import (
     mlp,
     polyak_update,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
-from hpamdp.settings import LearningRate, PositiveFraction
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 
-class HSACActor(nn.Module):
-    """One network for the logits of the discrete actions and the Gaussians of their parameters, before squashing.
+class HSACOptions(ActorCriticOptions, TargetRateOptions, ScaleOptions):
+    """Settings of `HSAC`."""
 
-    Args:
-        specs: sizes and bounds of the problem.
-        hidden_dims: sizes of the hidden layers.
-        scale_range: smallest and largest standard deviation.
-        initial_parameters: `domain`: the squashed means start at the problem's initial parameters, if it has any.
+    batch_size: PositiveInt = 256
+    """Transitions in an update."""
+    initial_parameters: InitialParameters = "none"
+    """Initial means: `domain` takes the problem's own initial parameters, if it has any; `none` takes mid-range."""
+    min_scale: PositiveFloat = 0.005
+    """Smallest standard deviation of the parameters, before they are squashed to [-1, 1]."""
+    discrete_temperature: PositiveFloat = 0.05
+    """Weight of the discrete action's entropy in the return; if tuned, its value at the start."""
+    parameter_temperature: PositiveFloat = 0.05
+    """Weight of the parameters' entropy in the return; if tuned, its value at the start."""
+    tune_discrete_temperature: bool = True
+    """Learn the discrete temperature, so that the entropy meets `discrete_target_entropy`."""
+    tune_parameter_temperature: bool = True
+    """Learn the parameters' temperature, so that the entropy meets `parameter_target_entropy`."""
+    discrete_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    """Target entropy of the discrete action, as a fraction of the uniform distribution's entropy."""
+    parameter_target_entropy: Annotated[float, Field(lt=math.log(2.0))] = -2.0
+    """Target entropy in nats for each parameter of the executed action, where the bounds are [-1, 1].
+
+    Uniform: 0.69. Standard deviation 0.1: -0.9; 0.03: -2.1; 0.01: -3.2.
     """
+    temperature_lr: LearningRate = 1e-3
+    """Learning rate of the temperatures."""
+    policy_delay: PositiveInt = 2
+    """Critic updates for each update of the actor and the temperatures."""
+
+
+class HSACActor(nn.Module):
+    """One network for the logits of the discrete actions and the Gaussians of their parameters, before squashing."""
 
     owner: Tensor
 
-    def __init__(
-        self,
-        specs: PAMDPSpecs,
-        hidden_dims: list[int],
-        scale_range: tuple[float, float],
-        initial_parameters: InitialParameters,
-    ) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: HSACOptions) -> None:
         super().__init__()
         self.sizes = [specs.num_discrete, specs.num_parameters, specs.num_parameters]
-        self.log_min_scale, self.log_max_scale = (math.log(scale) for scale in scale_range)
-        self.net = mlp(specs.observation_dim, hidden_dims, sum(self.sizes))
-        self.initial = InitialLayer(specs, initial_parameters, is_squashed=True)
+        self.log_min_scale, self.log_max_scale = (math.log(scale) for scale in options.scale_range)
+        self.net = mlp(specs.observation_dim, options.hidden_dims, sum(self.sizes))
+        self.initial = InitialLayer(specs, options.initial_parameters, is_squashed=True)
         means = slice(specs.num_discrete, specs.num_discrete + specs.num_parameters)
         self.initial.shrink(self.net[-1], means)
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
@@ -121,124 +139,72 @@ class HSACPolicy(TensorDictModuleBase):
 class HSAC(ReplayLearner):
     """Soft policy iteration over discrete actions and their parameters, from a replay buffer of its own."""
 
+    Options = HSACOptions
     stores_own_parameters = True
 
+    options: HSACOptions
     policy: HSACPolicy
     parameter_dims: Tensor
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: list[PositiveInt],
-        initial_parameters: InitialParameters,
-        min_scale: PositiveFloat,
-        max_scale: PositiveFloat,
-        discrete_temperature: PositiveFloat,
-        parameter_temperature: PositiveFloat,
-        tune_discrete_temperature: bool,
-        tune_parameter_temperature: bool,
-        discrete_target_entropy: Annotated[float, Field(ge=0.0, lt=1.0)],
-        parameter_target_entropy: Annotated[float, Field(lt=math.log(2.0))],
-        temperature_lr: LearningRate,
-        warmup_steps: NonNegativeInt,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_step: PositiveFloat,
-        augment: bool,
-        policy_delay: PositiveInt,
-        gamma: PositiveFraction,
-        tau: PositiveFraction,
-        actor_lr: LearningRate,
-        critic_lr: LearningRate,
+        device: torch.device | str = "cpu",
+        options: HSACOptions | None = None,
+        **settings: Any,
     ) -> None:
-        if not min_scale < max_scale:
-            raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
-        options = ReplayOptions(
-            gamma=gamma,
-            warmup_steps=warmup_steps,
-            buffer_size=buffer_size,
-            batch_size=batch_size,
-            updates_per_step=updates_per_step,
-            augment=augment,
-        )
+        options = HSACOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.discrete_target_entropy = discrete_target_entropy
         self.most_discrete_entropy = math.log(specs.num_discrete)
-        self.parameter_target_entropy = parameter_target_entropy
         self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
-        self.policy_delay = policy_delay
-        self.tau = tau
-
-        self.actor = HSACActor(specs, hidden_dims, (min_scale, max_scale), initial_parameters)
-        self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
+        self.actor = HSACActor(specs, options)
+        self.critics = HybridCritics(specs, 2, options.hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.log_discrete_temperature = nn.Parameter(
-            torch.tensor(math.log(discrete_temperature), dtype=torch.float32), requires_grad=tune_discrete_temperature
+        self.log_discrete_temperature = log_temperature(
+            options.discrete_temperature, is_tuned=options.tune_discrete_temperature
         )
-        self.log_parameter_temperature = nn.Parameter(
-            torch.tensor(math.log(parameter_temperature), dtype=torch.float32), requires_grad=tune_parameter_temperature
+        self.log_parameter_temperature = log_temperature(
+            options.parameter_temperature, is_tuned=options.tune_parameter_temperature
         )
         self.policy = HSACPolicy(self.actor, specs)
         self.to(device)
         temperatures = [self.log_discrete_temperature, self.log_parameter_temperature]
+        self.tunes_temperatures = any(temperature.requires_grad for temperature in temperatures)
         self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
-            "temperatures": torch.optim.Adam(temperatures, lr=temperature_lr, fused=True),
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
+            "temperatures": torch.optim.Adam(temperatures, lr=options.temperature_lr, fused=True),
         }
-
-    def on_progress(self, steps: int) -> None:
-        """Explore with the actor from the end of the warm-up on."""
-        self.policy.is_random.fill_(False)
-
-    def temperatures(self) -> tuple[Tensor, Tensor]:
-        """Return the weights of the discrete entropy and of the parameters' entropy, without gradients."""
-        return self.log_discrete_temperature.detach().exp(), self.log_parameter_temperature.detach().exp()
-
-    def soft_value(
-        self, critics: HybridCritics, state: Tensor, allowed: Tensor | None = None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the soft value V of states `[B, observation_dim]`, and both entropies minus their targets, each `[B]`.
-
-        V = sum_k pi(k) [min Q(k, x_k) - a log pi(k) - b log pi(x_k)] with sampled x_k and temperatures a and b. The
-        expectation over discrete actions is exact; the parameters' entropy is that of the executed action's own.
-
-        Args:
-            critics: that say Q.
-            state: `[B, observation_dim]`.
-            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
-        """
-        discrete_weight, parameter_weight = self.temperatures()
-        distribution: HybridDistribution = self.actor(state, allowed)
-        unit, log_density = distribution.sample_squashed()
-        log_probs = distribution.discrete_log_probs
-        # Of each discrete action's own parameters together, `[B, num_discrete]`.
-        own_log_density = distribution.sum_of_own(log_density)
-        own_target = self.parameter_target_entropy * self.parameter_dims
-        q = critics(state, unit).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
-        probs = log_probs.exp()
-        most_entropy = self.most_discrete_entropy if allowed is None else allowed.sum(-1).log()
-        discrete_excess = -(probs * log_probs).sum(-1) - self.discrete_target_entropy * most_entropy
-        parameter_excess = -(probs * (own_log_density + own_target)).sum(-1)
-        return (probs * q).sum(-1), discrete_excess, parameter_excess
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the temperatures. Return scalars."""
         scalars = self.gradient_step("critics", self._critic_loss, sample)
         scalars["discrete_temperature"], scalars["parameter_temperature"] = self.temperatures()
-        if self.updates % self.policy_delay == 0:
-            scalars |= self._update_actor(sample["state"], self.allowed(sample))
-            self._update_temperatures(scalars["discrete_excess"], scalars["parameter_excess"])
-        polyak_update(self.target_critics, self.critics, self.tau)
+        if self.updates % self.options.policy_delay == 0:
+            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            if self.tunes_temperatures:
+                excesses = scalars["discrete_excess"], scalars["parameter_excess"]
+                self.gradient_step("temperatures", self._temperature_loss, *excesses)
+        polyak_update(self.target_critics, self.critics, self.options.tau)
         return scalars
 
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the squared distance from the targets, and scalars."""
+        """Return the squared distance from r + discount V'(s'), and scalars."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
+
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls with the soft value, and the mean entropies minus their targets."""
+        value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed)
+        loss = -value.mean()
+        excesses = {"discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
+        return loss, {"actor": loss, **excesses}
+
+    def _temperature_loss(self, discrete_excess: Tensor, parameter_excess: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that lowers a temperature whose entropy exceeds the target, and raises it otherwise."""
+        discrete_loss = self.log_discrete_temperature * discrete_excess
+        return discrete_loss + self.log_parameter_temperature * parameter_excess, {}
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
@@ -246,21 +212,42 @@ class HSAC(ReplayLearner):
         value, _, _ = self.soft_value(self.target_critics, observation, self.specs.allowed(observation, action_mask))
         return value
 
-    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
-        """Update the actor to increase the soft value; return the loss and the mean entropies minus their targets."""
-        return self.gradient_step("actor", self._actor_loss, state, allowed)
+    def soft_value(
+        self, critics: HybridCritics, state: Tensor, allowed: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the soft value V of states `[B, observation_dim]`, and both entropies minus their targets, each `[B]`.
 
-    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
-        value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed)
-        loss = -value.mean()
-        excesses = {"discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
-        return loss, {"actor": loss, **excesses}
+        V = sum_k pi(k) [min Q(k, x_k) - a log pi(k) - b log pi(x_k)] with sampled x_k and temperatures a and b. The
+        expectation over discrete actions is exact. The parameters' entropy is that of the executed action's own.
 
-    def _update_temperatures(self, discrete_excess: Tensor, parameter_excess: Tensor) -> None:
-        """Lower each temperature where its entropy exceeds the target, raise it where the entropy falls short."""
-        if self.log_discrete_temperature.requires_grad or self.log_parameter_temperature.requires_grad:
-            self.gradient_step("temperatures", self._temperature_loss, discrete_excess, parameter_excess)
+        Args:
+            critics: give Q.
+            state: `[B, observation_dim]`.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; if None, all.
+        """
+        discrete_weight, parameter_weight = self.temperatures()
+        distribution: HybridDistribution = self.actor(state, allowed)
+        unit, log_density = distribution.sample_squashed()
+        log_probs = distribution.discrete_log_probs
+        # Of each discrete action's own parameters together, `[B, num_discrete]`.
+        own_log_density = distribution.sum_of_own(log_density)
+        own_target = self.options.parameter_target_entropy * self.parameter_dims
+        q = critics(state, unit).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
+        probs = log_probs.exp()
+        most_entropy = self.most_discrete_entropy if allowed is None else allowed.sum(-1).log()
+        discrete_excess = -(probs * log_probs).sum(-1) - self.options.discrete_target_entropy * most_entropy
+        parameter_excess = -(probs * (own_log_density + own_target)).sum(-1)
+        return (probs * q).sum(-1), discrete_excess, parameter_excess
 
-    def _temperature_loss(self, discrete_excess: Tensor, parameter_excess: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        discrete_loss = self.log_discrete_temperature * discrete_excess
-        return discrete_loss + self.log_parameter_temperature * parameter_excess, {}
+    def temperatures(self) -> tuple[Tensor, Tensor]:
+        """Return the weights of the discrete entropy and of the parameters' entropy, without gradients."""
+        return self.log_discrete_temperature.detach().exp(), self.log_parameter_temperature.detach().exp()
+
+    def on_progress(self, steps: int) -> None:
+        """Explore with the actor from the end of the warm-up on."""
+        self.policy.is_random.fill_(False)
+
+
+def log_temperature(initial: float, *, is_tuned: bool) -> nn.Parameter:
+    """Return the logarithm of a temperature, with a gradient if it is tuned."""
+    return nn.Parameter(torch.tensor(math.log(initial), dtype=torch.float32), requires_grad=is_tuned)

@@ -17,7 +17,7 @@ TorchRL's IQLLoss does not fit: it reads a single action leaf.
 from __future__ import annotations
 
 import copy
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt
@@ -25,71 +25,65 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
 from hpamdp.policies.shared.gradients import expectile_loss
-from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy
+from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy, ScaleOptions
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
-from hpamdp.settings import Expectile, LearningRate, PositiveFraction
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import Expectile, LearningRate, PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
+
+
+class IQLOptions(ActorCriticOptions, TargetRateOptions, ScaleOptions):
+    """Settings of `IQL`."""
+
+    hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
+    """Hidden layers of the actor, the state value and the critics."""
+    critic_lr: LearningRate = 1e-3
+    """Learning rate of the critics and of the state value."""
+    tau: PositiveFraction = 0.005
+    """Fraction of the way to the learned critics that the target critics move in an update."""
+    warmup_steps: NonNegativeInt = 1000
+    """Steps before the first update; the policy explores by its own standard deviation."""
+    batch_size: PositiveInt = 256
+    """Transitions in an update."""
+    expectile: Expectile = 0.8
+    """Expectile of the actions' values that V estimates: 0.5 is their mean, 1 their maximum."""
+    temperature: PositiveFloat = 10.0
+    """An action has weight exp(temperature * advantage) in the policy's likelihood."""
+    max_weight: PositiveFloat = 100.0
+    """Largest weight of an action."""
 
 
 class IQL(ReplayLearner):
     """Twin critics, a state value and an advantage-weighted policy, from a data set or a replay buffer."""
 
+    Options = IQLOptions
     stores_own_parameters = True
+
+    options: IQLOptions
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: Annotated[list[PositiveInt], Field(min_length=1)],
-        min_scale: PositiveFloat,
-        max_scale: PositiveFloat,
-        expectile: Expectile,
-        temperature: PositiveFloat,
-        max_weight: PositiveFloat,
-        gamma: PositiveFraction,
-        tau: PositiveFraction,
-        actor_lr: LearningRate,
-        critic_lr: LearningRate,
-        warmup_steps: NonNegativeInt,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_step: PositiveFloat,
-        augment: bool,
+        device: torch.device | str = "cpu",
+        options: IQLOptions | None = None,
+        **settings: Any,
     ) -> None:
-        if not min_scale < max_scale:
-            raise ValueError(f"min_scale={min_scale}: must be less than {max_scale=}")
-        options = ReplayOptions(
-            gamma=gamma,
-            warmup_steps=warmup_steps,
-            buffer_size=buffer_size,
-            batch_size=batch_size,
-            updates_per_step=updates_per_step,
-            augment=augment,
-        )
+        options = IQLOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.expectile = expectile
-        self.temperature = temperature
-        self.max_weight = max_weight
-        self.tau = tau
-
-        self.actor = HybridActor(specs, hidden_dims, (min_scale, max_scale), (min_scale * max_scale) ** 0.5)
-        self.state_value = mlp(specs.observation_dim, hidden_dims, 1)
-        self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
+        initial_scale = (options.min_scale * options.max_scale) ** 0.5
+        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range, initial_scale)
+        self.state_value = mlp(specs.observation_dim, options.hidden_dims, 1)
+        self.critics = HybridCritics(specs, 2, options.hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
         self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
-            "state_value": torch.optim.Adam(self.state_value.parameters(), lr=critic_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
+            "state_value": torch.optim.Adam(self.state_value.parameters(), lr=options.critic_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
         }
-
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return V(s), `[B]`."""
-        return self.state_value(observation).squeeze(-1)
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update V, then Q, then the policy from transitions `[batch_size]`; return scalars."""
@@ -97,13 +91,13 @@ class IQL(ReplayLearner):
             q = self.target_critics.of_discrete(sample["state"], sample["discrete"], sample["unit"]).amin(0)
         of_value = self.gradient_step("state_value", self._value_loss, sample["state"], q)
         scalars = self.gradient_step("critics", self._critic_loss, sample) | of_value | {"q": q.mean()}
-        polyak_update(self.target_critics, self.critics, self.tau)
+        polyak_update(self.target_critics, self.critics, self.options.tau)
         return scalars | self.gradient_step("actor", self._actor_loss, sample, self.allowed(sample), q)
 
     def _value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of V from the expectile of the values `[B]` of the data's actions."""
         excess = q - self.value(state)
-        loss = expectile_loss(excess, self.expectile)
+        loss = expectile_loss(excess, self.options.expectile)
         return loss, {"value": loss}
 
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -118,8 +112,12 @@ class IQL(ReplayLearner):
         """Return the negative log-likelihood of the data's actions, weighted by their advantages."""
         with torch.no_grad():
             advantage = q - self.value(sample["state"])
-            weight = (self.temperature * advantage).exp().clamp(max=self.max_weight)
+            weight = (self.options.temperature * advantage).exp().clamp(max=self.options.max_weight)
         distribution: HybridDistribution = self.actor(sample["state"], allowed)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
         loss = -(weight * (discrete_log_prob + parameter_log_prob)).mean()
         return loss, {"advantage_weight": weight.mean()}
+
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return V(s), `[B]`."""
+        return self.state_value(observation).squeeze(-1)

@@ -9,24 +9,23 @@ sections 4 and 5, equation 11. TD3: Fujimoto, van Hoof and Meger 2018, arXiv 180
 2109.05490 (a row of its tables).
 
 Differs from the source:
-- a random action is stored with random scores of which the highest is its own, as in the code of Bester, James and
-  Konidaris 2019, arXiv 1905.04388;
-- `parameter_noise` adds Gaussian noise to scores and parameters, besides epsilon-random actions;
-- smaller networks, which start as PyTorch's; the learning rates and the target rate are those of this project;
-- the problem's initial parameters, if `initial_parameters` asks for them, are added by a frozen layer, as in Bester et
-  al.
+- A random action is stored with random scores of which the highest is its own, as in the code of Bester, James and
+  Konidaris 2019, arXiv 1905.04388.
+- `parameter_noise` adds Gaussian noise to scores and parameters, besides epsilon-random actions.
+- The networks are smaller and start as PyTorch's; the learning rates and the target rate are those of this project.
+- If `initial_parameters` asks for them, a frozen layer adds the problem's initial parameters, as in Bester et al.
 
-TorchRL's DDPGLoss and TD3Loss would need a composite action split for them, bounds of their own, and have no inverting
-gradients, for which the gradient must be changed between critic and actor.
+TorchRL's DDPGLoss and TD3Loss would need a composite action split for them, and bounds of their own. They have no
+inverting gradients, for which the gradient must be changed between critic and actor.
 """
 
 from __future__ import annotations
 
 import copy
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -34,7 +33,8 @@ from torch import Tensor, nn
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_values
-from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, TwinCriticOptions
+from hpamdp.policies.shared.exploration import EpsilonOptions, linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
     EnsembleMLP,
     InitialLayer,
@@ -44,22 +44,45 @@ from hpamdp.policies.shared.networks import (
     polyak_update,
     with_clipped_noise,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
-from hpamdp.settings import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the scores of the discrete actions, which the critic sees.
 SCORES = "scores"
 
 
+class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, EpsilonOptions):
+    """Settings of `PADDPG`. Noise is in units where the bounds of scores and parameters are [-1, 1]."""
+
+    twin: bool = False
+    """Train as in TD3, which makes it PATD3: the lower of two critics counts, with smoothing and a delayed actor."""
+    target_smoothing: NonNegativeFloat = 0.1
+    """With `twin`: standard deviation of the noise on scores and parameters in the target; 0: none."""
+    target_smoothing_clip: NonNegativeFloat = 0.2
+    """With `twin`: largest size of this noise."""
+    policy_delay: PositiveInt = 2
+    """With `twin`: critic updates for each update of the actor and the target networks."""
+    initial_parameters: InitialParameters = "domain"
+    """`domain` adds the problem's own initial parameters, if it has any, by a frozen layer; `none` adds nothing."""
+    actor_lr: LearningRate = 1e-4
+    """Learning rate of the actor."""
+    max_grad_norm: PositiveFloat | None = 10.0
+    """Largest gradient norm; null: no limit."""
+    parameter_noise: NonNegativeFloat = 0.1
+    """Standard deviation of the exploring noise on scores and parameters."""
+    augment: Literal[False] = False
+    """Always false: the symmetries of a problem map no scores."""
+
+
 class PADDPGActor(nn.Module):
     """Scores and parameters: `[*B, observation_dim]` -> `[*B, num_discrete + num_parameters]` in [-1, 1]."""
 
-    def __init__(self, specs: PAMDPSpecs, hidden_dims: list[int], initial_parameters: InitialParameters) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: PADDPGOptions) -> None:
         super().__init__()
         self.num_discrete = specs.num_discrete
-        self.net = mlp(specs.observation_dim, hidden_dims, specs.num_discrete + specs.num_parameters)
-        self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
+        self.net = mlp(specs.observation_dim, options.hidden_dims, specs.num_discrete + specs.num_parameters)
+        self.initial = InitialLayer(specs, options.initial_parameters, is_squashed=False)
         self.initial.shrink(self.net[-1], slice(self.num_discrete, None))
 
     def forward(self, state: Tensor) -> Tensor:
@@ -116,97 +139,72 @@ class PADDPG(ReplayLearner):
 
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no scores
 
+    Options = PADDPGOptions
+    options: PADDPGOptions
     policy: PADDPGPolicy
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        twin: bool,
-        target_smoothing: NonNegativeFloat,
-        target_smoothing_clip: NonNegativeFloat,
-        policy_delay: PositiveInt,
-        initial_parameters: InitialParameters,
-        hidden_dims: list[PositiveInt],
-        warmup_steps: NonNegativeInt,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_step: PositiveFloat,
-        gamma: PositiveFraction,
-        tau: PositiveFraction,
-        actor_lr: LearningRate,
-        critic_lr: LearningRate,
-        max_grad_norm: PositiveFloat | None,
-        parameter_noise: NonNegativeFloat,
-        epsilon_final: Fraction,
-        epsilon_steps: NonNegativeInt,
+        device: torch.device | str = "cpu",
+        options: PADDPGOptions | None = None,
+        **settings: Any,
     ) -> None:
-        options = ReplayOptions(
-            gamma=gamma,
-            warmup_steps=warmup_steps,
-            buffer_size=buffer_size,
-            batch_size=batch_size,
-            updates_per_step=updates_per_step,
-        )
+        options = PADDPGOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.target_smoothing = target_smoothing if twin else 0.0
-        self.target_smoothing_clip = target_smoothing_clip
-        self.policy_delay = policy_delay if twin else 1
-        self.tau = tau
-        self.max_grad_norm = max_grad_norm
-        self.epsilon_final = epsilon_final
-        self.epsilon_steps = epsilon_steps
-
-        action_dim = specs.num_discrete + specs.num_parameters
-        self.actor = PADDPGActor(specs, hidden_dims, initial_parameters)
-        self.critics = EnsembleMLP(2 if twin else 1, specs.observation_dim + action_dim, hidden_dims, 1)
+        self.max_grad_norm = options.max_grad_norm
+        self.policy_delay = options.policy_delay if options.twin else 1
+        self.actor = PADDPGActor(specs, options)
+        num_inputs = specs.observation_dim + specs.num_discrete + specs.num_parameters
+        self.critics = EnsembleMLP(2 if options.twin else 1, num_inputs, options.hidden_dims, 1)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = PADDPGPolicy(self.actor, specs, parameter_noise)
+        self.policy = PADDPGPolicy(self.actor, specs, options.parameter_noise)
         self.to(device)
         self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
         }
-
-    @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return min Q'(s, a), `[B]`, with a the target actor's output, smoothed with `twin`."""
-        output = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
-        output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
-        return self._q(self.target_critics, observation, output).amin(0)
-
-    def on_progress(self, steps: int) -> None:
-        """Lower the fraction of random actions."""
-        self.policy.epsilon.fill_(linear_schedule(steps, self.epsilon_steps, self.epsilon_final))
-
-    def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the rows to store, with all scores."""
-        return super().transitions(batch).set(SCORES, batch[SCORES])
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
         scalars = self.gradient_step("critics", self._critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            inputs = sample["state"], self.allowed(sample)
-            scalars |= self.gradient_step("actor", self._actor_loss, *inputs)
-            polyak_update(self.target_actor, self.actor, self.tau)
-            polyak_update(self.target_critics, self.critics, self.tau)
+            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            polyak_update(self.target_actor, self.actor, self.options.tau)
+            polyak_update(self.target_critics, self.critics, self.options.tau)
         return scalars
 
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the squared distance from the targets, and scalars."""
-        q = self._q(self.critics, sample["state"], torch.cat([sample[SCORES], sample["unit"]], -1))
+        """Return the squared distance from r + discount min Q'(s', a'), and scalars."""
+        q = q_values(self.critics, sample["state"], torch.cat([sample[SCORES], sample["unit"]], -1))
         loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
     def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the value of the actor's output by the first critic."""
-        loss = -self._q(self.critics, state, with_lowest_scores(self.actor(state), allowed))[0].mean()
+        loss = -q_values(self.critics, state, with_lowest_scores(self.actor(state), allowed))[0].mean()
         return loss, {"actor": loss}
 
-    def _q(self, critics: EnsembleMLP, state: Tensor, output: Tensor) -> Tensor:
-        """Return the critics' values `[E, B]` of an actor's outputs `[B, num_discrete + num_parameters]`."""
-        return critics(torch.cat([state, output], -1)).squeeze(-1)
+    @torch.no_grad()
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return min Q'(s, a), `[B]`, with a the target actor's output, smoothed with `twin`."""
+        output = self.target_actor(observation)
+        if self.options.twin:
+            output = with_clipped_noise(output, self.options.target_smoothing, self.options.target_smoothing_clip)
+        output = with_lowest_scores(output, self.specs.allowed(observation, action_mask))
+        return q_values(self.target_critics, observation, output).amin(0)
+
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return the rows to store, with all scores."""
+        return super().transitions(batch).set(SCORES, batch[SCORES])
+
+    def on_progress(self, steps: int) -> None:
+        """Lower the probability of random actions."""
+        self.policy.epsilon.fill_(linear_schedule(steps, self.options.epsilon_steps, self.options.epsilon_final))
+
+
+def q_values(critics: EnsembleMLP, state: Tensor, output: Tensor) -> Tensor:
+    """Return the critics' values `[E, B]` of an actor's outputs `[B, num_discrete + num_parameters]`."""
+    return critics(torch.cat([state, output], -1)).squeeze(-1)

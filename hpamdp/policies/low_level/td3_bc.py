@@ -6,11 +6,11 @@ on the critics of MP-DQN (Bester et al. 2019, arXiv 1905.04388) with the twin cr
 1910.01708, equation in section 4).
 
 Differs from the sources:
-- every discrete action has its own parameters, so the actor increases the values of all discrete actions, each weighted
-  by its frequency in the data; the distance from the data is that of the recorded action's own parameters;
-- the actor increases the minimum of both critics, not the first one's value;
-- states are not normalised, as problems scale their observations;
-- by default the values weigh twice as much: `behaviour_weight` is 1 / alpha, 0.2 where the source has alpha = 2.5, that
+- Every discrete action has its own parameters. So the actor increases the values of all discrete actions, each weighted
+  by its frequency in the data. The distance from the data is that of the recorded action's own parameters.
+- The actor increases the minimum of both critics, not the first one's value.
+- States are not normalised, as problems scale their observations.
+- By default the values weigh twice as much: `behaviour_weight` is 1 / alpha, 0.2 where the source has alpha = 2.5, that
   is 0.4.
 
 TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, without a discrete choice.
@@ -19,10 +19,10 @@ TorchRL's TD3BCLoss does not fit: its policy is a single bounded action leaf, wi
 from __future__ import annotations
 
 import copy
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveInt
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -31,11 +31,40 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import allowed_rows, masked_logits
-from hpamdp.policies.shared.exploration import with_exploring_noise
+from hpamdp.policies.shared.actor_critic import ActorCriticOptions, SmoothedTargetOptions, TargetRateOptions
+from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
 from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update, with_clipped_noise
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
-from hpamdp.settings import LearningRate, PositiveFraction
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import LearningRate, PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
+
+
+class TD3BCOptions(ActorCriticOptions, TargetRateOptions, SmoothedTargetOptions, ParameterNoiseOptions):
+    """Settings of `TD3BC`. Noise is in units where the parameters' bounds are [-1, 1]."""
+
+    hidden_dims: Widths = (128, 128)
+    """Hidden layers of the actor, the critics and the model of the data's discrete actions."""
+    actor_lr: LearningRate = 1e-3
+    """Learning rate of the actor and of the model of the data's discrete actions."""
+    behaviour_weight: NonNegativeFloat = 0.2
+    """Weight of the parameters' squared distance from the data, beside values divided by their mean size.
+
+    It is 1 / alpha of the paper, which has 0.4.
+    """
+    discrete_threshold: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.3
+    """Discrete actions less probable in the data than this fraction of the most probable one are never taken."""
+    target_smoothing: NonNegativeFloat = 0.05
+    """Standard deviation of the noise on the parameters in the target."""
+    target_smoothing_clip: NonNegativeFloat = 0.1
+    """Largest size of this noise."""
+    policy_delay: PositiveInt = 2
+    """Critic updates for each update of the actor and the target networks."""
+    tau: PositiveFraction = 0.005
+    """Fraction of the way to the learned networks that the target networks move in an update of theirs."""
+    warmup_steps: NonNegativeInt = 1000
+    """Steps before the first update."""
+    batch_size: PositiveInt = 256
+    """Transitions in an update."""
 
 
 class TD3BCPolicy(TensorDictModuleBase):
@@ -48,8 +77,7 @@ class TD3BCPolicy(TensorDictModuleBase):
         critics: the values of all discrete actions.
         behaviour: logits of the data's discrete actions.
         specs: sizes and bounds of the problem.
-        discrete_threshold: least probability of an allowed action, as a fraction of the most frequent action's.
-        parameter_noise: standard deviation of the exploration noise.
+        options: settings of the learner.
     """
 
     def __init__(
@@ -58,8 +86,7 @@ class TD3BCPolicy(TensorDictModuleBase):
         critics: HybridCritics,
         behaviour: nn.Module,
         specs: PAMDPSpecs,
-        discrete_threshold: float,
-        parameter_noise: float,
+        options: TD3BCOptions,
     ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
@@ -68,10 +95,9 @@ class TD3BCPolicy(TensorDictModuleBase):
         self.critics = critics
         self.behaviour = behaviour
         self.specs = specs
-        self.log_threshold = (
-            torch.tensor(discrete_threshold, dtype=torch.float32).log().item()
-        )  # -inf where the threshold is 0
-        self.parameter_noise = parameter_noise
+        # In float32, and -inf where the threshold is 0.
+        self.log_threshold = torch.tensor(options.discrete_threshold, dtype=torch.float32).log().item()
+        self.parameter_noise = options.parameter_noise
 
     def is_refused(self, state: Tensor, allowed: Tensor | None) -> Tensor:
         """Return which discrete actions are forbidden or too rare in the data, bool `[B, num_discrete]`.
@@ -100,58 +126,33 @@ class TD3BCPolicy(TensorDictModuleBase):
 class TD3BC(ReplayLearner):
     """Q-learning on the data's discrete actions with parameters near the data's, from a data set or a replay buffer."""
 
+    Options = TD3BCOptions
     stores_own_parameters = True
 
+    options: TD3BCOptions
     policy: TD3BCPolicy
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        hidden_dims: list[PositiveInt],
-        behaviour_weight: NonNegativeFloat,
-        discrete_threshold: Annotated[float, Field(ge=0.0, lt=1.0)],
-        target_smoothing: NonNegativeFloat,
-        target_smoothing_clip: NonNegativeFloat,
-        policy_delay: PositiveInt,
-        parameter_noise: NonNegativeFloat,
-        gamma: PositiveFraction,
-        tau: PositiveFraction,
-        actor_lr: LearningRate,
-        critic_lr: LearningRate,
-        warmup_steps: NonNegativeInt,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_step: PositiveFloat,
-        augment: bool,
+        device: torch.device | str = "cpu",
+        options: TD3BCOptions | None = None,
+        **settings: Any,
     ) -> None:
-        options = ReplayOptions(
-            gamma=gamma,
-            warmup_steps=warmup_steps,
-            buffer_size=buffer_size,
-            batch_size=batch_size,
-            updates_per_step=updates_per_step,
-            augment=augment,
-        )
+        options = TD3BCOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.behaviour_weight = behaviour_weight
-        self.target_smoothing = target_smoothing
-        self.target_smoothing_clip = target_smoothing_clip
-        self.policy_delay = policy_delay
-        self.tau = tau
-
+        hidden_dims = options.hidden_dims
         self.actor = nn.Sequential(mlp(specs.observation_dim, hidden_dims, specs.num_parameters), nn.Tanh())
         self.critics = HybridCritics(specs, 2, hidden_dims, is_multipass=True)
         self.behaviour = mlp(specs.observation_dim, hidden_dims, specs.num_discrete)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = TD3BCPolicy(self.actor, self.critics, self.behaviour, specs, discrete_threshold, parameter_noise)
+        self.policy = TD3BCPolicy(self.actor, self.critics, self.behaviour, specs, options)
         self.to(device)
         self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
-            "behaviour": torch.optim.Adam(self.behaviour.parameters(), lr=actor_lr, fused=True),
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
+            "behaviour": torch.optim.Adam(self.behaviour.parameters(), lr=options.actor_lr, fused=True),
         }
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
@@ -159,10 +160,10 @@ class TD3BC(ReplayLearner):
         allowed = self.allowed(sample)
         scalars = self.gradient_step("critics", self._critic_loss, sample)
         scalars |= self.gradient_step("behaviour", self._behaviour_loss, sample, allowed)
-        if self.updates % self.policy_delay == 0:
+        if self.updates % self.options.policy_delay == 0:
             scalars |= self.gradient_step("actor", self._actor_loss, sample, allowed)
-            polyak_update(self.target_actor, self.actor, self.tau)
-            polyak_update(self.target_critics, self.critics, self.tau)
+            polyak_update(self.target_actor, self.actor, self.options.tau)
+            polyak_update(self.target_critics, self.critics, self.options.tau)
         return scalars
 
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -186,13 +187,14 @@ class TD3BC(ReplayLearner):
         is_own = self.owner == sample["discrete"].unsqueeze(-1)
         distance = ((unit - sample["unit"]).square() * is_own).sum(-1)
         # Values are divided by their mean size, so that the weight does not depend on the scale of the reward.
-        loss = (self.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
+        loss = (self.options.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
         return loss, {"actor": loss}
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`."""
-        unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
+        unit = self.target_actor(observation)
+        unit = with_clipped_noise(unit, self.options.target_smoothing, self.options.target_smoothing_clip)
         q = self.target_critics(observation, unit).amin(0)
         is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, action_mask))
         return q.masked_fill(is_refused, -torch.inf).amax(-1)

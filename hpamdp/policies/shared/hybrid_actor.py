@@ -8,15 +8,18 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import torch
+from pydantic import PositiveFloat, model_validator
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.nn import functional as F
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts
+from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
 
 # The raw sample of the parameters, which a learner needs for its likelihood.
@@ -100,6 +103,26 @@ class HybridDistribution(NamedTuple):
             values: `[*B, num_parameters]`.
         """
         return torch.zeros_like(self.discrete_log_probs).index_add(-1, self.owner, values)
+
+
+class ScaleOptions(Settings):
+    """The range in which the standard deviation of the parameters is learned."""
+
+    min_scale: PositiveFloat = 0.02
+    """Smallest standard deviation of the parameters, in units where their bounds are [-1, 1]."""
+    max_scale: PositiveFloat = 1.0
+    """Largest standard deviation of the parameters."""
+
+    @model_validator(mode="after")
+    def _check_scale(self) -> Self:
+        if not self.min_scale < self.max_scale:
+            raise ValueError(f"min_scale={self.min_scale}: must be less than max_scale={self.max_scale}")
+        return self
+
+    @property
+    def scale_range(self) -> tuple[float, float]:
+        """Smallest and largest standard deviation."""
+        return self.min_scale, self.max_scale
 
 
 class HybridActor(nn.Module):

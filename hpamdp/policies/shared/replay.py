@@ -22,15 +22,26 @@ from hpamdp.settings import PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
-class ReplayOptions(Settings):
-    """Settings of a learner with a replay buffer."""
+class BufferOptions(Settings):
+    """Settings of a replay buffer."""
 
-    warmup_steps: NonNegativeInt = 5000
-    """Random steps of a learner before its first update."""
     buffer_size: PositiveInt = 200_000
     """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     batch_size: PositiveInt = 128
     """Transitions in an update."""
+
+    @model_validator(mode="after")
+    def _check_buffer(self) -> Self:
+        if self.batch_size > self.buffer_size:
+            raise ValueError(f"batch_size={self.batch_size}: must be at most buffer_size={self.buffer_size}")
+        return self
+
+
+class ReplayOptions(BufferOptions):
+    """Settings of a learner with a replay buffer."""
+
+    warmup_steps: NonNegativeInt = 5000
+    """Random steps of a learner before its first update."""
     updates_per_step: Annotated[float, Field(gt=0.0)] = 0.25
     """Updates for each step that the learner collects."""
     augment: Literal["auto"] | bool = False
@@ -40,8 +51,6 @@ class ReplayOptions(Settings):
 
     @model_validator(mode="after")
     def _check_replay(self) -> Self:
-        if self.batch_size > self.buffer_size:
-            raise ValueError(f"batch_size={self.batch_size}: must be at most buffer_size={self.buffer_size}")
         if self.updates_per_step > 1000.0:
             raise ValueError(f"updates_per_step={self.updates_per_step}: must be at most 1000")
         return self
