@@ -41,6 +41,7 @@ from hpamdp.config import (
     no_such,
     no_such_option,
 )
+from hpamdp.limits import limit_in
 from hpamdp.messages import (
     file_and_reason,
     first_line,
@@ -150,6 +151,9 @@ def _main() -> None:
         sys.exit(_INTERRUPTED)
 
 
+_NEEDS = {"files": "more open files, see ulimit -n", "memory": "more memory, see ulimit -v"}
+
+
 @contextmanager
 def _limits_explained() -> Iterator[None]:
     """Exit with 1 and one line if the process runs out of files or memory, whichever library raises the error."""
@@ -160,22 +164,11 @@ def _limits_explained() -> Iterator[None]:
     except Exception as error:
         cause: BaseException | None = error
         while cause is not None:
-            limit = _limit(cause)
-            if limit is not None:
-                _exit_with(f"{first_line(cause) or type(cause).__name__}: the program needs {limit}", 1)
+            limit = limit_in(cause)
+            if limit in _NEEDS:
+                _exit_with(f"{first_line(cause) or type(cause).__name__}: the program needs {_NEEDS[limit]}", 1)
             cause = cause.__cause__ or cause.__context__
         raise
-
-
-def _limit(error: BaseException) -> str | None:
-    """Return in words which limit of the process an error is about; None if it is about no limit."""
-    text = str(error)
-    if getattr(error, "errno", None) in (errno.EMFILE, errno.ENFILE) or "Too many open files" in text:
-        return "more open files, see ulimit -n"
-    is_memory = isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM
-    if is_memory or "annot allocate memory" in text or "failed to map segment" in text:
-        return "more memory, see ulimit -v"
-    return None
 
 
 def _check_surroundings() -> None:

@@ -36,7 +36,7 @@ from hpamdp.run.collection.worker import (
     WorkingDir,
     packed,
 )
-from hpamdp.run.collection.workers import WorkerCollection, _call
+from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, _call
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
@@ -298,7 +298,7 @@ class Mortal(WorkerCollection):
         config = make_config([*SMALL, "high=ucb", *overrides])
         self.parts = assemble(config, folder)
         self.shards = []
-        super().__init__(config, self.parts, 0, 2, ahead=False, max_restarts=max_restarts)
+        super().__init__(config, self.parts, 0, num_workers=2, max_restarts=max_restarts)
 
     def _start(self, shard):
         self.shards.append(shard)
@@ -428,7 +428,7 @@ def test_a_shard_elsewhere_finds_the_users_classes_after_all_packages(tmp_path, 
 
 def test_a_worker_that_is_killed_is_replaced(workers):
     collection = workers[1]
-    collection._max_restarts = 1
+    collection.options = WorkerOptions(max_restarts=1)
     assert collection.next().shape == (8, 4)
     first, other = collection._workers
     collection._kill(first)

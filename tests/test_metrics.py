@@ -23,7 +23,7 @@ def without_login(monkeypatch, tmp_path):
 
 
 def wandb_logger(output_dir, mode):
-    return WandbLogger("hpamdp-tests", None, None, None, mode, output_dir=output_dir, config={"seed": 1})
+    return WandbLogger(output_dir, config={"seed": 1}, project="hpamdp-tests", mode=mode)
 
 
 def log_a_run(logger, output_dir):

@@ -19,6 +19,7 @@ from pydantic import Field, ValidationError
 from hpamdp.messages import first_line, warn
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 from hpamdp.run_files import TENSORBOARD_NAME, WANDB_NAME
+from hpamdp.settings import Settings
 
 
 class EarlierRun(NamedTuple):
@@ -230,34 +231,48 @@ class TensorboardLogger:
             RecordWriter(file).write(event.SerializeToString())
 
 
+class WandbOptions(Settings):
+    """Settings of `WandbLogger`; `project`, `entity`, `group` and `name` are those of `wandb.init`."""
+
+    project: Name | None = "hpamdp"
+    """Project of the run. If None, wandb chooses."""
+    entity: Name | None = None
+    """User or team of the run. If None, wandb chooses."""
+    group: Name | None = None
+    """Group of runs to show together."""
+    name: Name | None = None
+    """Name of the run. If None, wandb chooses."""
+    mode: Literal["auto", "offline", "online", "disabled"] = "auto"
+    """With `auto`, `WANDB_MODE` decides; if it is not set, online if an API key is configured, else offline."""
+
+
 class WandbLogger:
-    """Log to Weights & Biases without ever asking for anything or keeping a run from starting.
+    """Log to Weights & Biases. It asks for no input and never keeps a run from starting.
+
+    With the mode `online` it goes offline, with a warning, if there is no API key (`WANDB_API_KEY` or netrc) or no
+    answer. Offline runs lie in `wandb` in the run's folder, ready for `wandb sync`.
 
     Args:
-        project, entity, group, name: as in `wandb.init`; None leaves the choice to wandb.
-        mode: "auto" is what `WANDB_MODE` says, and without it online where an API key is configured (`WANDB_API_KEY`
-            or netrc), offline elsewhere. "online" goes offline with a warning where there is no key or no answer.
-        output_dir: the run's folder; offline runs lie in `wandb` in it, ready for `wandb sync`.
-        config: the run's settings, to be shown beside its numbers.
+        output_dir: the run's folder.
+        config: the run's settings, to show beside its numbers.
         earlier: the run that is continued, if any; its id is kept.
     """
 
+    Options = WandbOptions
     guarded_settings: ClassVar[tuple[str, ...]] = ("entity", "mode=online")
 
     def __init__(
         self,
-        project: Name | None,
-        entity: Name | None,
-        group: Name | None,
-        name: Name | None,
-        mode: Literal["auto", "offline", "online", "disabled"],
-        *,
         output_dir: Path,
         config: dict[str, Any] | None = None,
         earlier: EarlierRun | None = None,
+        options: WandbOptions | None = None,
+        **settings: Any,
     ) -> None:
         import wandb
 
+        self.options: WandbOptions = WandbOptions.of(options, settings)
+        project = self.options.project
         self._teardown = wandb.teardown
         run_id = None if earlier is None else _wandb_id(earlier.folder)
         output_dir.mkdir(parents=True, exist_ok=True)  # wandb goes to a temporary folder where this one is missing
@@ -284,9 +299,9 @@ class WandbLogger:
             wandb.setup(wandb_settings)
             return wandb.init(
                 project=project,
-                entity=entity,
-                group=group,
-                name=name,
+                entity=self.options.entity,
+                group=self.options.group,
+                name=self.options.name,
                 id=run_id,
                 resume="allow" if run_id is not None and chosen == "online" else None,
                 dir=str(output_dir),
@@ -296,7 +311,7 @@ class WandbLogger:
                 settings=wandb_settings,
             )
 
-        chosen = _wandb_mode(mode, server)
+        chosen = _wandb_mode(self.options.mode, server)
         try:
             self._run = start(chosen)
         except wandb.errors.Error as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from pydantic import PositiveInt
@@ -11,55 +12,70 @@ from tensordict import TensorDict
 from hpamdp.data.demonstrations import Demonstrations
 from hpamdp.data.human import played_file
 from hpamdp.data.human.episodes import select
-from hpamdp.data.human.released_file import HumanData, read
+from hpamdp.data.human.released_file import SHA256, HumanData, read
 from hpamdp.data.human.rest_to_rest import to_rest_to_rest
 from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.settings import Settings
+
+
+class PeoplesOptions(Settings):
+    """Settings of people's presses: which episodes, and in which form."""
+
+    successes: bool = False
+    """Take only episodes that ended in the dock."""
+    best_people: PositiveInt | None = None
+    """Take only episodes of this many people, those with the highest mean score. If None, of all."""
+    rest_to_rest: bool = True
+    """Convert presses that the next one interrupted to rest-to-rest presses, the only ones that the environment has."""
+
+
+class HumanOptions(PeoplesOptions):
+    """Settings of `HumanDemonstrations`."""
+
+    path: str | None = None
+    """The released file. If None, the path in $HPAMDP_HUMAN_DATA, else the file that was downloaded."""
+    checksum: str | None = SHA256
+    """The SHA-256 that the file must have, by default the released file's. If None, any."""
+    complete: bool = False
+    """Take only episodes whose log misses no press."""
+
+
+class PlayedOptions(PeoplesOptions):
+    """Settings of `PlayedDemonstrations`."""
+
+    path: str = "played.jsonl"
+    """The file of episodes. Lines that are no episode are left out, with a warning."""
+    practice: bool = False
+    """Take episodes of practice, too."""
 
 
 class HumanDemonstrations(Demonstrations):
-    """The presses of the selected episodes, as the given environment would have returned them.
+    """The recorded presses of the selected episodes, as the given environment would have returned them.
 
-    Where the environment has a fixed key map, each key is replaced by the one that pushes the boat in the same
-    direction under that key map. Where it has a fixed controller, only the episodes with this controller are taken.
+    If the environment has a fixed key map, each key is replaced by the one that pushes the boat in the same direction
+    under that key map. If it has a fixed controller, only the episodes with this controller are taken.
 
-    Selectors learn from the episodes as they were recorded, with their outcomes and the fuel that was left, whatever
-    the log of their presses misses and `rest_to_rest` leaves out.
+    Selectors learn from all episodes as they were recorded, with their outcomes and their remaining fuel. Neither
+    missing presses nor `rest_to_rest` changes that.
 
     Args:
         env: the boat-docking environment, which determines controller, key map, reward and observation.
-        path: the released file; None: `released_file.default_path`.
-        checksum: the SHA-256 that the file must have; None: any.
-        complete, successes, best_people: which episodes, as in `hpamdp.data.human.episodes.select`.
-        rest_to_rest: whether to convert the recorded presses to rest-to-rest presses; see
-            `hpamdp.data.human.rest_to_rest`.
 
     Raises:
         ValueError: `env` is not a boat-docking environment.
         DataError: the file is missing or not the right one, or no episode is left.
     """
 
-    def __init__(
-        self,
-        env: object,
-        *,
-        path: str | None,
-        checksum: str | None,
-        complete: bool,
-        successes: bool,
-        best_people: PositiveInt | None,
-        rest_to_rest: bool,
-    ) -> None:
+    Options = HumanOptions
+
+    def __init__(self, env: object, options: HumanOptions | None = None, **settings: Any) -> None:
+        self.options: HumanOptions = HumanOptions.of(options, settings)
         boats = _boats(env)
-        data = select(
-            read(None if path is None else Path(path), checksum=checksum, one_frame=True),
-            complete=complete,
-            successes=successes,
-            best_people=best_people,
-            controller=_controller_of(boats),
-        )
-        rows, recorded = _as_returned(data, boats, rest_to_rest=rest_to_rest)
+        path = None if self.options.path is None else Path(self.options.path)
+        data = read(path, checksum=self.options.checksum, one_frame=True)
+        rows, recorded = _as_returned(data, boats, self.options, complete=self.options.complete)
         super().__init__(rows, boats.device, decisions=recorded)
 
 
@@ -68,33 +84,19 @@ class PlayedDemonstrations(Demonstrations):
 
     Args:
         env: the boat-docking environment, which determines controller, key map, reward and observation.
-        path: the file of episodes.
-        practice: whether the episodes of practice count, too.
-        successes, best_people, rest_to_rest: as in `HumanDemonstrations`.
 
     Raises:
         ValueError: `env` is not a boat-docking environment.
         DataError: the file is missing or damaged, or no episode is left.
     """
 
-    def __init__(
-        self,
-        env: object,
-        *,
-        path: str,
-        practice: bool,
-        successes: bool,
-        best_people: PositiveInt | None,
-        rest_to_rest: bool,
-    ) -> None:
+    Options = PlayedOptions
+
+    def __init__(self, env: object, options: PlayedOptions | None = None, **settings: Any) -> None:
+        self.options: PlayedOptions = PlayedOptions.of(options, settings)
         boats = _boats(env)
-        data = select(
-            played_file.read(path, practice=practice),
-            successes=successes,
-            best_people=best_people,
-            controller=_controller_of(boats),
-        )
-        rows, recorded = _as_returned(data, boats, rest_to_rest=rest_to_rest)
+        data = played_file.read(self.options.path, practice=self.options.practice)
+        rows, recorded = _as_returned(data, boats, self.options)
         super().__init__(rows, boats.device, decisions=recorded)
 
 
@@ -112,11 +114,20 @@ def _controller_of(env: BoatDockEnv) -> str | None:
     return env.rules.controller if env.rules.controller in harbour.CONTROLLERS else None
 
 
-def _as_returned(data: HumanData, env: BoatDockEnv, *, rest_to_rest: bool) -> tuple[TensorDict, TensorDict | None]:
-    """Return the transitions and, where the agent chooses, the decisions, as the environment would have them."""
+def _as_returned(
+    data: HumanData, env: BoatDockEnv, options: PeoplesOptions, *, complete: bool = False
+) -> tuple[TensorDict, TensorDict | None]:
+    """Return the transitions and, if the agent chooses, the decisions, as the environment would have them."""
     rules = env.rules
+    data = select(
+        data,
+        complete=complete,
+        successes=options.successes,
+        best_people=options.best_people,
+        controller=_controller_of(env),
+    )
     recorded = decisions(data, reward=rules.reward, observation=rules.observation) if env.has_choice else None
-    if rest_to_rest:
+    if options.rest_to_rest:
         data = to_rest_to_rest(data)
     if isinstance(rules.keymap, int):
         data = with_keymap(data, rules.keymap)

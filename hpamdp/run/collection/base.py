@@ -90,9 +90,9 @@ class WorkerDiedError(CollectionError):
 class Collection:
     """Gives batches of the agent acting in the run's environments, until it is closed.
 
-    A subclass's `__init__` takes any of `config`, `parts` and `frames` (steps so far) and its options as keyword
-    arguments, which are the schema of its yaml. Every collection gives batches of the same keys and shape, with the
-    environments in the same order, from the current policy, or from that of the batch before if it collects ahead.
+    A subclass's `__init__` takes any of `config`, `parts` and `frames` (steps so far), which the program supplies, and
+    its settings as `options`. Every collection gives batches of the same keys and shape, with the environments in the
+    same order. It uses the current policy, or the policy of the batch before if it collects ahead.
     """
 
     package: ClassVar[str | None] = None  # an optional package that it needs; also the name of the extra

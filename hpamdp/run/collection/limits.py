@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import resource
 
+from hpamdp.limits import limit_in
+
 _SHARED_MEMORY = "/dev/shm"  # where Linux keeps it
-# Messages of Python and torch about these limits if they raise no OSError.
-_NO_FILES = ("Too many open files", "received 0 items of ancdata")
-_NO_PROCESSES = ("can't start new thread", "Resource temporarily unavailable")
-_NO_SPACE = ("No space left on device",)
 
 
 def limit_of(error: BaseException) -> str | None:
-    """Return in words which limit an error is about and how to raise it; None if it is about no limit."""
-    code = error.errno if isinstance(error, OSError) else None
-    text = str(error) if isinstance(error, OSError | RuntimeError) else ""
-
-    def contains(signs: tuple[str, ...]) -> bool:
-        return any(sign in text for sign in signs)
-
-    if code in (errno.EMFILE, errno.ENFILE) or contains(_NO_FILES):
+    """Return in words which limit an error is about and how to raise it; None if it is about no such limit."""
+    limit = limit_in(error)
+    if limit == "files":
         return f"too many open files (ulimit -n is {_soft(resource.RLIMIT_NOFILE)}; raise it, or use fewer workers)"
-    if code == errno.EAGAIN or contains(_NO_PROCESSES):
+    if limit == "processes":
         return f"too many processes (ulimit -u is {_soft(resource.RLIMIT_NPROC)}; raise it, or use fewer workers)"
-    if code in (errno.ENOSPC, errno.EDQUOT) or contains(_NO_SPACE):
-        return full_shared_memory()
-    return None
+    return full_shared_memory() if limit == "space" else None
 
 
 def full_shared_memory() -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import signal
 from multiprocessing import connection, resource_tracker
+from typing import Any
 
-from pydantic import NonNegativeInt, PositiveInt
 from torchrl.collectors import MultiSyncCollector
 
 from hpamdp.config import Config
@@ -14,7 +14,7 @@ from hpamdp.messages import warn
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.limits import full_shared_memory
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
-from hpamdp.run.collection.workers import WorkerCollection, children_without, modules_here_last
+from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, children_without, modules_here_last
 from hpamdp.run.stopping import STOP_SIGNALS
 
 _PATIENCE_S = 2.0  # from the moment a worker's pipe is closed until it has an exit code
@@ -24,22 +24,16 @@ class MultiCollection(WorkerCollection):
     """Steps the environments in processes of TorchRL's MultiSyncCollector, which write into shared memory."""
 
     def __init__(
-        self,
-        config: Config,
-        parts: Parts,
-        frames: int,
-        *,
-        num_workers: PositiveInt,
-        ahead: bool,
-        max_restarts: NonNegativeInt = 0,
+        self, config: Config, parts: Parts, frames: int, options: WorkerOptions | None = None, **settings: Any
     ) -> None:
-        num_cpus = len(os.sched_getaffinity(0))
-        if num_workers > num_cpus:
-            warn(f"collector.num_workers={num_workers}: more than the {num_cpus} CPUs, which the workers will share")
+        options = WorkerOptions.of(options, settings)
+        num, num_cpus = options.num_workers, len(os.sched_getaffinity(0))
+        if num > num_cpus:
+            warn(f"collector.num_workers={num}: more than the {num_cpus} CPUs, which the workers will share")
         # multiprocessing unblocks the signals when it starts this helper of its own.
         with modules_here_last():
             resource_tracker.ensure_running()
-        super().__init__(config, parts, frames, num_workers, ahead=ahead, max_restarts=max_restarts)
+        super().__init__(config, parts, frames, options)
 
     def _start(self, shard: EnvShard) -> MultiSyncCollector:
         # A terminal sends its Ctrl-C, and a cluster its stop, to every process of a run.

@@ -12,7 +12,6 @@ import warnings
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
-from pydantic import NonNegativeInt, PositiveInt
 from torchrl.collectors.distributed import RayCollector
 
 from hpamdp.config import Config
@@ -20,7 +19,7 @@ from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.collection.worker import EnvShard, RemoteShard, ShardCollector, WorkingDir
-from hpamdp.run.collection.workers import WorkerCollection, children_without
+from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, children_without
 from hpamdp.run.stopping import STOP_SIGNALS
 
 _CONNECT_S = 10.0  # until a cluster's address must have answered
@@ -28,28 +27,29 @@ _SLOW_START_S = 120.0
 _SLOW = f"an actor has not started after {_SLOW_START_S:.0f} s; the run waits for it, see `ray status` and Ray's logs"
 
 
+class RayOptions(WorkerOptions):
+    """Settings of `RayCollection`; the workers are Ray actors, each with a CPU."""
+
+    address: str | None = None
+    """A running cluster, as `ray.init` takes it. If None, Ray runs on this machine for the time of the run."""
+
+
 class RayCollection(WorkerCollection):
     """Steps the environments in the actors of TorchRL's RayCollector."""
 
+    Options = RayOptions
     package: ClassVar[str | None] = "ray"
     guarded_settings: ClassVar[tuple[str, ...]] = ("address",)
 
     def __init__(
-        self,
-        config: Config,
-        parts: Parts,
-        frames: int,
-        *,
-        num_workers: PositiveInt,
-        ahead: bool,
-        max_restarts: NonNegativeInt = 0,
-        address: str | None = None,
+        self, config: Config, parts: Parts, frames: int, options: RayOptions | None = None, **settings: Any
     ) -> None:
+        options = RayOptions.of(options, settings)
         # RayCollector warns that it has no weights to send; `collect` sends them.
         for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
             warnings.filterwarnings("ignore", message=warning)
-        _connect(address, num_workers)
-        super().__init__(config, parts, frames, num_workers, ahead=ahead, max_restarts=max_restarts)
+        _connect(options.address, options.num_workers)
+        super().__init__(config, parts, frames, options)
 
     def _start(self, shard: EnvShard) -> RayCollector:
         remote = RemoteShard(WorkingDir(os.getcwd()), shard)

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, NoReturn, TypeVar
 
 import numpy as np
 import torch
+from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
@@ -22,45 +23,53 @@ from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedEr
 from hpamdp.run.collection.limits import limit_of
 from hpamdp.run.collection.worker import EnvShard, RemoteError, packed
 from hpamdp.search_path import protect_children, unprotect_children
+from hpamdp.settings import Settings
 
 _PATIENCE_S = 2.0  # for workers in the middle of a batch that is no longer needed
 
 _Returned = TypeVar("_Returned")
 
 
-class WorkerCollection(Collection):
-    """Steps an equal shard of the environments in each of `num_workers` processes, on the CPU with one thread.
+class WorkerOptions(Settings):
+    """Settings of collections in several processes."""
 
-    Environment `i` has the same episodes as in a single process; only exploration uses other random numbers, one
-    stream for each worker. Before each batch, all workers get the policy's weights and buffers; they wait for one
+    num_workers: PositiveInt = 2
+    """Number of processes, each with an equal part of `num_envs` and a CPU thread."""
+    ahead: bool = False
+    """Collect the next batch, by the earlier policy, while the agent learns from the last one."""
+    max_restarts: NonNegativeInt = 0
+    """How many dead workers are replaced over the whole run. If another one dies, the run ends."""
+
+
+class WorkerCollection(Collection):
+    """Steps an equal part of the environments in each of `num_workers` processes, on the CPU with one thread.
+
+    Environment `i` has the same episodes as in a single process. Only exploration uses other random numbers, with one
+    stream for each worker. Before each batch, all workers get the policy's weights and buffers. They wait for one
     another and for the learner.
 
-    With `ahead`, workers begin the next batch as soon as one is handed out, by the policy from before anything was
-    learned from that one. What is collected does not depend on how long either takes. A batch that is on its way when
-    the run is saved is saved with it.
+    With `ahead`, workers begin the next batch as soon as they have handed one out. They use the policy from before the
+    agent learned from that batch, so the data does not depend on timing. A checkpoint includes the batch on its way.
 
     Each worker has a TorchRL collector and a thread that waits for it. If a worker dies, the others keep their episodes
     and their part of the batch. Its replacement begins new episodes, with new seeds, and collects the missing part.
 
     A subclass starts a worker in `_start`, ends it in `_kill`, and explains its death in `_death`.
-
-    Args:
-        config, parts, frames: as for any collection.
-        num_workers: number of processes.
-        ahead: whether workers collect while the agent learns.
-        max_restarts: how many dead workers are replaced over the whole run.
     """
 
+    Options: ClassVar[type[WorkerOptions]] = WorkerOptions
     has_workers: ClassVar[bool] = True
+    options: WorkerOptions
 
     def __init__(
-        self, config: Config, parts: Parts, frames: int, num_workers: int, *, ahead: bool, max_restarts: int
+        self, config: Config, parts: Parts, frames: int, options: WorkerOptions | None = None, **settings: Any
     ) -> None:
+        self.options = self.Options.of(options, settings)
+        num_workers = self.options.num_workers
         self.name = str(config.collector)
         self._config = config
         self._frames = frames
-        self._ahead = ahead
-        self._max_restarts = max_restarts
+        self._is_closing = False
         self._restarts = 0
         self._restarting = threading.Lock()
         self._notices: list[str] = []
@@ -109,7 +118,7 @@ class WorkerCollection(Collection):
         raise NotImplementedError
 
     def _shard(self, worker: int, restart: int = 0) -> EnvShard:
-        """Return the environments of a worker.
+        """Return a worker's part of the environments.
 
         Args:
             worker: the worker's number.
@@ -174,10 +183,10 @@ class WorkerCollection(Collection):
             WorkerDiedError: no more restarts are allowed.
         """
         with self._restarting:
-            if self._restarts >= self._max_restarts:
+            if self._is_closing or self._restarts >= self.options.max_restarts:
                 raise death
             self._restarts += 1
-            self._notices.append(f"{death}; it was replaced (restart {self._restarts} of {self._max_restarts})")
+            self._notices.append(f"{death}; it was replaced (restart {self._restarts} of {self.options.max_restarts})")
         self._end(number)
         self._batches[number] = None
         self._cpu_s_of_dead += self._cpu_s[number]
@@ -204,7 +213,7 @@ class WorkerCollection(Collection):
         policy = packed(self._policy)
         self._coming = self._coming or self._begin(policy)
         batch = self._finished()
-        self._coming = self._begin(policy) if self._ahead else []
+        self._coming = self._begin(policy) if self.options.ahead else []
         self._is_idle = True
         return batch.to(self._device)
 
@@ -278,7 +287,7 @@ class WorkerCollection(Collection):
     def close(self) -> None:
         """End the workers; wait a short time for the batch that is on its way."""
         _, running = wait(self._coming, _PATIENCE_S)
-        self._max_restarts = 0
+        self._is_closing = True
         for part, worker in zip(self._coming, self._workers, strict=False):
             if part in running and worker is not None:
                 self._kill(worker)
@@ -336,7 +345,7 @@ def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _sliced(values: Mapping[str, Any], first: int, size: int) -> dict[str, Any]:
-    """Return rows of nested columns, on the CPU."""
+    """Return `size` rows of nested columns from the row `first` on, on the CPU."""
     return {
         name: _sliced(value, first, size) if isinstance(value, Mapping) else value[first : first + size].cpu()
         for name, value in values.items()
