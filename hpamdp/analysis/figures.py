@@ -1,4 +1,4 @@
-"""Figures of a finished or stopped run, drawn from the files in its folder and nothing else."""
+"""Figures of a finished or stopped run, drawn from the files in its folder alone."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from hpamdp.run_files import FIGURES_NAME, MAX_TEXT_BYTES
 
 
 def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
-    """Draw what the files in a run's folder allow and return the figures' paths.
+    """Draw all figures that the files in a run's folder allow, and return their paths.
 
-    `metrics.csv` gives `learning_curves.png`, with the references of `summary.json`; `evaluation.npz` gives what the
-    environment draws of it. A missing or broken file leaves its figures out.
+    `learning_curves.png` shows `metrics.csv` with the references of `summary.json`. The environment draws its figures
+    from `evaluation.npz`. If a file is missing or broken, its figures are left out.
 
     Args:
         output_dir: the run's folder; the figures go there.
-        env: the environment's class, which has the curves to show and draws its own figures.
+        env: the environment's class, which names the curves and draws its own figures.
     """
     summary = _read_summary(output_dir / "summary.json")
     rows = read_rows(output_dir / "metrics.csv")

@@ -1,6 +1,6 @@
-"""Films of episodes as files: GIF by Pillow, which draws the pictures anyway, MP4 by imageio, which brings its encoder.
+"""Films of episodes as files: GIF by Pillow, which also draws the pictures; MP4 by imageio, which brings an encoder.
 
-Matplotlib's writers would do, too, but draw through a figure, ten times slower, and want an ffmpeg of the system.
+Matplotlib's writers are ten times slower, since they draw through a figure, and need an installed ffmpeg.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ Track = Sequence[Mapping[str, Tensor]]
 
 
 class FilmError(ValueError):
-    """A film that cannot be written; told in one line."""
+    """A film that cannot be written; the message is one line."""
 
 
 def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> list[np.ndarray]:
-    """Return the pictures of several episodes side by side, uint8 `[height, width, 3]`; none where nothing can be seen.
+    """Return the pictures of several episodes side by side, uint8 `[height, width, 3]`; none if the problem draws none.
 
     Args:
         env: the problem, which draws.
-        tracks: of each episode the `env_state` at the start and after every step, columns `[1, ...]`.
+        tracks: the `env_state` of each episode at the start and after every step, columns `[1, ...]`.
         fps: pictures a second.
         size: px from edge to edge of one episode.
     """
@@ -59,7 +59,7 @@ def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = No
 
     Args:
         states: the columns `[N, ...]` at the start and after every step.
-        num_steps: of each track at most; None: all.
+        num_steps: the most steps of a track. If None, all.
     """
     if not states or not states[0]:
         return []

@@ -80,10 +80,10 @@ def _run_folders(folder: Path, seen: set[str]) -> Iterator[Path]:
 
 
 def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
-    """Write each table as a csv of its name, the first row's columns at the top; none of them, if one has no rows.
+    """Write each table as a csv file of its name, unless one of them has no rows.
 
     Raises:
-        SystemExit: with a line that names those without rows.
+        SystemExit: a table has no rows; nothing is written.
     """
     empty = [name for name, rows in tables.items() if not rows]
     if empty:
@@ -133,7 +133,7 @@ def spread(values: Sequence[float], digits: int = 3) -> str:
 def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
     """Return the mean of the middle half, and its 95 % bootstrap interval over seeds.
 
-    Of fewer than `MIN_SEEDS` it is the plain mean or nearly so, and says nothing more; `middle_half` leaves it out.
+    With fewer than `MIN_SEEDS` values it is close to the plain mean, so `middle_half` leaves it out.
 
     Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
     """
@@ -157,10 +157,10 @@ class Difference:
     """How much one method is above another, with the seeds as the unit.
 
     Attributes:
-        mean: difference of the means, of the interquartile means from `MIN_SEEDS` seeds of both on.
-        low, high: its 95 % bootstrap interval; NaN with a single seed of either. With three seeds of both it reaches
-            about from the least to the greatest difference of two of them, and contains the truth in 90 % of cases.
-        improvement: the probability that a seed of the one is above a seed of the other, ties counted half.
+        mean: difference of the means; from `MIN_SEEDS` seeds of both on, of the interquartile means.
+        low, high: its 95 % bootstrap interval; NaN if either has a single seed. With three seeds of each, the interval
+            spans about the differences of single seeds, and contains the true difference in 90 % of cases.
+        improvement: the probability that a seed of the first is above a seed of the second. Ties count half.
     """
 
     mean: float
@@ -174,7 +174,7 @@ class Difference:
         return self.low > 0.0 or self.high < 0.0
 
     def __str__(self) -> str:
-        """Return the difference and its interval, `unclear` where that does not exclude 0."""
+        """Return the difference and its interval, and `unclear` if the interval contains 0."""
         if np.isnan(self.low):
             return f"{self.mean:+.3f}"
         interval = f"{self.mean:+.3f} ({self.low:+.3f} to {self.high:+.3f})"
@@ -203,8 +203,8 @@ def difference(values: Sequence[float], others: Sequence[float]) -> Difference:
 def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., np.ndarray]) -> tuple[float, float]:
     """Return the 95 % expanded percentile bootstrap interval of a statistic of independent samples.
 
-    The plain percentile interval of a few seeds is too narrow: of the difference of three and three it contains the
-    truth in 78 % of cases. Expanded, it is as wide as Student's t asks for, as far as the samples go.
+    The plain percentile interval of a few seeds is too narrow: for three seeds against three it contains the true
+    difference in 78 % of cases. The expanded interval is as wide as Student's t interval, as far as the samples reach.
 
     Source: Hesterberg 2015, *What teachers should know about the bootstrap*, arXiv 1411.5279.
     """
@@ -218,9 +218,9 @@ def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., np.ndarr
 
 
 def curve(runs: Rows, x: str, y: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `x` and the mean and standard deviation over seeds of `y`, as far as all the seeds go.
+    """Return `x` and the mean and standard deviation of `y` over seeds, up to the shortest run.
 
-    The deviation is that of a sample, as `spread` has it; 0 with one seed.
+    The deviation is that of a sample, as in `spread`; with one seed it is 0.
     """
     seeds = [np.array([(row[x], row[y]) for row in rows], dtype=float) for rows in groups(runs, "seed").values()]
     num = min(map(len, seeds))

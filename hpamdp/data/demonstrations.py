@@ -1,4 +1,4 @@
-"""The contract of a data set to learn from, and what its transitions need beside those that were recorded."""
+"""The contract of a data set to learn from, and the option sums that its transitions need."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Demonstrations:
     """Transitions to learn from, as if they had been collected from the environment at hand.
 
     For a recording of your own, write a subclass and choose it in `conf/data`. Its constructor takes the environment
-    as `env`, beside the options of its yaml, and passes its transitions to this one. Options last a whole episode.
-    The constructor checks the values. A run then compares them with its environment by `check`.
+    as `env`, beside the settings of its yaml, and passes its transitions to this constructor, which checks the values.
+    A run then compares them with its environment by `check`. Options last a whole episode.
 
     Args:
         transitions: `[M]`, one episode after another, with ascending episode numbers under `TRAJECTORY`. At the root
@@ -32,9 +32,9 @@ class Demonstrations:
             the environment's. The last row of each episode is `done`, and no other row. Parameters of discrete actions
             that a row does not take may be 0. `action_mask` and `option_mask` are optional.
         device: where the tensors are kept.
-        decisions: `[K]`, for selectors, where more is known of what the options earned than the transitions show: at
-            the root `option`, under `next` `decision_observation`, `option_return`, `option_steps`, `observation`,
-            `done` and `is_decision`, which is true. None: the decisions in the transitions.
+        decisions: `[K]`, for selectors, if more is known of the options' returns than the transitions show. At the root
+            `option`; under `next` `decision_observation`, `option_return`, `option_steps`, `observation`, `done` and
+            `is_decision`, which is true. If None, selectors learn from the decisions in the transitions.
 
     Attributes:
         batch: the transitions `[1, M]`, with the sums that `with_option_sums` adds.

@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, Selector, is_greedy
+from hpamdp.policies.base import Learner, Level, Selector, is_greedy
 from hpamdp.policies.masks import allowed_or_first
 from hpamdp.specs import PAMDPSpecs
 
@@ -32,8 +32,8 @@ def with_option(rows: TensorDictBase, num_options: int) -> TensorDictBase:
 class OptionRouter(TensorDictModuleBase):
     """The low level's policy: in each environment, the policy of the held option's learner acts.
 
-    Keys that a learner's policy both reads and writes, its state, stay in the tensordict from step to step. A policy
-    finds none of them where nothing has been written yet.
+    Keys that a learner's policy both reads and writes are its state. They stay in the tensordict from step to step, and
+    are missing before the first step.
 
     Args:
         learners: one for each option, or a single one.
@@ -41,7 +41,7 @@ class OptionRouter(TensorDictModuleBase):
         is_shared: whether the single learner observes the option.
 
     Attributes:
-        state_keys: the policies' state.
+        state_keys: the keys of the policies' state.
     """
 
     def __init__(self, learners: Sequence[Learner], specs: PAMDPSpecs, is_shared: bool) -> None:
@@ -86,7 +86,7 @@ class OptionRouter(TensorDictModuleBase):
         return td
 
     def _fill(self, td: TensorDictBase, policy: nn.Module, missing: Sequence[NestedKey]) -> None:
-        """Write zeros under the keys of a policy that acts in none of the environments, so that all steps have them."""
+        """Write zeros under the keys of a policy that acts in no environment, so that all steps have the same keys."""
         with torch.random.fork_rng():
             acted = policy(self._seen(td).reshape(-1)[:1])
         for key in missing:
@@ -94,14 +94,14 @@ class OptionRouter(TensorDictModuleBase):
             td.set(key, value.new_zeros(*td.batch_size, *value.shape[1:]))
 
     def _seen(self, td: TensorDictBase) -> TensorDictBase:
-        """Return what the policies read, as far as it is there."""
+        """Return the entries that the policies read, without missing ones."""
         return td.select(*self.in_keys, strict=False)
 
 
 class OptionValues(nn.Module):
-    """What the learners expect of each option.
+    """The learners' values of each option.
 
-    A module, so that the learners' weights reach the selector's copies in other processes.
+    It is a module, so that the learners' weights reach the selector's copies in other processes.
 
     Args:
         learners: one for each option, or a single one that observes the option.
@@ -121,7 +121,7 @@ class OptionValues(nn.Module):
 
         Args:
             observation: of the states.
-            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
         """
         masks = () if action_mask is None else (action_mask,)
         if len(self.learners) == self.num_options:
@@ -140,14 +140,14 @@ class OptionValues(nn.Module):
 
 
 def _exploring_value(learner: Learner, observation: Tensor, *masks: Tensor) -> Tensor:
-    """Return a learner's values `[N]` of observations `[N, *]`; infinite while exploring before its first update."""
+    """Return a learner's values `[N]` of observations `[N, *]`; infinite if exploring before its first update."""
     if learner.is_untrained() and not is_greedy():
         return torch.full_like(observation[:, 0], torch.inf)
     return learner.value(observation, *masks)
 
 
 class HeldOption(TensorDictModuleBase):
-    """The same option in every environment at every step; the first allowed one where it is forbidden."""
+    """The same option in every environment at every step, or the first allowed option if it is forbidden."""
 
     def __init__(self, option: int) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ class HeldOption(TensorDictModuleBase):
 
 
 class AgentNextOptions:
-    """What follows an option that ends inside its episode: a `NextOptions` for the learners of an agent.
+    """The `NextOptions` of an agent: its selector chooses them, and its learners give their values.
 
     Args:
         selector: chooses the options.
@@ -180,12 +180,12 @@ class AgentNextOptions:
 
     @torch.no_grad()
     def value(self, observation: Tensor, option: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen.
+        """Return the values `[N]` of states under the options chosen there.
 
         Args:
-            observation: of the states.
-            option: chosen there, `[N]`.
-            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+            observation: of the states, `[N, observation_dim]`.
+            option: the options chosen there, `[N]`.
+            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
         """
         masks = () if action_mask is None else (action_mask,)
         if self.is_shared:
@@ -213,11 +213,11 @@ class AgentNextOptions:
 
     @torch.no_grad()
     def greedy(self, td: TensorDictBase, held: Tensor) -> Tensor:
-        """Return the selector's greedy options `[N]`; where it decides so, the held ones `[N]` go on.
+        """Return the selector's greedy options `[N]`; a held option goes on if the selector decides so.
 
         Args:
-            td: what it reads of the states `[N]` but for `is_decision`.
-            held: the options before.
+            td: the entries that the selector reads of the states `[N]`, without `is_decision`.
+            held: the options before, `[N]`.
         """
         is_decision = torch.ones(len(td), 1, dtype=torch.bool, device=td.get(keys.OBSERVATION).device)
         td = td.copy().set(keys.IS_DECISION, is_decision).set(keys.OPTION, held)
@@ -226,10 +226,11 @@ class AgentNextOptions:
             return torch.where(self.selector.ends(td), option, held) if self.decides_ends else option
 
     def with_ends(self, batch: TensorDictBase) -> TensorDictBase:
-        """Return a shallow copy of a batch `[*B, T]` with the ends that the selector decided on, a step later each.
+        """Return a shallow copy of a batch `[*B, T]` in which the selector's decisions mark the ends of options.
 
-        Whether an option ends with the batch will be known with the next one. For learners it does (`option_ended`),
-        and may be followed by itself; for the selector it does not (`is_decision`).
+        The selector decides on an end one step later. So the next batch will show whether an option ends with the last
+        step. Until then learners take it as ended (`option_ended`), possibly followed by itself. The selector does not
+        (`is_decision`).
         """
         done = batch.get(("next", keys.DONE))
         is_ended = batch.get(keys.IS_DECISION).roll(-1, -2) & ~done
@@ -243,16 +244,17 @@ class AgentNextOptions:
     def with_next_option(self, batch: TensorDictBase) -> TensorDictBase:
         """Return a shallow copy of a batch `[*B, T]` in which `("next", "option")` holds in the next state, `[*B, T]`.
 
-        Where an option ends, it is the one of the next step; where that is not in the batch, the selector's greedy one.
+        If an option ends, that is the option of the next step. If the next step is not in the batch, it is the
+        selector's greedy option.
         """
         option = batch.get(keys.OPTION)
         is_ended = batch.get(("next", keys.OPTION_ENDED)).squeeze(-1)
         is_missing = is_ended & batch.get(("next", keys.DONE)).squeeze(-1)
         is_missing[..., -1] = is_ended[..., -1]
-        following = torch.where(is_ended, option.roll(-1, -1), option)
+        next_option = torch.where(is_ended, option.roll(-1, -1), option)
         if is_missing.any():
-            following[is_missing] = self.greedy(batch.get("next")[is_missing], option[is_missing])
-        return batch.copy().set(keys.NEXT_OPTION, following)
+            next_option[is_missing] = self.greedy(batch.get("next")[is_missing], option[is_missing])
+        return batch.copy().set(keys.NEXT_OPTION, next_option)
 
     def _without_option(self, observation: Tensor) -> Tensor:
         return observation[..., : -self.num_options] if self.is_shared else observation
@@ -265,11 +267,11 @@ class HierarchicalAgent(nn.Module):
         selector: the high level; None if the environment leaves no choice.
         learners: one for each option, or a single one.
         specs: of the problem as the environment states it.
-        is_shared: whether the single learner observes the option; the specs it was built with then count the one-hot
-            option as part of the observation.
+        is_shared: whether the single learner observes the option. Its own specs then count the one-hot option as part
+            of the observation.
         is_frozen: whether the learners stay as they are.
-        uniform_option_frames: number of steps (of decisions, if the learners are frozen) at the beginning for which the
-            selector's exploring choices are uniform. The selector learns from them.
+        uniform_option_frames: number of steps at the beginning with uniform exploring choices; of decisions, if the
+            learners are frozen. The selector learns from them.
         selector_ends_options: whether the selector decides where options end.
 
     Attributes:
@@ -329,7 +331,7 @@ class HierarchicalAgent(nn.Module):
             scalars.update({f"high/{name}": value for name, value in learned.items()})
         if self.is_frozen:
             return scalars
-        for prefix, learner, rows, mask in self._shares(batch):
+        for prefix, learner, rows, mask in self._batches_of_learners(batch):
             learned = learner.learn(rows, mask)
             scalars.update({f"{prefix}/{name}": value for name, value in learned.items()})
         return scalars
@@ -339,11 +341,11 @@ class HierarchicalAgent(nn.Module):
 
         Args:
             batch: the transitions.
-            decisions: `[*B, K]` for the selector; None: those in the batch.
+            decisions: `[*B, K]` for the selector. If None, the decisions in the batch.
         """
         if self.selector is not None and "offline" in self.selector.modes:
             self.selector.add_demonstrations(_finished_decisions(batch if decisions is None else decisions))
-        for _, learner, rows, mask in self._shares(batch):
+        for _, learner, rows, mask in self._batches_of_learners(batch):
             learner.add_demonstrations(rows, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
@@ -359,21 +361,21 @@ class HierarchicalAgent(nn.Module):
 
     def without_update(self) -> list[str]:
         """Return the names, as in logs, of the selector and the learners that have made no update yet."""
-        levels: list[tuple[str, Learner | Selector]] = [] if self.selector is None else [("high", self.selector)]
+        levels: list[tuple[str, Level]] = [] if self.selector is None else [("high", self.selector)]
         if not self.is_frozen:
             levels += [(self._prefix_of(i), learner) for i, learner in enumerate(self._learners())]
         return [name for name, level in levels if not level.has_updated()]
 
     def stateful(self) -> dict[str, Any]:
         """Return what a checkpoint must hold besides parameters and buffers, by level and name."""
-        levels: dict[str, Learner | Selector] = {f"learner{i}": each for i, each in enumerate(self._learners())}
+        levels: dict[str, Level] = {f"learner{i}": each for i, each in enumerate(self._learners())}
         if self.selector is not None:
             levels["selector"] = self.selector
         return {f"{level}_{name}": part for level, module in levels.items() for name, part in module.stateful().items()}
 
     @torch.no_grad()
     def replay_rows(self, name: str, steps: TensorDictBase) -> TensorDictBase | None:
-        """Return the rows `[N]` that a replay buffer would store of some steps; None if its owner does not say.
+        """Return the rows `[N]` that a replay buffer would store of some steps; None if its owner declares none.
 
         Args:
             name: the buffer's name in `stateful`.
@@ -385,7 +387,7 @@ class HierarchicalAgent(nn.Module):
         owner, _, part = name.partition("_")
         if owner == "selector":
             return self._level(owner).replay_rows(batch).get(part)
-        for i, (_, learner, seen, _) in enumerate(self._shares(batch)):
+        for i, (_, learner, seen, _) in enumerate(self._batches_of_learners(batch)):
             if owner == f"learner{i}":
                 return learner.replay_rows(seen).get(part)
         return None
@@ -403,16 +405,16 @@ class HierarchicalAgent(nn.Module):
         """
         self._level(name.partition("_")[0]).check_rows(rows, example)
 
-    def _level(self, owner: str) -> Learner | Selector:
+    def _level(self, owner: str) -> Level:
         level = self.selector if owner == "selector" else self.learners[int(owner.removeprefix("learner"))]
-        assert isinstance(level, Learner | Selector)
+        assert isinstance(level, Level)
         return level
 
     def exported(self) -> dict[str, Any] | None:
-        """Return as JSON values what a program without torch needs to act greedily; None if a part of it cannot say.
+        """Return as JSON values what a program without torch needs to act greedily; None if a part cannot be exported.
 
-        `selector` is None where there is nothing to choose; `learners` has one entry for each option, or a single one,
-        which with `is_shared` observes the one-hot option at the end of the observation.
+        `selector` is None if there is nothing to choose. `learners` has one entry for each option, or a single one.
+        With `is_shared` that one observes the one-hot option at the end of the observation.
         """
         learners = [learner.exported() for learner in self._learners()]
         selector = None if self.selector is None else self.selector.exported()
@@ -425,8 +427,8 @@ class HierarchicalAgent(nn.Module):
             assert isinstance(learner, Learner)
             yield learner
 
-    def _shares(self, batch: TensorDictBase) -> Iterator[tuple[str, Learner, TensorDictBase, Tensor]]:
-        """Yield for each learner its prefix in logs, itself, the batch as it sees it, the mask of its transitions."""
+    def _batches_of_learners(self, batch: TensorDictBase) -> Iterator[tuple[str, Learner, TensorDictBase, Tensor]]:
+        """Yield each learner with its prefix in logs, the batch in its own form, and the mask of its transitions."""
         everything = torch.ones(batch.shape, dtype=torch.bool, device=batch.get(keys.OBSERVATION).device)
         if self.next_options is not None and ("next", keys.OPTION_ENDED) in batch.keys(include_nested=True):
             batch = self.next_options.with_next_option(batch)

@@ -37,47 +37,118 @@ def option_ends(batch: TensorDictBase) -> Tensor:
 
 
 class NextOptions(Protocol):
-    """What follows an option that ends inside its episode, as the agent tells it to its learners.
+    """Which options follow the one that ended, and what they are worth; the agent gives it to its learners.
 
-    The value of a state in which an option has ended is the value under the option that follows, by that option's own
-    learner. Learners reach one another through this alone. Observations are as the learner that asks sees them.
+    If an option has ended in a state, the value of that state is its value under the next option, by that option's
+    own learner. Learners reach one another in this way only. Observations are in the form that the asking learner sees.
     """
 
     def value(self, observation: Tensor, option: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the values `[N]` of states `[N, observation_dim]` in which the options `[N]` are chosen.
+        """Return the values `[N]` of states under the options chosen there.
 
         Args:
-            observation: of the states.
-            option: chosen there, `[N]`.
-            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+            observation: of the states, `[N, observation_dim]`.
+            option: the options chosen there, `[N]`.
+            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
         """
         ...
 
     @property
     def decides_ends(self) -> bool:
-        """Whether the selector decides where options end; otherwise they end where they did at the time."""
+        """Whether the selector decides where options end. If not, stored ends stay valid."""
         ...
 
     def choose(self, observation: Tensor, option: Tensor, held: Tensor) -> Tensor:
-        """Return the options `[N]` that the selector would now choose greedily in states `[N, observation_dim]`.
+        """Return the options `[N]` that the selector would choose greedily now.
 
-        Where it decides that the held option goes on, that is the held one.
+        If the selector decides that the held option goes on, the held option is returned. If the selector needs more
+        than the observation, the options chosen at the time are returned.
 
         Args:
-            observation: of the states in which an option has ended or may end.
-            option: chosen at the time, `[N]`. The result, if the selector would need more than the observation.
+            observation: of the states in which an option has ended or may end, `[N, observation_dim]`.
+            option: the options chosen at the time, `[N]`.
             held: the options before, `[N]`.
         """
         ...
 
 
-class Selector(TensorDictModuleBase):
+class Level:
+    """What a checkpoint and an export need from a selector or a learner; a base of both.
+
+    Attributes:
+        specs: sizes and bounds of the problem.
+        needs: names of constructor arguments of the environment which the run sets to true. With `oracle`, the
+            environment also writes its planner's best action for each option (the `ORACLE_` keys of `hpamdp.keys`).
+            With `human`, it writes the probabilities of human choices (`HUMAN_OPTION`). Environments without such an
+            argument are refused. Append the keys to `in_keys`.
+        guarded_settings: settings that can run code, read files or reach servers.
+        may_be_nan: the columns of the replay buffer that may hold NaN.
+    """
+
+    needs: ClassVar[tuple[str, ...]] = ()
+    guarded_settings: ClassVar[tuple[str, ...]] = ()
+    may_be_nan: ClassVar[frozenset[str]] = frozenset()
+    specs: PAMDPSpecs
+
+    def stateful(self) -> dict[str, Any]:
+        """Return what a checkpoint must hold besides parameters and buffers, by name.
+
+        Each value is an optimizer, a TorchRL `ReplayBuffer`, or has a `state_dict` of constant names and shapes. If one
+        is a replay buffer, override `replay_rows`, too.
+        """
+        return {}
+
+    def has_updated(self) -> bool:
+        """Return whether an update was made, or there is nothing to learn. The run reports levels without an update.
+
+        By default the optimizers in `stateful` decide. Override it for learning without an optimizer.
+        """
+        return have_stepped(self.stateful())
+
+    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
+        """Return the rows `[N]` that each replay buffer of `stateful` would store of a collected batch `[*B, T]`.
+
+        The rows of a checkpoint must have the same names, shapes and dtypes. If a buffer has no entry here, its saved
+        rows are not compared.
+        """
+        return {}
+
+    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
+        """Refuse invalid saved rows `[N]` of a replay buffer.
+
+        Args:
+            rows: the rows to put into the buffer.
+            example: the rows that `replay_rows` returned.
+
+        Raises:
+            ValueError: a row is invalid.
+        """
+        check_stored_rows(rows, self.specs, self.may_be_nan)
+
+    def check_state(self, state: Mapping[str, Any]) -> None:
+        """Refuse a state dict with the right names and shapes but invalid values.
+
+        Called before `load_state_dict`. Override it if finite numbers are not enough.
+
+        Raises:
+            ValueError: a value is invalid.
+        """
+
+    def exported(self) -> dict[str, Any] | None:
+        """Return as JSON values what a program without torch needs to act greedily; None if it cannot be exported.
+
+        `kind` names the form, which `hpamdp.policies.shared.exported_policy` explains.
+        """
+        return None
+
+
+class Selector(Level, TensorDictModuleBase):
     """The high level: chooses an option at every decision and holds it until the next one.
 
-    A decision is due where an episode begins or the previous option has ended. `forward` does the holding: a subclass
-    writes `select` and, if it learns, `learn`::
+    A decision is due if an episode begins or the previous option has ended. `forward` holds the options between
+    decisions. A subclass writes `select` and, if it learns, `learn`::
 
-        class GreedyMean(Selector):  # the option with the highest mean reward, at times a random one
+        class GreedyMean(Selector):  # epsilon-greedy by the mean rewards of the options
             def __init__(self, specs: PAMDPSpecs, *, epsilon: Fraction) -> None:
                 super().__init__(specs)
                 self.epsilon = epsilon
@@ -98,49 +169,41 @@ class Selector(TensorDictModuleBase):
                 self.counts.index_add_(0, option, torch.ones_like(reward))
                 return {"reward": reward.mean().item()}
 
-    Constructor: `specs` holds the sizes of the problem; `device`, if it is an argument, says where tensors live. All
-    other arguments are keyword-only; their names and type annotations are the schema of the selector's yaml in
-    `conf/high`. A selector never sees the environment, the config or the agent.
+    Constructor: `specs` holds the sizes of the problem. The argument `device`, if it exists, says where tensors live.
+    Settings are fields of a model `Options`, see `hpamdp.settings`, or keyword-only arguments as above. Their names and
+    types are the schema of the selector's yaml in `conf/high`. A selector never sees the environment, the config or the
+    agent.
 
-    Tensordict: `forward` gets the current step of `[*B]` environments and reads `in_keys`: `observation`
-    `[*B, observation_dim]` and `is_decision` bool `[*B, 1]`; where the environment says which options may be chosen,
-    also `option_mask` bool `[*B, num_options]`: forbidden ones must neither be chosen nor count in a target. It writes
-    `out_keys`: `option` int64 `[*B]`. If `learn` needs to know more about a choice, such as its log-probability, append
-    a key to `out_keys` and return it from `choose` and `choose_uniformly`, first dimensions `[*B]`. It is held with the
-    option and is there again in `learn`.
+    Tensordict: `forward` gets the current step of `[*B]` environments. It reads `in_keys`: `observation`
+    `[*B, observation_dim]`, `is_decision` bool `[*B, 1]` and, if the problem forbids options, `option_mask` bool
+    `[*B, num_options]`. Forbidden options must neither be chosen nor count in a target. `forward` writes `out_keys`:
+    `option` int64 `[*B]`. If `learn` needs to know more about a choice, such as its log-probability, append a key to
+    `out_keys` and return it from `choose` and `choose_uniformly`, first dimensions `[*B]`. The key is held with the
+    option and is in the batch that `learn` gets.
 
-    State: the same module acts in training and evaluation, with different numbers of environments, so whatever belongs
-    to an episode travels in the tensordict. What the selector has learned belongs in parameters and buffers: they are
-    saved in checkpoints and sent to collector processes. Everything else that training needs, such as optimizers and
-    replay buffers, is returned by `stateful`.
+    State: the same module acts in training and evaluation, with different numbers of environments. So the state of an
+    episode belongs in the tensordict. What the selector has learned belongs in parameters and buffers, which are saved
+    in checkpoints and sent to collector processes. `stateful` returns everything else that training needs, such as
+    optimizers and replay buffers.
 
     Attributes:
-        specs: sizes of the problem.
-        needs: names of constructor arguments of the environment which the run sets to true, so that the environment
-            writes more than its observation: with `oracle` its planner's best action for each option (the `ORACLE_`
-            keys of `hpamdp.keys`), with `human` the probabilities of the human choices (`HUMAN_OPTION`). Append the
-            keys that `select` reads to `in_keys`. Environments without such an argument are refused.
-        asks_learners: whether the selector wants `option_values`.
-        option_values: maps observations `[N, observation_dim]` and the states' action masks, or None, to what the
-            learners themselves expect of each option, `[N, num_options]`; the agent sets it, if `asks_learners`.
-        gamma: discount of an environment step, whatever the length of the options: `option_return` is discounted by
-            it, and so is the value of the next decision, see `next_discount`.
+        asks_learners: whether the selector needs `option_values`.
+        option_values: maps observations `[N, observation_dim]` and the states' action masks, or None, to the learners'
+            values of each option, `[N, num_options]`. The agent sets it if `asks_learners`.
+        gamma: discount of an environment step, whatever the length of the options. It discounts `option_return` and
+            the value of the next decision, see `next_discount`.
         ends_options: whether the selector can decide where options end, by `ends`.
-        decides_ends: whether it does so in this run (`agent.termination=learned`); the agent sets it.
-        is_bandit: whether the selector takes what an option paid for all that its choice was worth. It then is for
-            options that last as long as their episodes, after which nothing follows; others are refused.
-        modes: what the selector can learn from. `train`: its own choices. `offline`: a data set of choices that others
-            made. A selector with keys of its own in `out_keys` usually has `train` alone, as a data set lacks them.
-        is_uniform: bool scalar, a buffer that the agent sets. While it is true, for the first
-            `agent.uniform_option_frames` steps of a run, exploring choices come from `choose_uniformly`, so that every
-            option's learner gets transitions to learn from.
-        pending: how many decisions for each option have been made whose end `learn` has not yet seen, int64
-            `[num_options]`, a buffer that the agent sets after every batch. A selector that needs the number within a
-            batch adds the choices that it makes.
+        decides_ends: whether it does so in this run (`agent.termination=learned`). The agent sets it.
+        is_bandit: True if the selector uses an option's return as its full value, that is, does not bootstrap. Its
+            options must last as long as their episodes; others are refused.
+        modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
+            A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
+        is_uniform: bool scalar, a buffer that the agent sets. It is true for the first `agent.uniform_option_frames`
+            steps of a run. Exploring choices then come from `choose_uniformly`, so that every learner gets data.
+        pending: how many decisions for each option have not yet reached `learn`, int64 `[num_options]`. The agent sets
+            this buffer after every batch. A selector that needs the number within a batch adds its own choices.
     """
 
-    needs: ClassVar[tuple[str, ...]] = ()
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
     asks_learners: ClassVar[bool] = False
     is_bandit: ClassVar[bool] = False
     ends_options: ClassVar[bool] = False
@@ -167,7 +230,7 @@ class Selector(TensorDictModuleBase):
     def select(self, td: TensorDictBase) -> Tensor:
         """Return an option for every environment, int64 `[*B]`.
 
-        Choose greedily if `is_greedy()`, else explore. Where no decision is due, the choice is ignored.
+        Choose greedily if `is_greedy()`, else explore. If no decision is due, the choice is ignored.
         """
         raise NotImplementedError
 
@@ -184,16 +247,16 @@ class Selector(TensorDictModuleBase):
         return {keys.OPTION: random_choice(td.batch_size, self.specs.num_options, mask, self.is_uniform.device)}
 
     def ends(self, td: TensorDictBase) -> Tensor:
-        """Return where the held `option` `[*B]` of `td` ends, given `observation`, bool `[*B]`; greedily or exploring.
+        """Return whether the held `option` of `td` ends in each environment, bool `[*B]`.
 
-        Asked at every step but those that begin an episode, if `decides_ends`. Override it if `ends_options`.
+        Called at every step but the first of an episode, if `decides_ends`. Override it if `ends_options`.
         """
         raise NotImplementedError(f"{type(self).__name__} does not decide where options end")
 
     def learn_from_steps(self, batch: TensorDictBase) -> dict[str, float]:
-        """Learn from every step of a collected batch `[*B, T]`, as `Learner.learn` gets it; return scalars to log.
+        """Learn from every step of a collected batch `[*B, T]`, in the form of `Learner.learn`; return scalars to log.
 
-        For selectors that learn within options; called after `learn`.
+        Called after `learn`. Override it if the selector learns within options.
         """
         return {}
 
@@ -208,19 +271,18 @@ class Selector(TensorDictModuleBase):
         - `("next", "decision_observation")` `[N, observation_dim]`: the observation at the decision;
         - `("next", "option_return")` `[N, 1]`: the sum of the option's rewards, discounted by `gamma`;
         - `("next", "option_steps")` int64 `[N, 1]`: how many steps the option took;
-        - `("next", "observation")` `[N, observation_dim]` and `("next", "done")` bool `[N, 1]`: where it ended, and
-          whether its episode ended there, too;
+        - `("next", "observation")` `[N, observation_dim]`: the state in which it ended;
+        - `("next", "done")` bool `[N, 1]`: whether its episode ended there, too.
 
-        `observation`, without `next`, belongs to the option's last step: it is not what the choice was based on.
+        `observation`, without `next`, belongs to the option's last step. The choice was not based on it.
         """
         return {}
 
     def add_demonstrations(self, decisions: TensorDictBase) -> None:
         """Learn from the decisions `[N]` of a data set, as in `learn`, or keep them for `update`.
 
-        Called once, before training, on selectors with the mode `offline`. It is not experience: what falls with the
-        decisions that the selector has made, such as its exploration, stays where it is. Override it if `learn` counts
-        them or makes updates.
+        Called once, before training, on selectors with the mode `offline`. Exploration does not decay with these
+        decisions, since the selector has not made them. Override it if `learn` counts decisions or makes updates.
         """
         self.learn(decisions)
 
@@ -228,81 +290,30 @@ class Selector(TensorDictModuleBase):
         """Make updates from the decisions of a data set and return scalars to log, averaged over them.
 
         Called repeatedly with `mode=offline`, in which `learn` is not called, on selectors with the mode `offline`.
-        Those that learn in closed form have nothing left to do.
+        Selectors that learn in closed form need not override it.
         """
         return {}
 
     def next_discount(self, decisions: TensorDictBase) -> Tensor:
         """Return the factor `[N]` of the next decision's value in the target of each of the decisions `[N]`.
 
-        It is `gamma ** option_steps` where an option ended inside its episode. It is 0 where the episode ended, by its
-        time limit, too: otherwise an option that idles until the limit would be worth as much as the best one.
+        It is `gamma ** option_steps` if the option ended inside its episode. It is 0 if the episode ended, also by its
+        time limit. Otherwise an option that idles until the limit would look as valuable as the best one.
         """
         after = decisions.get("next")
         goes_on = ~after.get(keys.DONE).squeeze(-1)
         return self.gamma ** after.get(keys.OPTION_STEPS).squeeze(-1).float() * goes_on
 
-    def stateful(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold besides parameters and buffers, by name.
-
-        Each value is an optimizer, a TorchRL `ReplayBuffer`, or has a `state_dict` of constant names and shapes. For a
-        buffer, override `replay_rows`, too.
-        """
-        return {}
-
     def decisions_to_update(self) -> dict[str, int]:
         """Return the least number of decisions before the first update, by the name of each setting that requires one.
 
-        A selector that learns within options counts steps. A run that is too short is refused, and the message names
-        the setting with the largest number. Override it if one decision is not enough.
+        A selector that learns within options counts steps. A run that is too short is refused. The message names the
+        setting with the largest number. Override it if one decision is not enough.
         """
         return {}
-
-    def has_updated(self) -> bool:
-        """Return whether the selector has made an update, or has nothing to learn; a run reports if it has not.
-
-        By default the optimizers in `stateful` decide. Override it if the selector learns without an optimizer.
-        """
-        return have_stepped(self.stateful())
-
-    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return the rows `[N]` that each replay buffer of `stateful` would store of a collected batch `[*B, T]`.
-
-        The rows of a checkpoint must have the same names, shapes and dtypes. If a buffer has no entry here, its saved
-        rows are not compared.
-        """
-        return {}
-
-    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse invalid saved rows `[N]` of a replay buffer.
-
-        Args:
-            rows: the rows to put into the buffer.
-            example: the rows that `replay_rows` returned.
-
-        Raises:
-            ValueError: a row is invalid.
-        """
-        check_stored_rows(rows, self.specs)
-
-    def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse a state dict with the names and shapes of this selector's, but with invalid values.
-
-        Called before `load_state_dict`. Override it if finite numbers are not enough.
-
-        Raises:
-            ValueError: a value is invalid.
-        """
-
-    def exported(self) -> dict[str, Any] | None:
-        """Return as JSON values what a program without torch needs to choose greedily; None if that is not known.
-
-        `kind` names the form, which `hpamdp.policies.shared.exported_policy` explains.
-        """
-        return None
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
-        """Write `out_keys`: a fresh choice where `is_decision`, elsewhere what `td` already holds."""
+        """Write `out_keys`: a fresh choice if `is_decision` is true, else what `td` already holds."""
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         held = {key: td.get(key, None) for key in self.out_keys}
         nothing_held = any(value is None for value in held.values())
@@ -319,70 +330,61 @@ class Selector(TensorDictModuleBase):
         return td
 
 
-class Learner(nn.Module):
+class Learner(Level, nn.Module):
     """The low level: learns which discrete action to take, and with which parameters.
 
-    By default each option has a learner of its own; with `agent.sharing=shared` a single one serves all of them, and
-    the observation it sees ends in the one-hot option. A subclass provides:
+    By default each option has its own learner. With `agent.sharing=shared` a single learner serves all options, and the
+    one-hot option is the end of its observation. A subclass provides:
 
     - `policy`, which acts;
     - `learn`, to learn from the agent's own transitions;
     - `add_demonstrations` and `update`, to learn from a data set, and `"offline"` in `modes`;
-    - `value`, if it bootstraps, so that others can bootstrap from it where their option ends and its own follows;
+    - `value`, if it bootstraps, so that the learners of other options can bootstrap from it;
     - `stateful`, if it has optimizers or a replay buffer.
 
-    Where an option ends inside its episode, the next state is worth what it is worth under the option chosen next, not
-    under the one that ended. The batch then has `("next", "option_ended")`, and `("next", "option")` says which option
-    holds in the next state; `next_options` has the value. The key is missing where options last as long as their
-    episodes, and nothing of this applies.
+    If an option ends inside its episode, the value of the next state is its value under the next option. The batch then
+    has `("next", "option_ended")`, and `("next", "option")` is the option that holds in the next state. `next_options`
+    has the values. If options last as long as their episodes, these keys do not exist.
 
     `policies.shared.replay.ReplayLearner` implements `learn`, `add_demonstrations`, `update` and `stateful` for
     off-policy learners. The smallest complete learner is `policies.low_level.random.Random`.
 
-    Constructor: `specs` holds the sizes and bounds of the problem, with the symmetries and the geometry that it
-    declares, and `device`, if it is an argument, says where tensors live. All other arguments are keyword-only; their
-    names and type annotations are the schema of the learner's yaml in `conf/low`. A learner never sees the environment,
-    the config, the agent or another learner.
+    Constructor: `specs` holds the sizes and bounds of the problem, and the symmetries and geometry that it declares.
+    The argument `device`, if it exists, says where tensors live. Settings are fields of a model `Options`, see
+    `hpamdp.settings`, or keyword-only arguments. Their names and types are the schema of the learner's yaml in
+    `conf/low`. A learner never sees the environment, the config, the agent or another learner.
 
-    Policy: `policy` reads its `in_keys`, usually `observation` `[*B, observation_dim]`, and writes its `out_keys`:
+    Policy: `policy` reads its `in_keys`, usually `observation` `[*B, observation_dim]`. It writes its `out_keys`:
     `("action", "discrete")` int64 `[*B]` and `("action", "parameters")` `[*B, num_parameters]`, within their bounds.
-    The parameters of all discrete actions lie side by side, and only the chosen action's own have an effect;
-    `specs.parameter_mask` says whose they are, `specs.from_unit` maps [-1, 1] to the bounds. `is_greedy()` says whether
-    to act greedily or to explore.
+    The parameters of all discrete actions lie side by side. Only the parameters of the chosen action have an effect.
+    `specs.parameter_mask` says which action owns which parameter, and `specs.from_unit` maps [-1, 1] to the bounds.
+    `is_greedy()` says whether to act greedily or to explore.
 
-    - Where some discrete actions are forbidden at times, `specs.allowed(observation, td.get("action_mask", None))`
-      says which ones may be taken, in the policy as in `learn`; it is None where nothing is forbidden. They must
-      neither be taken nor count in a target.
+    - `specs.allowed(observation, td.get("action_mask", None))` says which discrete actions are allowed, in the policy
+      as in `learn`. It is None if nothing is forbidden. Forbidden actions must neither be taken nor count in a target.
     - If `learn` needs to know more about an action, such as its log-probability, append a key to the policy's
-      `out_keys`: it is there again in the batch.
-    - The policy gets only the environments whose option is its learner's, so their number changes from step to step,
-      and it acts in evaluation, too. So the module must not remember anything about an episode. What the policy needs
-      from step to step travels in the tensordict, under a key of its own, `[*B, ...]`, that is among its `in_keys` and
-      its `out_keys`. The key is missing before the first step; where `is_decision` is true, what it holds is left over
-      from an earlier option.
-    - The policy may run as a copy in another process, which receives its parameters and buffers and nothing else. So
-      whatever changes during training, such as an exploration rate, must be one of them.
+      `out_keys`. The key is in the batch that `learn` gets.
+    - The policy gets only the environments whose option is its learner's, so their number changes from step to step. It
+      also acts in evaluation. So the module must not remember anything about an episode. State that the policy needs
+      from step to step travels in the tensordict, under a key `[*B, ...]` that is among both its `in_keys` and its
+      `out_keys`. The key is missing before the first step. If `is_decision` is true, its value is left over from an
+      earlier option.
+    - The policy may run as a copy in another process, which receives its parameters and buffers only. So whatever
+      changes during training, such as an exploration rate, must be one of them.
 
     Attributes:
-        specs: sizes and bounds of the problem.
         policy: the module that acts.
-        needs: what the environment must reveal beyond its observation, as in `Selector`.
-        guarded_settings: settings that can run code, read files or reach servers, as in `Selector`.
-        modes: what the learner can learn from. `train`: transitions that the agent collects (`mode=train`). `offline`:
-            a data set (`mode=offline`, or `data=...` with `mode=train`).
-        value_option: name of the setting without which there is no `value`; None: where there is the method, there is.
-        progress: the buffers, by the last part of their names, that say how far a run has come: counters of its steps
-            and the exploration that follows from them. They begin afresh where a new run takes over the learner.
-        may_be_nan: the columns of the replay buffer that may hold NaN.
-        next_options: what follows an option that ends inside its episode; the agent sets it.
+        modes: what the learner can learn from: transitions that the agent collects (`train`), or a data set
+            (`offline`, for `mode=offline` and for `data=...` with `mode=train`).
+        value_option: setting that must be true for `value` to work. If None, `value` always works.
+        progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
+            counters. They start afresh if a new run takes over the learner.
+        next_options: which options follow one that ended, and their values. The agent sets it.
     """
 
-    needs: ClassVar[tuple[str, ...]] = ()
-    guarded_settings: ClassVar[tuple[str, ...]] = ()
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_option: ClassVar[str | None] = None
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
-    may_be_nan: ClassVar[frozenset[str]] = frozenset()
 
     policy: TensorDictModuleBase
     next_options: NextOptions
@@ -394,35 +396,35 @@ class Learner(nn.Module):
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the values `[N]` of states `[N, observation_dim]` from which this learner would bootstrap.
 
-        That is the value of what the learner does from there on, by its target networks if it has any.
+        Target networks give the value, if the learner has any.
 
         Args:
             observation: of the states.
-            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
         """
         raise NotImplementedError(f"{type(self).__name__} has no value to bootstrap from")
 
     def is_untrained(self) -> bool:
         """Return whether parameters and buffers show that `value` still comes from untrained networks.
 
-        While exploring, `high=value` chooses the options of such learners first, so that all of them get steps.
+        While exploring, `high=value` chooses the options of such learners first, so that all of them get data.
         """
         return False
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Learn from a collected batch `[*B, T]` and return scalars to log, averaged over the updates made.
 
-        Called after every batch, even if none of its transitions is this learner's. When and how often it updates is
-        up to the learner. The scalars are logged as `low/<name>`, or `low/<option>/<name>` with several learners.
+        Called after every batch, even if none of its transitions is this learner's. The learner decides when and how
+        often it updates. The scalars are logged as `low/<name>`, or `low/<option>/<name>` with several learners.
 
         Args:
-            batch: consecutive steps along `T`: `observation`, `option` (if the problem has options), the policy's
-                `out_keys` and, under `next`, `observation`, `reward` `[*B, T, 1]` and bool `[*B, T, 1]` `terminated`,
-                `truncated`, `done` and `is_decision`. A time limit is `truncated`, not `terminated`: values may be
-                bootstrapped there. Where options may end inside their episodes, also bool `[*B, T, 1]` `option_ended`
-                and int64 `[*B, T]` `option`, see above. Where `option_ends`, the next step may belong to another
-                learner. All learners get the same batch, and the collector may reuse its memory: do not modify it, and
-                copy what must last.
+            batch: consecutive steps along `T`. At the root: `observation`, `option` (if the problem has options) and
+                the policy's `out_keys`. Under `next`: `observation`, `reward` `[*B, T, 1]` and bool `[*B, T, 1]`
+                `terminated`, `truncated`, `done` and `is_decision`. A time limit is `truncated`, not `terminated`, so
+                values may bootstrap there. If options may end inside their episodes, `next` also holds `option_ended`
+                bool `[*B, T, 1]` and `option` int64 `[*B, T]`. After `option_ends`, the next step may belong to another
+                learner. All learners get the same batch, and the collector may reuse its memory. So do not modify it,
+                and copy what must last.
             mask: bool `[*B, T]`, the transitions that are this learner's.
         """
         return {}
@@ -477,37 +479,3 @@ class Learner(nn.Module):
         one step is not enough.
         """
         return {}
-
-    def has_updated(self) -> bool:
-        """Return whether the learner has made an update, or has nothing to learn, as `Selector.has_updated` does."""
-        return have_stepped(self.stateful())
-
-    def exported(self) -> dict[str, Any] | None:
-        """Return as JSON values what a program without torch needs to act greedily; None if that is not known.
-
-        `kind` names the form, which `hpamdp.policies.shared.exported_policy` explains.
-        """
-        return None
-
-    def stateful(self) -> dict[str, Any]:
-        """Return what a checkpoint must hold besides parameters and buffers, as `Selector.stateful` does."""
-        return {}
-
-    def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
-        """Return the rows that each replay buffer would store of a batch, as `Selector.replay_rows` does."""
-        return {}
-
-    def check_rows(self, rows: TensorDictBase, example: TensorDictBase) -> None:
-        """Refuse invalid saved rows, as `Selector.check_rows` does.
-
-        Raises:
-            ValueError: a row is invalid.
-        """
-        check_stored_rows(rows, self.specs, self.may_be_nan)
-
-    def check_state(self, state: Mapping[str, Any]) -> None:
-        """Refuse a state dict with invalid values, as `Selector.check_state` does.
-
-        Raises:
-            ValueError: a value is invalid.
-        """

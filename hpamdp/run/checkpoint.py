@@ -35,7 +35,7 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, warn
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.base import Learner, Selector
+from hpamdp.policies.base import Learner, Level
 from hpamdp.run.state_checks import (
     Progress,
     SavedPart,
@@ -421,7 +421,7 @@ class _Opened:
                 raise ValueError(f"{key} differs from another name of the same weights")
             state[key] = first
         for prefix, part in module.named_modules():
-            if isinstance(part, Learner | Selector):
+            if isinstance(part, Level):
                 start = f"{prefix}." if prefix else ""
                 part.check_state({key.removeprefix(start): state[key] for key in state if key.startswith(start)})
         return state

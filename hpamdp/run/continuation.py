@@ -28,7 +28,7 @@ _BOOKKEEPING = (
 
 
 class Rest(NamedTuple):
-    """The rest of a run: nothing if it has a score, else everything after its checkpoint."""
+    """The rest of a run: nothing if it has a score, else everything after its checkpoint, or all if it has none."""
 
     score: float | None = None
     checkpoint: Path | None = None

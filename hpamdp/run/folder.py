@@ -132,9 +132,9 @@ def mark_unfinished(folder: Path) -> None:
 
 @contextmanager
 def moved_aside(folder: Path) -> Iterator[None]:
-    """Move an earlier run out of the folder, delete it after the block, and bring it back if the block fails.
+    """Move an earlier run aside, delete it after the block, and bring it back if the block fails.
 
-    Files that no run writes stay where they are.
+    Files that no run writes stay in the folder.
 
     Raises:
         OSError: the folder cannot be written to; the earlier run stays.
@@ -170,8 +170,8 @@ def _bring_back(folder: Path) -> None:
 def is_about_folder(error: OSError, folder: Path) -> bool:
     """Return whether the run's folder cannot be made or written to, or is gone.
 
-    An error of a write to an open file names no file, so its number decides. The collection itself reports errors of
-    the memory that processes share.
+    An error of a write to an open file names no file, so its number decides. Collections report errors of shared memory
+    themselves.
     """
     if error.filename is not None:
         return Path(str(error.filename)).is_relative_to(folder)

@@ -1,4 +1,4 @@
-"""Where a run's numbers go beside its own files."""
+"""Loggers, which send a run's numbers and figures to other places than its own files."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ _WANDB_MODES: dict[str, WandbMode] = {
 
 
 class Logger(Protocol):
-    """Takes a run's numbers and figures somewhere besides `metrics.csv`.
+    """Sends a run's numbers and figures to another place than `metrics.csv`.
 
-    A constructor may have the arguments `output_dir`, `config`, and `earlier` (an `EarlierRun` if a run is continued,
-    else None). The program supplies them.
+    The program supplies the arguments `output_dir`, `config` and `earlier` of a constructor that has them. `earlier` is
+    an `EarlierRun` if a run is continued, else None.
     """
 
     def log(self, row: dict[str, float], step: int) -> None:
@@ -68,11 +68,11 @@ class Logger(Protocol):
 
 
 class Guarded:
-    """Passes everything to a logger until the logger raises an error; then warns once and drops the rest.
+    """Passes every call on to a logger. After its first error, warns once and drops all later calls.
 
     Args:
         name: the logger's name, for the warning.
-        start: a function that makes the logger. Its `ValueError` is a user's mistake, and is raised.
+        start: a function that makes the logger. Its `ValueError` is a user's mistake and is raised.
     """
 
     def __init__(self, name: str, start: Callable[[], Logger]) -> None:
@@ -153,8 +153,9 @@ class TensorboardLogger:
     """Log to a TensorBoard event file.
 
     The file is complete after each row, and has the times of training. A resumed run deletes the old events, which may
-    go past its checkpoint, and writes its earlier rows again. torch's
-    `SummaryWriter` is not used: it writes in a thread, whose errors are printed with a traceback.
+    go past its checkpoint, and writes its earlier rows again.
+
+    torch's `SummaryWriter` is not used, since it writes in a thread and prints its errors with a traceback.
 
     Args:
         output_dir: the run's folder; the events go to `tensorboard` in it.

@@ -1,4 +1,4 @@
-"""Compare the contents of a checkpoint with a run, before anything of the run changes."""
+"""Compare the contents of a checkpoint with a run, before the run changes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hpamdp.run.tensor_archive import SavedTensor
 _MOST = 2**53
 Count = Annotated[int, Field(ge=0, le=_MOST)]
 Amount = Annotated[FiniteFloat, Field(ge=0.0)]
-# Settings of an optimizer that training changes, and settings that only say how a step is computed.
+# Settings of an optimizer that training changes, and settings that choose between equivalent implementations.
 _SCHEDULED, _IMPLEMENTATION = ("lr", "weight_decay"), ("foreach", "fused", "capturable", "differentiable")
 # Settings that earlier versions of torch lack.
 _MAY_LACK = (*_IMPLEMENTATION, "decoupled_weight_decay")
@@ -39,7 +39,7 @@ class SavedPart(BaseModel):
 
 
 class Progress(SavedPart):
-    """How far a run has come. Entries of later versions are left out."""
+    """How far a run has come. Entries of later versions are ignored."""
 
     model_config = ConfigDict(strict=True, extra="ignore", frozen=True)
 
@@ -192,7 +192,7 @@ def buffers_sized_by_data(module: nn.Module) -> set[int]:
 
 
 def state_after_a_step(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Return the state of a copy of an optimizer that has made a step, for the forms of its tensors."""
+    """Return the state of a copy of an optimizer after a step; only the forms of its tensors matter."""
     another = copy.deepcopy(optimizer)
     for group in another.param_groups:
         for parameter in group["params"]:

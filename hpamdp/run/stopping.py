@@ -1,4 +1,4 @@
-"""How a run is stopped from outside: by signals, which take effect between two batches, and by `sys.exit`."""
+"""Stop a run from outside: by signals, which take effect between two batches, and by `sys.exit` in other code."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class StopRequest:
 def stop_on_signals() -> Iterator[StopRequest]:
     """Note the signals that stop a run, until the block ends; ignored signals stay ignored.
 
-    In another thread than the main one nothing is noted, because signals reach only the main thread.
+    Only the main thread notes signals, since Python delivers them to no other thread.
     """
     request = StopRequest()
     before = {number: signal.getsignal(number) for number in _changeable_signals()}
@@ -80,14 +80,14 @@ def _changeable_signals() -> tuple[signal.Signals, ...]:
 
 
 class ProgramExitError(RuntimeError):
-    """A call of `sys.exit` in third-party code, told in one line."""
+    """A call of `sys.exit` in third-party code, explained in one line."""
 
 
 @contextmanager
 def exits_explained() -> Iterator[None]:
     """Turn a call of `sys.exit` inside the block into an error that names its place.
 
-    Calls by argparse are let through. So are calls by submitit, which ends a job this way to requeue it.
+    Calls by argparse pass, and so do calls by submitit, which ends a job this way to requeue it.
 
     Raises:
         ProgramExitError: `sys.exit` was called.

@@ -1,9 +1,9 @@
-"""Read files of `torch.save` without running code, and without taking more memory than the file has bytes.
+"""Read files of `torch.save` without running code, and with no more memory than the file has bytes.
 
-`torch.load(weights_only=True)` runs no code either. But it allocates the sizes that a file claims, decompresses members
-without a limit, and before torch 2.10 trusts the length of a storage. Here a file is first read as a description:
-nested values with a `SavedTensor` in the place of each tensor. The caller checks the description before it reads the
-tensors.
+`torch.load(weights_only=True)` runs no code either. But it allocates the sizes that a file claims and decompresses
+members without a limit. Before torch 2.10 it also trusts the length of a storage. A `TensorArchive` first reads a
+description: nested values with a `SavedTensor` in the place of each tensor. The caller checks the description, and then
+reads the tensors.
 """
 
 from __future__ import annotations
