@@ -83,7 +83,7 @@ def test_latents_that_still_decode_to_their_action_are_kept_and_a_shifted_codec_
         rows["latent"] = torch.cat([trained.codec.embeddings[rows["discrete"]], trained.codec.z_to_unit(mean)], -1)
     _, is_corrected = trained.corrected_latent(rows)
     assert is_corrected.float().mean() < 0.1
-    shifted = make(discrete="greedy" if trained.actor.is_greedy else "nearest")
+    shifted = make(discrete="greedy" if trained.actor.proposes_each else "nearest")
     shifted.load_state_dict(trained.state_dict())
     with torch.no_grad():
         shifted.codec.table.copy_(shifted.codec.table.flip(0))
@@ -117,7 +117,7 @@ def test_the_greedy_policy_takes_the_best_of_the_actors_latent_actions_and_their
     td = TensorDict({keys.OBSERVATION: torch.rand(30, 4) * 2 - 1}, [30])
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         latent = learner.policy(td.clone())[LATENT]
-    own = learner.actor(td[keys.OBSERVATION], learner.codec.embeddings)
+    own = learner.actor.proposals(learner.actor(td[keys.OBSERVATION]), learner.codec.embeddings)
     with torch.no_grad():
         tried = [own, *((own + each).clamp(-1.0, 1.0) for each in learner.policy.variations)]
         values = torch.stack([learner.critics(td[keys.OBSERVATION], each).amin(0).amax(-1) for each in tried])
@@ -242,7 +242,7 @@ def test_the_search_brings_z_to_a_higher_hill_that_the_gradient_does_not_see(dis
         learner.actor.net[-1].bias.fill_(0.5)
     for _ in range(300):
         learner.gradient_step("actor", learner._actor_loss, state, None)
-    z = learner.actor(state, learner.codec.embeddings)[..., 3:]
+    z = learner.actor.proposals(learner.actor(state), learner.codec.embeddings)[..., 3:]
     torch.testing.assert_close(z, torch.full_like(z, expected), atol=0.1, rtol=0.0)
 
 
@@ -313,9 +313,10 @@ def test_with_a_tolerance_a_latent_is_outdated_exactly_where_it_decodes_to_other
             unit, _ = codec.decode(rows["state"], discrete, codec.z_from_unit(latent[:, 3:]))
         return ((unit - rows["unit"]) * codec.mask[discrete]).abs().amax(-1)
 
-    trained.parameter_tolerance = 0.2
+    plain = trained.options
+    trained.options = plain.model_copy(update={"parameter_tolerance": 0.2})
     latent, is_corrected = trained.corrected_latent(rows)
-    trained.parameter_tolerance = None
+    trained.options = plain
     error = decoding_error(rows["latent"])
     assert torch.equal(is_corrected, error > 0.2)
     assert 0.3 < is_corrected[discrete != 2].float().mean() < 1.0, "the third action has no parameter"
@@ -346,7 +347,7 @@ def test_relabelling_by_samples_spreads_over_the_latent_space():
     )  # fmt: skip
     latent, _ = learner.corrected_latent(rows)
     assert (latent.std(0) > 0.05).all() and (latent.abs() <= 1.0).all()
-    learner.relabels_with_noise = False
+    learner.options = learner.options.model_copy(update={"relabelling": "mean"})
     latent, _ = learner.corrected_latent(rows)
     assert (latent.std(0) < 1e-6).all()
 

@@ -178,7 +178,7 @@ def test_in_bfloat16_parameters_near_a_bound_still_have_a_gradient(name):
         last.bias.fill_(4.0)
     unit_of = {
         "pdqn": lambda state: learner.actor(state),
-        "hyar": lambda state: learner.actor(state, learner.codec.embeddings)[..., -learner.codec.latent_dim :],
+        "hyar": lambda state: learner.actor(state)[..., -learner.codec.latent_dim :],
         "hsac": lambda state: learner.actor(state).sample_squashed()[0],
     }
     if name == "hsac":

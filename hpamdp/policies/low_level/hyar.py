@@ -42,9 +42,9 @@ TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.
 from __future__ import annotations
 
 import copy
-import math
+from collections.abc import Sequence
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
@@ -56,28 +56,80 @@ from torch.nn import functional as F
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
-from hpamdp.policies.shared.actor_critic import set_learning_rates
-from hpamdp.policies.shared.exploration import linear_schedule
-from hpamdp.policies.shared.networks import (
-    EnsembleMLP,
-    before_tanh,
+from hpamdp.policies.shared.actor_critic import TargetRateOptions, set_learning_rates
+from hpamdp.policies.shared.actor_search import (
+    SearchingActorOptions,
+    actor_loss,
     even_normal,
     in_pieces,
-    mlp,
-    polyak_update,
-    unsquashed,
-    with_clipped_noise,
     with_variations,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
+from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.networks import EnsembleMLP, before_tanh, mlp, polyak_update, unsquashed, with_clipped_noise
+from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.scales import scale_of
-from hpamdp.settings import Fraction, LearningRate, PositiveFraction
+from hpamdp.settings import LearningRate, PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
 
 # Variations that are valued at once, if those of a state are no more: bounds the memory.
 _MAX_TRIED = 1 << 14
+
+
+class HyAROptions(TargetRateOptions, SearchingActorOptions):
+    """Settings of `HyAR`. Noise is in units where the latent action's bounds are [-1, 1].
+
+    The published settings: discrete=nearest latent_dim=6 hidden_dims=[256,256] codec_pretrain_updates=5000
+    codec_lr=1e-4 kl_weight=0.5 dynamics_weight=1 gamma=0.99 tau=0.005 actor_lr=3e-4 critic_lr=3e-4
+    target_smoothing_clip=0.5, after a warm-up of 5,000 to 20,000 random episodes.
+    """
+
+    twin: bool = True
+    """Act by TD3 (HyAR-TD3); else by DDPG (HyAR-DDPG), with one critic, no delay and no target smoothing."""
+    discrete: Literal["greedy", "nearest"] = "greedy"
+    """Discrete action: the one with the highest value (`greedy`), or with the embedding nearest to e (`nearest`).
+
+    `nearest` is the published form. With `greedy`, updates take longer the more discrete actions there are.
+    """
+    embedding_dim: PositiveInt = 6
+    """Dimension of a discrete action's embedding e."""
+    latent_dim: PositiveInt | None = None
+    """Dimension of the latent variable z of the VAE; if null, the largest number of parameters of a discrete action."""
+    codec_hidden_dim: PositiveInt = 128
+    """Width of the codec's layers."""
+    warmup_steps: PositiveInt = 2000
+    """Random steps of a learner before its first update; the codec is trained on them."""
+    codec_pretrain_updates: PositiveInt = 2000
+    """Updates of the codec alone at the end of the warm-up."""
+    codec_every: PositiveInt = 10
+    """Critic updates for each update of the codec after that."""
+    codec_lr: LearningRate = 1e-3
+    """Learning rate of the codec."""
+    kl_weight: NonNegativeFloat = 1e-4
+    """Weight of the KL divergence in the codec's loss."""
+    dynamics_weight: NonNegativeFloat = 0.1
+    """Weight of the predicted change of the state in the codec's loss."""
+    latent_coverage: PositiveFraction = 0.96
+    """Central fraction of the encoded z that the actor can reach: the latent-space constraint of the paper."""
+    correction_factor: PositiveFloat = 5.0
+    """Encode a stored z anew if the error of its predicted change is this many times the codec's recent mean."""
+    parameter_tolerance: NonNegativeFloat | None = None
+    """Instead, encode a stored z anew if it decodes to parameters that differ from the executed ones by more than this.
+
+    If null, the predicted change decides. Where the next state is hard to predict, the parameters are the surer sign.
+    """
+    relabelling: Literal["mean", "sample"] = "sample"
+    """Latent action in place of an outdated or random one: the encoder's mean, or a sample as published.
+
+    The means lie on a line in the latent space. Off that line, where the actor goes, only samples teach the critics.
+    """
+    buffer_size: PositiveInt = 300_000
+    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
+    lr_final: PositiveFraction = 0.1
+    """Fraction of the three learning rates that is left at the end; 1 keeps them constant."""
+    epsilon_steps: NonNegativeInt = 15_000
+    """Steps after the warm-up within which the probability of a random action falls."""
 
 
 class HybridCodec(nn.Module):
@@ -168,29 +220,22 @@ class HybridCodec(nn.Module):
 class LatentActor(nn.Module):
     """Proposes latent actions (e, z) in [-1, 1]: one for each discrete action, or one alone.
 
-    With `is_greedy`, e is each discrete action's own embedding, and the actor gives a z for each. Otherwise it gives a
-    single (e, z).
+    With `proposes_each`, e is each discrete action's own embedding, and the actor gives a z for each. Otherwise it
+    gives a single (e, z).
     """
 
     def __init__(
-        self, specs: PAMDPSpecs, embedding_dim: int, latent_dim: int, hidden_dims: list[int], is_greedy: bool
+        self, specs: PAMDPSpecs, embedding_dim: int, latent_dim: int, hidden_dims: Sequence[int], proposes_each: bool
     ) -> None:
         super().__init__()
-        self.is_greedy = is_greedy
-        self.num_proposals = specs.num_discrete if is_greedy else 1
-        self.num_given = latent_dim if is_greedy else embedding_dim + latent_dim
+        self.proposes_each = proposes_each
+        self.num_proposals = specs.num_discrete if proposes_each else 1
+        self.num_given = latent_dim if proposes_each else embedding_dim + latent_dim
         self.net = mlp(specs.observation_dim, hidden_dims, self.num_proposals * self.num_given)
 
-    def forward(self, state: Tensor, embeddings: Tensor, noise: float = 0.0, noise_clip: float = math.inf) -> Tensor:
-        """Return the proposals, `[B, num_proposals, embedding_dim + latent_dim]`.
-
-        Args:
-            state: `[B, observation_dim]`.
-            embeddings: of the discrete actions, `[num_discrete, embedding_dim]`.
-            noise: standard deviation of the Gaussian noise on what the actor gives.
-            noise_clip: bound of this noise.
-        """
-        return self.proposals(with_clipped_noise(self.raw(state).tanh(), noise, noise_clip), embeddings)
+    def forward(self, state: Tensor) -> Tensor:
+        """Return what the actor gives for states `[B, observation_dim]`, `[B, num_proposals, num_given]` in [-1, 1]."""
+        return self.raw(state).tanh()
 
     def raw(self, state: Tensor) -> Tensor:
         """Return what the actor gives before tanh, `[B, num_proposals, num_given]`."""
@@ -198,7 +243,7 @@ class LatentActor(nn.Module):
 
     def proposals(self, given: Tensor, embeddings: Tensor) -> Tensor:
         """Return the proposals of what the actor gave, `[B, num_proposals, num_given]` in [-1, 1]."""
-        return torch.cat([embeddings.expand(len(given), -1, -1), given], -1) if self.is_greedy else given
+        return torch.cat([embeddings.expand(len(given), -1, -1), given], -1) if self.proposes_each else given
 
     def given(self, proposals: Tensor) -> Tensor:
         """Return the part of proposals that the actor gives."""
@@ -209,7 +254,7 @@ class LatentCritics(nn.Module):
     """`num_members` independent networks for Q(s, e, z)."""
 
     def __init__(
-        self, num_members: int, observation_dim: int, action_dim: int, hidden_dims: list[int], *, layer_norm: bool
+        self, num_members: int, observation_dim: int, action_dim: int, hidden_dims: Sequence[int], *, layer_norm: bool
     ) -> None:
         super().__init__()
         self.net = EnsembleMLP(num_members, observation_dim + action_dim, hidden_dims, 1, layer_norm=layer_norm)
@@ -243,31 +288,13 @@ def best_of_tried(critics: LatentCritics, state: Tensor, tried: Tensor) -> tuple
 
 
 class HyARPolicy(TensorDictModuleBase):
-    """Takes the best of the actor's proposals, decoded; explores with noise on them and with random actions.
-
-    Args:
-        actor: makes the proposals.
-        critics: value them.
-        codec: decodes them.
-        specs: of the problem.
-        noise: standard deviation of the exploring noise on the proposals.
-        greedy_samples: how many variations of each proposal's z the greedy policy values besides the proposal itself.
-        greedy_noise: standard deviation of these variations.
-    """
+    """Takes the best of the actor's proposals, decoded; explores with noise on them and with random actions."""
 
     epsilon: Tensor
     variations: Tensor
 
     def __init__(
-        self,
-        actor: LatentActor,
-        critics: LatentCritics,
-        codec: HybridCodec,
-        specs: PAMDPSpecs,
-        *,
-        noise: float,
-        greedy_samples: int,
-        greedy_noise: float,
+        self, actor: LatentActor, critics: LatentCritics, codec: HybridCodec, specs: PAMDPSpecs, options: HyAROptions
     ) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
@@ -276,9 +303,9 @@ class HyARPolicy(TensorDictModuleBase):
         self.critics = critics
         self.codec = codec
         self.specs = specs
-        self.noise = noise
+        self.noise = options.parameter_noise
         self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
-        of_z = even_normal(greedy_samples, codec.latent_dim, greedy_noise)
+        of_z = even_normal(options.greedy_samples, codec.latent_dim, options.greedy_noise)
         self.register_buffer("variations", F.pad(of_z, (codec.table.shape[-1], 0)), persistent=False)
 
     @torch.no_grad()
@@ -290,8 +317,11 @@ class HyARPolicy(TensorDictModuleBase):
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         allowed = allowed_rows(self.specs, td)
         is_exploring = not is_greedy()
-        proposals = self.actor(state, self.codec.embeddings, self.noise if is_exploring else 0.0)
-        if not self.actor.is_greedy:
+        given = self.actor(state)
+        if is_exploring:
+            given = with_exploring_noise(given, self.noise)
+        proposals = self.actor.proposals(given, self.codec.embeddings)
+        if not self.actor.proposes_each:
             proposals = self.codec.of_allowed(proposals, allowed)
         q = None
         if not is_exploring and len(self.variations) > 0:
@@ -339,138 +369,46 @@ class HyARPolicy(TensorDictModuleBase):
 class HyAR(ReplayLearner):
     """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
+    Options = HyAROptions
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
     may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
 
+    options: HyAROptions
     policy: HyARPolicy
     dynamics_error: Tensor
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        twin: bool,
-        discrete: Literal["greedy", "nearest"],
-        embedding_dim: PositiveInt,
-        latent_dim: PositiveInt | None,
-        codec_hidden_dim: PositiveInt,
-        hidden_dims: list[PositiveInt],
-        layer_norm: bool,
-        warmup_steps: PositiveInt,
-        codec_pretrain_updates: PositiveInt,
-        codec_every: PositiveInt,
-        codec_lr: LearningRate,
-        kl_weight: NonNegativeFloat,
-        dynamics_weight: NonNegativeFloat,
-        latent_coverage: PositiveFraction,
-        correction_factor: PositiveFloat,
-        parameter_tolerance: NonNegativeFloat | None,
-        relabelling: Literal["mean", "sample"],
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_step: PositiveFloat,
-        augment: bool,
-        gamma: PositiveFraction,
-        reward_scale: PositiveFloat,
-        tau: PositiveFraction,
-        actor_lr: LearningRate,
-        critic_lr: LearningRate,
-        lr_final: PositiveFraction,
-        lr_steps: NonNegativeInt,
-        policy_delay: PositiveInt,
-        target_smoothing: NonNegativeFloat,
-        target_smoothing_clip: NonNegativeFloat,
-        preactivation_penalty: NonNegativeFloat,
-        search_samples: NonNegativeInt,
-        search_weight: NonNegativeFloat,
-        parameter_noise: NonNegativeFloat,
-        greedy_samples: NonNegativeInt,
-        greedy_noise: NonNegativeFloat,
-        epsilon_final: Fraction,
-        epsilon_steps: NonNegativeInt,
+        device: torch.device | str = "cpu",
+        options: HyAROptions | None = None,
+        **settings: Any,
     ) -> None:
-        options = ReplayOptions(
-            gamma=gamma,
-            warmup_steps=warmup_steps,
-            buffer_size=buffer_size,
-            batch_size=batch_size,
-            updates_per_step=updates_per_step,
-            augment=augment,
-        )
+        options = HyAROptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.codec_pretrain_updates = codec_pretrain_updates
-        self.codec_every = codec_every
-        self.kl_weight = kl_weight
-        self.dynamics_weight = dynamics_weight
-        self.reward_scale = reward_scale
-        self.latent_coverage = latent_coverage
-        self.correction_factor = correction_factor
-        self.parameter_tolerance = parameter_tolerance
-        self.relabels_with_noise = relabelling == "sample"
-        self.tau = tau
-        self.lr_final = lr_final
-        self.lr_steps = lr_steps
-        self.policy_delay = policy_delay if twin else 1
-        self.target_smoothing = target_smoothing if twin else 0.0
-        self.target_smoothing_clip = target_smoothing_clip
-        self.preactivation_penalty = preactivation_penalty
-        self.search_samples = search_samples
-        self.search_weight = search_weight
-        self.epsilon_final = epsilon_final
-        self.epsilon_steps = epsilon_steps
+        self.reward_scale = options.reward_scale
+        self.policy_delay = options.policy_delay if options.twin else 1
+        self.smoothing = options.target_smoothing if options.twin else 0.0, options.target_smoothing_clip
 
-        latent_dim = latent_dim or max(1, *specs.parameter_dims)
-        self.codec = HybridCodec(specs, embedding_dim, latent_dim, codec_hidden_dim)
-        self.actor = LatentActor(specs, embedding_dim, latent_dim, hidden_dims, is_greedy=discrete == "greedy")
-        num_critics = 2 if twin else 1
+        latent_dim = options.latent_dim or max(1, *specs.parameter_dims)
+        dims, latent_dims = options.hidden_dims, (options.embedding_dim, latent_dim)
+        self.codec = HybridCodec(specs, *latent_dims, options.codec_hidden_dim)
+        self.actor = LatentActor(specs, *latent_dims, dims, proposes_each=options.discrete == "greedy")
         self.critics = LatentCritics(
-            num_critics, specs.observation_dim, embedding_dim + latent_dim, hidden_dims, layer_norm=layer_norm
+            2 if options.twin else 1, specs.observation_dim, sum(latent_dims), dims, layer_norm=options.layer_norm
         )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = HyARPolicy(
-            self.actor,
-            self.critics,
-            self.codec,
-            specs,
-            noise=parameter_noise,
-            greedy_samples=greedy_samples,
-            greedy_noise=greedy_noise,
-        )
+        self.policy = HyARPolicy(self.actor, self.critics, self.codec, specs, options)
         # The codec's recent mean squared error of the scaled change of the state.
         self.register_buffer("dynamics_error", torch.ones((), dtype=torch.float32))
         self.to(device)
-        self.learning_rates = {"codec": codec_lr, "actor": actor_lr, "critics": critic_lr}
+        self.learning_rates = {"codec": options.codec_lr, "actor": options.actor_lr, "critics": options.critic_lr}
+        modules = {"codec": self.codec, "actor": self.actor, "critics": self.critics}
         self.optimizers = {
-            "codec": torch.optim.Adam(self.codec.parameters(), lr=codec_lr, fused=True),
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
+            name: torch.optim.Adam(modules[name].parameters(), lr=rate, fused=True)
+            for name, rate in self.learning_rates.items()
         }
-
-    def transitions(self, batch: TensorDictBase) -> TensorDict:
-        """Return the rows to store, with the latent actions that the actor gave."""
-        return super().transitions(batch).set(LATENT, batch[LATENT])
-
-    def augmented(self, sample: TensorDictBase) -> TensorDictBase:
-        """Return a sample mapped by random symmetries; the latent actions are to be encoded anew."""
-        if self.symmetry is None:
-            return sample
-        mapped = self.symmetry(sample)
-        return mapped.set(LATENT, torch.full_like(mapped[LATENT], torch.nan))
-
-    def start(self) -> None:
-        """Train the codec alone."""
-        stored = self.buffer[:]
-        self.codec.change_scale.copy_(scale_of(stored["next_state"] - stored["state"]))
-        for _ in range(self.codec_pretrain_updates):
-            self._update_codec(self.augmented(self.buffer.sample(self.options.batch_size)))
-        self._fit_latent_range()
-
-    def on_progress(self, steps: int) -> None:
-        """Lower the fraction of random actions and the learning rates."""
-        self.policy.epsilon.fill_(linear_schedule(steps, self.epsilon_steps, self.epsilon_final))
-        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(steps, self.lr_steps, self.lr_final))
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
@@ -478,20 +416,80 @@ class HyAR(ReplayLearner):
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
             scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
-            polyak_update(self.target_actor, self.actor, self.tau)
-            polyak_update(self.target_critics, self.critics, self.tau)
-        if self.updates % self.codec_every == 0:
+            polyak_update(self.target_actor, self.actor, self.options.tau)
+            polyak_update(self.target_critics, self.critics, self.options.tau)
+        if self.updates % self.options.codec_every == 0:
             scalars |= self._update_codec(sample)
-            if self.updates % (100 * self.codec_every) == 0:
+            if self.updates % (100 * self.options.codec_every) == 0:
                 self._fit_latent_range()
         return scalars
 
+    def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        scalars = self.gradient_step("codec", self._codec_loss, sample)
+        self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
+        return scalars
+
     def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the squared distance from the targets, and scalars."""
+        """Return the squared distance of Q(s, e, z) from r + discount * V(s'), where V is `value`."""
         latent, is_corrected = self.corrected_latent(sample)
         q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
         loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "redone": is_corrected.float().mean()}
+
+    @torch.no_grad()
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the max over the target actor's allowed proposals a of min Q'(s, a), `[B]`.
+
+        The proposals carry clipped noise.
+        """
+        allowed = self.specs.allowed(observation, action_mask)
+        given = with_clipped_noise(self.target_actor(observation), *self.smoothing)
+        proposals = self.target_actor.proposals(given, self.codec.embeddings)
+        if not self.actor.proposes_each:
+            return self.target_critics(observation, self.codec.of_allowed(proposals, allowed)).amin(0).amax(-1)
+        return masked_values(self.target_critics(observation, proposals).amin(0), allowed).amax(-1)
+
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""
+        raw = self.actor.raw(state)
+        proposals = self.actor.proposals(raw.tanh(), self.codec.embeddings.detach())
+        if not self.actor.proposes_each:
+            proposals = self.codec.of_allowed(proposals, allowed)
+        q = self.critics(state, proposals, num_members=1)
+        value = (q if allowed is None or not self.actor.proposes_each else q * allowed).sum(-1)
+        loss = actor_loss(self.options, value, raw, partial(self._search, state, raw, proposals.detach(), allowed))
+        return loss, {"actor": -value.mean()}
+
+    def _search(self, state: Tensor, raw: Tensor, proposals: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Find for every proposal the best of random latent actions, by the critics.
+
+        The random ones differ from the proposal in z. If the actor gives one proposal alone, they also differ in the
+        discrete action, one of the allowed.
+
+        Args:
+            state: `[B, observation_dim]`.
+            raw: what the actor gives there before tanh, `[B, P, num_given]`.
+            proposals: made of it, `[B, P, embedding_dim + latent_dim]`.
+            allowed: bool `[B, num_discrete]`; None: all.
+
+        Returns:
+            By how much the best one is better than each proposal, at least 0, and the squared distance to it,
+            `[B, P]` each.
+        """
+        shape = (*proposals.shape[:2], self.options.search_samples)
+        with torch.no_grad():
+            if self.actor.proposes_each:
+                e = proposals[..., : -self.codec.latent_dim].unsqueeze(2).expand(*shape, -1)
+            else:
+                of_tried = None if allowed is None else allowed[:, None, None].expand(*shape, -1)
+                discrete = random_choice(torch.Size(shape), self.specs.num_discrete, of_tried, state.device)
+                e = self.codec.embeddings[discrete]
+            z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device, dtype=torch.float32) - 1.0
+            num_rows = max(1, _MAX_TRIED // (shape[1] * shape[2]))
+            found, best = in_pieces(partial(best_of_tried, self.critics), num_rows, state, torch.cat([e, z], -1))
+            gain = (best - self.critics(state, proposals).amin(0)).clamp(min=0.0)
+            gain = gain * allowed if self.actor.proposes_each and allowed is not None else gain
+        return gain, (raw - unsquashed(self.actor.given(found))).square().sum(-1)
 
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return latents that the codec still decodes to the executed actions, and which of them were corrected, `[B]`.
@@ -511,14 +509,14 @@ class HyAR(ReplayLearner):
             is_current = self._is_current(batch, z)
             is_same_discrete = (self.codec.nearest_discrete(e.nan_to_num()) == discrete) & ~e.isnan().any(-1)
             new_e = self.codec.embeddings[discrete]
-            if self.actor.is_greedy:
+            if self.actor.proposes_each:
                 e = new_e  # the critics are asked about these alone
             else:
-                if self.relabels_with_noise:
+                if self.options.relabelling == "sample":
                     new_e = with_clipped_noise(new_e, 0.1, 0.5)
                 e = torch.where(is_same_discrete.unsqueeze(-1), e, new_e)
             new_z, log_variance = self.codec.encode(state, discrete, batch["unit"])
-            if self.relabels_with_noise:
+            if self.options.relabelling == "sample":
                 new_z = new_z + (0.5 * log_variance).exp() * torch.randn_like(new_z)
             z = torch.where(is_current.unsqueeze(-1), z, self.codec.z_to_unit(new_z))
         return torch.cat([e, z], -1), ~(is_same_discrete & is_current)
@@ -530,79 +528,13 @@ class HyAR(ReplayLearner):
         """
         state, discrete = batch["state"], batch["discrete"]
         z = self.codec.z_from_unit(z)
-        if self.parameter_tolerance is None:
+        if self.options.parameter_tolerance is None:
             target = (batch["next_state"] - state) / self.codec.change_scale
             error = (self.codec.change(state, discrete, z) - target).square().mean(-1)
-            return error <= self.correction_factor * self.dynamics_error
+            return error <= self.options.correction_factor * self.dynamics_error
         unit, _ = self.codec.decode(state, discrete, z)
         error = ((unit - batch["unit"]) * self.codec.mask[discrete]).abs().amax(-1)
-        return error <= self.parameter_tolerance
-
-    @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the max over the target actor's allowed proposals a of min Q'(s, a), `[B]`.
-
-        The proposals carry clipped noise.
-        """
-        allowed = self.specs.allowed(observation, action_mask)
-        proposals = self.target_actor(
-            observation, self.codec.embeddings, self.target_smoothing, self.target_smoothing_clip
-        )
-        if not self.actor.is_greedy:
-            return self.target_critics(observation, self.codec.of_allowed(proposals, allowed)).amin(0).amax(-1)
-        return masked_values(self.target_critics(observation, proposals).amin(0), allowed).amax(-1)
-
-    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""
-        raw = self.actor.raw(state)
-        proposals = self.actor.proposals(raw.tanh(), self.codec.embeddings.detach())
-        if not self.actor.is_greedy:
-            proposals = self.codec.of_allowed(proposals, allowed)
-        is_counted = allowed if self.actor.is_greedy else None
-        q = self.critics(state, proposals, num_members=1)
-        value_loss = -(q if is_counted is None else q * is_counted).sum(-1).mean()
-        loss = value_loss
-        if self.preactivation_penalty > 0.0:
-            loss = loss + self.preactivation_penalty * raw.square().sum((-2, -1)).mean()
-        if self.search_samples > 0 and self.search_weight > 0.0:
-            found, gain = self._best_of_random(state, proposals.detach(), allowed)
-            gain = gain if is_counted is None else gain * is_counted
-            distance = (raw - unsquashed(self.actor.given(found))).square().sum(-1)
-            loss = loss + self.search_weight * (gain * distance).sum(-1).mean()
-        return loss, {"actor": value_loss}
-
-    @torch.no_grad()
-    def _best_of_random(self, state: Tensor, proposals: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Return for every proposal the best of random latent actions, by the critics, and its gain.
-
-        The random ones differ from the proposal in z; where the actor gives one proposal alone, also in the discrete
-        action, one of the allowed.
-
-        Args:
-            state: `[B, observation_dim]`.
-            proposals: of the actor, `[B, P, embedding_dim + latent_dim]`.
-            allowed: bool `[B, num_discrete]`; None: all.
-
-        Returns:
-            Latent actions like the proposals, and by how much each is better than the actor's, `[B, P]`, at least 0.
-        """
-        shape = (*proposals.shape[:2], self.search_samples)
-        if self.actor.is_greedy:
-            e = proposals[..., : -self.codec.latent_dim].unsqueeze(2).expand(*shape, -1)
-        else:
-            of_tried = None if allowed is None else allowed[:, None, None].expand(*shape, -1)
-            discrete = random_choice(torch.Size(shape), self.specs.num_discrete, of_tried, state.device)
-            e = self.codec.embeddings[discrete]
-        z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device, dtype=torch.float32) - 1.0
-        num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * self.search_samples))
-        best, value = in_pieces(partial(best_of_tried, self.critics), num_rows, state, torch.cat([e, z], -1))
-        return best, (value - self.critics(state, proposals).amin(0)).clamp(min=0.0)
-
-    def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update the codec; return the parts of its loss."""
-        scalars = self.gradient_step("codec", self._codec_loss, sample)
-        self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
-        return scalars
+        return error <= self.options.parameter_tolerance
 
     def _codec_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the codec's loss and its parts."""
@@ -613,8 +545,23 @@ class HyAR(ReplayLearner):
         reconstruction = ((unit - executed).square() * self.codec.mask[discrete]).sum(-1).mean()
         divergence = -0.5 * (1.0 + log_variance - mean.square() - log_variance.exp()).sum(-1).mean()
         dynamics = F.mse_loss(change, (sample["next_state"] - state) / self.codec.change_scale)
-        loss = reconstruction + self.kl_weight * divergence + self.dynamics_weight * dynamics
+        loss = reconstruction + self.options.kl_weight * divergence + self.options.dynamics_weight * dynamics
         return loss, {"reconstruction": reconstruction, "kl": divergence, "dynamics": dynamics}
+
+    def start(self) -> None:
+        """Train the codec alone."""
+        stored = self.buffer[:]
+        self.codec.change_scale.copy_(scale_of(stored["next_state"] - stored["state"]))
+        for _ in range(self.options.codec_pretrain_updates):
+            self._update_codec(self.augmented(self.buffer.sample(self.options.batch_size)))
+        self._fit_latent_range()
+
+    def on_progress(self, steps: int) -> None:
+        """Lower the probability of random actions, and the learning rates."""
+        options = self.options
+        self.policy.epsilon.fill_(linear_schedule(steps, options.epsilon_steps, options.epsilon_final))
+        fraction = linear_schedule(steps, options.lr_steps, options.lr_final)
+        set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def _fit_latent_range(self) -> None:
         """Set the range of z to the central `latent_coverage` of the encoded stored actions."""
@@ -624,7 +571,18 @@ class HyAR(ReplayLearner):
             # Samples, not means: in a dimension that the codec does not use, all means are alike, and mapping their
             # narrow range onto [-1, 1] would blow up differences that mean nothing.
             z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
-        tail = (1.0 - self.latent_coverage) / 2.0
+        tail = (1.0 - self.options.latent_coverage) / 2.0
         low, high = z.quantile(tail, 0), z.quantile(1.0 - tail, 0)
         self.codec.z_low.copy_(low)
         self.codec.z_high.copy_(torch.maximum(high, low + 1e-3))
+
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return the rows to store, with the latent actions that the actor gave."""
+        return super().transitions(batch).set(LATENT, batch[LATENT])
+
+    def augmented(self, sample: TensorDictBase) -> TensorDictBase:
+        """Return a sample mapped by random symmetries; the latent actions are to be encoded anew."""
+        if self.symmetry is None:
+            return sample
+        mapped = self.symmetry(sample)
+        return mapped.set(LATENT, torch.full_like(mapped[LATENT], torch.nan))

@@ -33,18 +33,28 @@ the parameters, which come from a network with a target and a loss of its own.
 from __future__ import annotations
 
 import copy
-from typing import Literal
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal
 
 import torch
-from pydantic import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from pydantic import PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy, option_ends
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_critic import set_learning_rates
+from hpamdp.policies.shared.actor_search import (
+    SearchingActorOptions,
+    actor_loss,
+    even_normal,
+    in_pieces,
+    with_variations,
+)
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
 from hpamdp.policies.shared.networks import (
     HybridCritics,
@@ -52,27 +62,60 @@ from hpamdp.policies.shared.networks import (
     InitialParameters,
     InvertingGradients,
     before_tanh,
-    even_normal,
-    in_pieces,
     mlp,
     polyak_update,
     unsquashed,
     with_clipped_noise,
-    with_variations,
 )
-from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
-from hpamdp.settings import Fraction, LearningRate, PositiveFraction
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
 # Parameters, or values, of the variations that are tried at once: bounds the memory where discrete actions are many.
 _MAX_TRIED = 1 << 22
 
 
+class PDQNOptions(SearchingActorOptions):
+    """Settings of `PDQN`."""
+
+    multipass: bool = True
+    """Show the value of a discrete action its own parameters alone, as in MP-DQN; else all parameters, as in P-DQN."""
+    double_q: bool = False
+    """Choose the next action by the learned critics; the target critics evaluate it either way."""
+    n_step: PositiveInt = 1
+    """Rewards summed before bootstrapping. A sum also ends with its batch, so long sums need long batches."""
+    bounding: Literal["tanh", "inverting_gradients"] = "tanh"
+    """How the parameters are kept within their bounds."""
+    initial_parameters: InitialParameters = "domain"
+    """Initial parameters: `domain` adds the problem's own by a frozen layer, if it has any; `none` adds nothing."""
+    actor_tau: PositiveFraction = 0.01
+    """Fraction of the way to the actor that its target network moves at each actor update."""
+    critic_tau: PositiveFraction = 0.01
+    """Fraction of the way to the critics that their target networks move at each actor update."""
+    max_grad_norm: PositiveFloat | None = None
+    """Largest gradient norm of a gradient step; if null, there is no limit."""
+    epsilon_episodes: PositiveInt | None = None
+    """Episodes of the whole run within which the probability of a random action falls, in place of `epsilon_steps`."""
+
+    @model_validator(mode="after")
+    def _check_pdqn(self) -> Self:
+        if self.preactivation_penalty > 0.0 and self.bounding != "tanh":
+            raise ValueError(
+                f"preactivation_penalty={self.preactivation_penalty}: needs bounding=tanh; bounding={self.bounding!r}"
+            )
+        if self.search_samples > 0 and not self.multipass:
+            raise ValueError(
+                f"search_samples={self.search_samples}: needs multipass=true, as values else depend on other actions' "
+                "parameters"
+            )
+        return self
+
+
 class ParameterActor(nn.Module):
     """The parameters of all discrete actions: `[*B, observation_dim]` -> `[*B, num_parameters]` in [-1, 1]."""
 
     def __init__(
-        self, specs: PAMDPSpecs, hidden_dims: list[int], bounding: str, initial_parameters: InitialParameters
+        self, specs: PAMDPSpecs, hidden_dims: Sequence[int], bounding: str, initial_parameters: InitialParameters
     ) -> None:
         super().__init__()
         self.net = mlp(specs.observation_dim, hidden_dims, specs.num_parameters)
@@ -112,39 +155,21 @@ def best_of_tried(critics: HybridCritics, state: Tensor, tried: Tensor) -> tuple
 
 
 class PDQNPolicy(TensorDictModuleBase):
-    """Takes the discrete action with the highest Q; explores with random actions and noise on the parameters.
-
-    Args:
-        actor: gives the parameters.
-        critics: value them.
-        specs: of the problem.
-        noise: standard deviation of the exploring noise on the parameters in [-1, 1].
-        greedy_samples: how many variations of the parameters the greedy policy values besides the actor's own.
-        greedy_noise: standard deviation of these variations.
-    """
+    """Takes the discrete action with the highest Q; explores with random actions and noise on the parameters."""
 
     epsilon: Tensor
     variations: Tensor
 
-    def __init__(
-        self,
-        actor: ParameterActor,
-        critics: HybridCritics,
-        specs: PAMDPSpecs,
-        *,
-        noise: float,
-        greedy_samples: int,
-        greedy_noise: float,
-    ) -> None:
+    def __init__(self, actor: ParameterActor, critics: HybridCritics, specs: PAMDPSpecs, options: PDQNOptions) -> None:
         super().__init__()
         self.in_keys = [keys.OBSERVATION]
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
         self.actor = actor
         self.critics = critics
         self.specs = specs
-        self.noise = noise
+        self.noise = options.parameter_noise
         self.register_buffer("epsilon", torch.ones((), dtype=torch.float32))
-        variations = even_normal(greedy_samples, specs.num_parameters, greedy_noise)
+        variations = even_normal(options.greedy_samples, specs.num_parameters, options.greedy_noise)
         self.register_buffer("variations", variations, persistent=False)
 
     @torch.no_grad()
@@ -184,102 +209,99 @@ class PDQNPolicy(TensorDictModuleBase):
 class PDQN(ReplayLearner):
     """Q-learning over discrete actions and gradient ascent on their parameters, from a replay buffer of its own."""
 
+    Options = PDQNOptions
+
+    options: PDQNOptions
     policy: PDQNPolicy
     episodes: Tensor
 
     def __init__(
         self,
         specs: PAMDPSpecs,
-        device: torch.device,
-        *,
-        multipass: bool,
-        twin: bool,
-        double_q: bool,
-        target_smoothing: NonNegativeFloat,
-        target_smoothing_clip: NonNegativeFloat,
-        policy_delay: PositiveInt,
-        n_step: PositiveInt,
-        bounding: Literal["tanh", "inverting_gradients"],
-        initial_parameters: InitialParameters,
-        hidden_dims: list[PositiveInt],
-        layer_norm: bool,
-        warmup_steps: NonNegativeInt,
-        buffer_size: PositiveInt,
-        batch_size: PositiveInt,
-        updates_per_step: PositiveFloat,
-        augment: bool,
-        gamma: PositiveFraction,
-        reward_scale: PositiveFloat,
-        actor_lr: LearningRate,
-        critic_lr: LearningRate,
-        lr_final: PositiveFraction,
-        lr_steps: NonNegativeInt,
-        actor_tau: PositiveFraction,
-        critic_tau: PositiveFraction,
-        max_grad_norm: PositiveFloat | None,
-        preactivation_penalty: NonNegativeFloat,
-        search_samples: NonNegativeInt,
-        search_weight: NonNegativeFloat,
-        parameter_noise: NonNegativeFloat,
-        greedy_samples: NonNegativeInt,
-        greedy_noise: NonNegativeFloat,
-        epsilon_final: Fraction,
-        epsilon_steps: NonNegativeInt,
-        epsilon_episodes: PositiveInt | None,
+        device: torch.device | str = "cpu",
+        options: PDQNOptions | None = None,
+        **settings: Any,
     ) -> None:
-        if preactivation_penalty > 0.0 and bounding != "tanh":
-            raise ValueError(f"preactivation_penalty={preactivation_penalty}: needs bounding=tanh; {bounding=}")
-        if search_samples > 0 and not multipass:
-            raise ValueError(
-                f"{search_samples=}: needs multipass=true, as values else depend on other actions' parameters"
-            )
-        options = ReplayOptions(
-            gamma=gamma,
-            warmup_steps=warmup_steps,
-            buffer_size=buffer_size,
-            batch_size=batch_size,
-            updates_per_step=updates_per_step,
-            augment=augment,
-        )
+        options = PDQNOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.stores_own_parameters = multipass
-        self.double_q = double_q
-        self.target_smoothing = target_smoothing
-        self.target_smoothing_clip = target_smoothing_clip
-        self.policy_delay = policy_delay
-        self.n_step = n_step
-        self.learning_rates = {"actor": actor_lr, "critics": critic_lr}
-        self.lr_final = lr_final
-        self.lr_steps = lr_steps
-        self.actor_tau = actor_tau
-        self.critic_tau = critic_tau
-        self.max_grad_norm = max_grad_norm
-        self.preactivation_penalty = preactivation_penalty
-        self.search_samples = search_samples
-        self.search_weight = search_weight
-        self.reward_scale = reward_scale
-        self.epsilon_final = epsilon_final
-        self.epsilon_steps = epsilon_steps
-        self.epsilon_episodes = epsilon_episodes
+        self.stores_own_parameters = options.multipass
+        self.reward_scale = options.reward_scale
+        self.max_grad_norm = options.max_grad_norm
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
 
-        self.actor = ParameterActor(specs, hidden_dims, bounding, initial_parameters)
-        self.critics = HybridCritics(specs, 2 if twin else 1, hidden_dims, multipass, layer_norm=layer_norm)
+        dims = options.hidden_dims
+        self.actor = ParameterActor(specs, dims, options.bounding, options.initial_parameters)
+        self.critics = HybridCritics(
+            specs, 2 if options.twin else 1, dims, options.multipass, layer_norm=options.layer_norm
+        )
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = PDQNPolicy(
-            self.actor,
-            self.critics,
-            specs,
-            noise=parameter_noise,
-            greedy_samples=greedy_samples,
-            greedy_noise=greedy_noise,
-        )
+        self.policy = PDQNPolicy(self.actor, self.critics, specs, options)
         self.to(device)
+        self.learning_rates = {"actor": options.actor_lr, "critics": options.critic_lr}
         self.optimizers = {
-            "actor": torch.optim.Adam(self.actor.parameters(), lr=actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=critic_lr, fused=True),
+            "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
+            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
         }
+
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
+        scalars = self.gradient_step("critics", self._critic_loss, sample)
+        scalars["epsilon"] = self.policy.epsilon
+        if self.updates % self.options.policy_delay == 0:
+            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            polyak_update(self.target_actor, self.actor, self.options.actor_tau)
+            polyak_update(self.target_critics, self.critics, self.options.critic_tau)
+        return scalars
+
+    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the squared distance of Q(s, k, x) from r + discount * V(s'), where V is `value`."""
+        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
+        loss = (q - self.target(sample)).square().mean(-1).sum()
+        return loss, {"critic": loss, "q": q.mean()}
+
+    @torch.no_grad()
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`.
+
+        With `double_q`, the learned critics choose k instead of the target critics.
+        """
+        smoothing = self.options.target_smoothing, self.options.target_smoothing_clip
+        unit = with_clipped_noise(self.target_actor(observation), *smoothing)
+        q = self.target_critics(observation, unit).amin(0)
+        choosing_q = self.critics(observation, unit).amin(0) if self.options.double_q else q
+        choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
+        return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
+
+    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the loss that falls with the sum of the allowed discrete actions' values."""
+        raw = self.actor.raw(state)
+        q = self.critics(state, self.actor.bounded(raw)).amin(0)
+        value = (q if allowed is None else q * allowed).sum(-1)
+        loss = actor_loss(self.options, value, raw, partial(self._search, state, raw, q, allowed))
+        return loss, {"actor": -value.mean()}
+
+    def _search(self, state: Tensor, raw: Tensor, q: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Find for every discrete action the best of random parameters, by the critics.
+
+        Args:
+            state: `[B, observation_dim]`.
+            raw: the actor's parameters there, before they are bounded, `[B, num_parameters]`.
+            q: their values, `[B, num_discrete]`.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
+
+        Returns:
+            For each parameter, by how much the best of its discrete action is better than the actor's, at least 0, and
+            the squared distance to it, `[B, num_parameters]` each.
+        """
+        shape = len(state), self.options.search_samples, self.specs.num_parameters
+        with torch.no_grad():
+            tried = 2.0 * torch.rand(shape, device=state.device, dtype=torch.float32) - 1.0
+            best, place = best_of_tried(self.critics, state, tried)
+            found = tried.gather(1, place[:, self.owner].unsqueeze(1)).squeeze(1)
+            gain = (best - q).clamp(min=0.0)
+            gain = gain if allowed is None else gain * allowed
+        return gain[:, self.owner], (raw - self.actor.unbounded(found)).square()
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Store the batch's transitions, count its episodes; after the warm-up, make the updates that are due."""
@@ -287,19 +309,21 @@ class PDQN(ReplayLearner):
         return super().learn(batch, mask)
 
     def on_progress(self, steps: int) -> None:
-        """Lower the fraction of random actions and the learning rates."""
-        time, over = steps, self.epsilon_steps
-        if self.epsilon_episodes is not None:
-            time, over = int(self.episodes), self.epsilon_episodes
-        self.policy.epsilon.fill_(linear_schedule(time, over, self.epsilon_final))
-        set_learning_rates(self.optimizers, self.learning_rates, linear_schedule(steps, self.lr_steps, self.lr_final))
+        """Lower the probability of random actions, and the learning rates."""
+        options = self.options
+        time, over = steps, options.epsilon_steps
+        if options.epsilon_episodes is not None:
+            time, over = int(self.episodes), options.epsilon_episodes
+        self.policy.epsilon.fill_(linear_schedule(time, over, options.epsilon_final))
+        fraction = linear_schedule(steps, options.lr_steps, options.lr_final)
+        set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return every row with its n-step return, the state that follows and the discount of that state's value."""
         rows = super().transitions(batch)
         done = option_ends(batch).squeeze(-1)
         terminated = batch["next", keys.TERMINATED].squeeze(-1)
-        reward, last = n_step_returns(rows["reward"], done, self.n_step, self.options.gamma)
+        reward, last = n_step_returns(rows["reward"], done, self.options.n_step, self.options.gamma)
         num_rewards = last - torch.arange(done.shape[-1], device=last.device) + 1
         next_state = rows["next_state"]
         rows["reward"] = reward
@@ -312,70 +336,6 @@ class PDQN(ReplayLearner):
             mask = rows["next_action_mask"]
             rows["next_action_mask"] = mask.gather(-2, last.unsqueeze(-1).expand_as(mask))
         return rows
-
-    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
-        scalars = self.gradient_step("critics", self._critic_loss, sample)
-        scalars["epsilon"] = self.policy.epsilon
-        if self.updates % self.policy_delay == 0:
-            scalars |= self._update_actor(sample["state"], self.allowed(sample))
-            polyak_update(self.target_actor, self.actor, self.actor_tau)
-            polyak_update(self.target_critics, self.critics, self.critic_tau)
-        return scalars
-
-    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the squared distance from the targets, and scalars."""
-        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
-        loss = (q - self.target(sample)).square().mean(-1).sum()
-        return loss, {"critic": loss, "q": q.mean()}
-
-    def _update_actor(self, state: Tensor, allowed: Tensor | None) -> dict[str, Tensor]:
-        """Update the actor to increase the sum of the allowed discrete actions' values; return the loss."""
-        return self.gradient_step("actor", self._actor_loss, state, allowed)
-
-    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
-        raw = self.actor.raw(state)
-        q = self.critics(state, self.actor.bounded(raw)).amin(0)
-        value_loss = -(q if allowed is None else q * allowed).sum(-1).mean()
-        loss = value_loss
-        if self.preactivation_penalty > 0.0:
-            loss = loss + self.preactivation_penalty * raw.square().sum(-1).mean()
-        if self.search_samples > 0 and self.search_weight > 0.0:
-            found, gain = self._best_of_random(state, q)
-            gain = gain if allowed is None else gain * allowed
-            distance = (raw - self.actor.unbounded(found)).square()
-            loss = loss + self.search_weight * (gain[:, self.owner] * distance).sum(-1).mean()
-        return loss, {"actor": value_loss}
-
-    @torch.no_grad()
-    def _best_of_random(self, state: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-        """Return for every discrete action the best of random parameters, by the critics, and its gain.
-
-        Args:
-            state: `[B, observation_dim]`.
-            q: values of the actor's parameters there, `[B, num_discrete]`.
-
-        Returns:
-            Parameters `[B, num_parameters]` in [-1, 1], and by how much each discrete action is better with its own of
-            them than with the actor's, `[B, num_discrete]`, at least 0.
-        """
-        shape = len(state), self.search_samples, self.specs.num_parameters
-        tried = 2.0 * torch.rand(shape, device=state.device, dtype=torch.float32) - 1.0
-        best, place = best_of_tried(self.critics, state, tried)
-        found = tried.gather(1, place[:, self.owner].unsqueeze(1)).squeeze(1)
-        return found, (best - q).clamp(min=0.0)
-
-    @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`.
-
-        With `double_q`, the learned critics choose k instead of the target critics.
-        """
-        unit = with_clipped_noise(self.target_actor(observation), self.target_smoothing, self.target_smoothing_clip)
-        q = self.target_critics(observation, unit).amin(0)
-        choosing_q = self.critics(observation, unit).amin(0) if self.double_q else q
-        choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
-        return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
 
 
 def n_step_returns(reward: Tensor, done: Tensor, n: int, gamma: float) -> tuple[Tensor, Tensor]:

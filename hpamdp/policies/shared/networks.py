@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
-from torch.quasirandom import SobolEngine
 
 from hpamdp.specs import PAMDPSpecs
 
@@ -117,34 +116,6 @@ def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
         return unit
     noise = (scale * torch.randn_like(unit)).clamp(-clip, clip)
     return (unit + noise).clamp(-1.0, 1.0)
-
-
-def even_normal(num: int, dim: int, deviation: float) -> Tensor:
-    """Return normal vectors `[num, dim]` with mean 0, the same at each call, that cover the space evenly.
-
-    Raises:
-        ValueError: there are too many dimensions.
-    """
-    if num == 0 or dim == 0:
-        return torch.zeros(num, dim, dtype=torch.float32)
-    if dim > SobolEngine.MAXDIM:
-        raise ValueError(
-            f"greedy_samples={num}: {dim} parameters are more than {SobolEngine.MAXDIM}; use greedy_samples=0"
-        )
-    uniform = SobolEngine(dim, scramble=True, seed=0).draw(num, dtype=torch.float32)
-    return deviation * torch.special.ndtri(uniform.clamp(1e-6, 1.0 - 1e-6))
-
-
-def with_variations(unit: Tensor, variations: Tensor) -> Tensor:
-    """Return actions in [-1, 1], `[*B, D]`, and behind each its sums with the variations `[S, D]`: `[*B, 1 + S, D]`."""
-    unit = unit.unsqueeze(-2)
-    return torch.cat([unit, (unit + variations).clamp(-1.0, 1.0)], -2)
-
-
-def in_pieces(function: Callable[..., tuple[Tensor, ...]], num_rows: int, *rows: Tensor) -> tuple[Tensor, ...]:
-    """Return what a function makes of rows, each `[N, ...]`, given to it `num_rows` at a time: bounds the memory."""
-    pieces = [function(*piece) for piece in zip(*(each.split(num_rows) for each in rows), strict=True)]
-    return tuple(torch.cat(made) for made in zip(*pieces, strict=True))
 
 
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
