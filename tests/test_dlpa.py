@@ -9,8 +9,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.env.boatdock import episode, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.policies.low_level.dlpa import DLPA, Plan, Planner
-from hpamdp.policies.low_level.dlpa_model import PAMDPModel
+from hpamdp.policies.low_level.dlpa.learner import DLPA
+from hpamdp.policies.low_level.dlpa.model import PAMDPModel
+from hpamdp.policies.low_level.dlpa.planner import Plan, Planner
 from hpamdp.policies.shared.planning import Prediction
 from hpamdp.specs import PAMDPSpecs
 

@@ -16,7 +16,8 @@ from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.geometry import Symmetries, plane_maps
-from hpamdp.policies.shared.frame import CanonicalFrame, RandomSymmetry
+from hpamdp.policies.shared.canonical_frame import CanonicalFrame
+from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.specs import PAMDPSpecs
 
 NUM = 300

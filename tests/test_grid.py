@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from hpamdp.config import ConfigError
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.policies.shared.frame import RandomSymmetry
+from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.state_checks import example_steps

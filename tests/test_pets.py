@@ -8,8 +8,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from hpamdp import keys
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
-from hpamdp.policies.low_level.pets import MEMBER, PETS
-from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.low_level.pets.learner import PETS
+from hpamdp.policies.low_level.pets.policy import MEMBER
+from hpamdp.policies.shared.end_values import EndValueOptions, EndValues
 from hpamdp.policies.shared.planning import Found, Prediction, SequenceSearch, discounted_return, elite_weights
 from hpamdp.policies.shared.scales import scale_of
 from hpamdp.specs import PAMDPSpecs
@@ -133,7 +134,7 @@ def test_the_smallest_deviation_falls_from_iteration_to_iteration():
 
 
 def test_a_smallest_deviation_that_rises_is_refused():
-    with pytest.raises(ValueError, match=r"min_deviation=0.3, but must be at most first_min_deviation=0.2"):
+    with pytest.raises(ValueError, match=r"min_deviation=0.3: must be at most first_min_deviation=0.2"):
         make(min_deviation=0.3)
 
 
@@ -609,7 +610,7 @@ def test_actions_lie_in_their_bounds():
 
 
 def test_more_elites_than_samples_are_refused():
-    with pytest.raises(ValueError, match="num_elites=20, but must be at most num_samples=16"):
+    with pytest.raises(ValueError, match="num_elites=20: must be at most num_samples=16"):
         make(num_elites=20)
     with pytest.raises(ValueError, match="num_elites=12, but must be at most greedy_samples=8"):
         make(num_elites=12, greedy_samples=8)
@@ -657,8 +658,8 @@ def test_the_copies_of_a_policy_get_the_weights_of_its_end_values():
 @pytest.mark.parametrize(("expectile", "expected"), [(0.5, 0.5), (0.9, 0.9)])
 def test_values_are_expectiles_of_what_the_stored_actions_led_to(expectile, expected):
     torch.manual_seed(0)
-    values = EndValues(2, [16], tau=0.5, expectile=expectile)
-    optimizer = torch.optim.Adam(values.learned(), lr=1e-2)
+    values = EndValues(2, [16], EndValueOptions(end_value_lr=1e-2, end_value_tau=0.5, end_value_expectile=expectile))
+    optimizer = values.optimizer()
     state = torch.rand(256, 2)
     reward = (torch.arange(256) % 2).float()
     for _ in range(200):

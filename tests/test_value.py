@@ -12,7 +12,7 @@ from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.high_level.value import Value
-from hpamdp.policies.low_level.pets import PETS
+from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")

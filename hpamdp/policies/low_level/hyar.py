@@ -124,8 +124,6 @@ class HyAROptions(TargetRateOptions, SearchingActorOptions):
 
     The means lie on a line in the latent space. Off that line, where the actor goes, only samples teach the critics.
     """
-    buffer_size: PositiveInt = 300_000
-    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     lr_final: PositiveFraction = 0.1
     """Fraction of the three learning rates that is left at the end; 1 keeps them constant."""
     epsilon_steps: NonNegativeInt = 15_000

@@ -11,7 +11,7 @@ Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -20,6 +20,24 @@ from torch import Tensor, nn
 from hpamdp.policies.shared.gradients import expectile_loss
 from hpamdp.policies.shared.networks import mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.settings import Expectile, LearningRate, PositiveFraction, Settings
+
+
+class EndValueOptions(Settings):
+    """Settings of the values at the ends of plans."""
+
+    end_values: bool = False
+    """Let plans count the value of their last state, by networks that learn it from the stored steps.
+
+    Set it if options end inside episodes, and for `high=value`: a plan of one option does not see the rewards of the
+    next one. Set it also if all rewards are the same and the terminations are further away than the horizon.
+    """
+    end_value_lr: LearningRate = 1e-3
+    """Learning rate of these values."""
+    end_value_tau: PositiveFraction = 0.02
+    """Fraction of the way to the learned values that their target network moves at each update."""
+    end_value_expectile: Expectile = 0.9
+    """Expectile of the returns that stored actions led to, from 0.5, their mean, towards 1, the best of them."""
 
 
 class EndValues(nn.Module):
@@ -33,14 +51,12 @@ class EndValues(nn.Module):
     Args:
         observation_dim: of the states.
         hidden_dims: of both networks.
-        tau: rate at which the target network of the former follows, at each update.
-        expectile: of what the stored actions led to, from .5, their mean, towards 1, the best of them.
+        options: their learning rate, the rate of the target network and the expectile.
     """
 
-    def __init__(self, observation_dim: int, hidden_dims: Sequence[int], *, tau: float, expectile: float) -> None:
+    def __init__(self, observation_dim: int, hidden_dims: Sequence[int], options: EndValueOptions) -> None:
         super().__init__()
-        self.tau = tau
-        self.expectile = expectile
+        self.options = options
         self.own = mlp(observation_dim, hidden_dims, 1)
         self.end = mlp(observation_dim, hidden_dims, 1)
         self.target_own = copy.deepcopy(self.own).requires_grad_(False)
@@ -67,14 +83,14 @@ class EndValues(nn.Module):
             next_value: of the next states under the option that follows, `[B]`.
         """
         excess = reward + discount * next_value - self.own(state).squeeze(-1)
-        own = expectile_loss(excess, self.expectile)
+        own = expectile_loss(excess, self.options.end_value_expectile)
         end = ((self(next_state) - next_value).square() * (discount > 0.0)).mean()
         return own + end, {"own_value": own, "end_value": end}
 
-    def learned(self) -> Iterator[nn.Parameter]:
-        """Yield the parameters that the optimizer changes."""
-        yield from self.own.parameters()
-        yield from self.end.parameters()
+    def optimizer(self) -> torch.optim.Optimizer:
+        """Return the optimizer of the learned networks, which is the learner's optimizer `end_values`."""
+        learned = [*self.own.parameters(), *self.end.parameters()]
+        return torch.optim.Adam(learned, lr=self.options.end_value_lr, fused=True)
 
     def update(
         self, learner: ReplayLearner, rows: TensorDictBase, state: Tensor, next_state: Tensor
@@ -90,5 +106,5 @@ class EndValues(nn.Module):
             next_value = learner.next_value(rows)
         inputs = state, next_state, rows["reward"], rows["discount"], next_value
         scalars = learner.gradient_step("end_values", self.loss, *inputs)
-        polyak_update(self.target_own, self.own, self.tau)
+        polyak_update(self.target_own, self.own, self.options.end_value_tau)
         return scalars

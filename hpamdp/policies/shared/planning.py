@@ -3,15 +3,85 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 from torch import Tensor
+from typing_extensions import Self
 
 from hpamdp.policies.masks import random_choice
+from hpamdp.settings import Settings
 
 # Of a sequence with a forbidden action: finite, so that the weights of the elites are numbers.
 _FORBIDDEN_RETURN = -1e9
+
+
+class SearchOptions(Settings):
+    """Settings of a search for good sequences of actions. Deviations are in units where the bounds are [-1, 1]."""
+
+    horizon: PositiveInt = 2
+    """Steps in a sequence: a plan sees no reward and no termination beyond them."""
+    num_samples: PositiveInt = 256
+    """Samples in an iteration."""
+    num_elites: PositiveInt = 32
+    """The best of the samples, which define the next iteration's distribution."""
+    num_iterations: PositiveInt = 5
+    """Iterations of the search."""
+    temperature: PositiveFloat = 0.1
+    """Elites are weighted by exp(return / temperature)."""
+    min_deviation: NonNegativeFloat = 0.02
+    """Smallest standard deviation of a parameter."""
+
+    def _check_search(self, numbers: dict[str, int], tried: str) -> None:
+        """Refuse more elites than one of the numbers of samples, and searches that try too many actions.
+
+        Args:
+            numbers: of samples, by the name of the setting.
+            tried: names of the settings whose product is the number of actions, apart from the samples.
+        """
+        for name, number in numbers.items():
+            if self.num_elites > number:
+                raise ValueError(f"num_elites={self.num_elites}: must be at most {name}={number}")
+        factors = {name: getattr(self, name) for name in tried.split()}
+        total = max(numbers.values())
+        for factor in factors.values():
+            total *= factor
+        if total > 1_000_000_000:
+            given = ", ".join(f"{name}={value}" for name, value in (factors | numbers).items())
+            raise ValueError(f"{given}: a plan would try more than 1,000,000,000 actions")
+
+
+class SequenceSearchOptions(SearchOptions):
+    """Settings of a `SequenceSearch`."""
+
+    max_sequences: PositiveInt = 64
+    """Largest number of discrete sequences tried: all of them if there are no more, else random ones."""
+    num_kept: PositiveInt = 4
+    """Sequences refined in the second iteration; half as many in each one after it, down to 1."""
+    num_samples: PositiveInt = 12
+    """Samples of the parameters for each sequence in an iteration."""
+    greedy_samples: PositiveInt = 60
+    """The same in a greedy plan, where nothing makes up for a plan that is not the best."""
+    num_elites: PositiveInt = 4
+    """The best of the samples, which define the next iteration's Gaussians."""
+    first_min_deviation: NonNegativeFloat = 0.3
+    """Smallest standard deviation of a parameter in the second iteration; it falls geometrically from there.
+
+    The shortest step that reaches a target lies at a cliff of the return, which elites alone approach too slowly.
+    """
+    min_deviation: NonNegativeFloat = 0.04
+    """Smallest standard deviation of a parameter in the last iteration."""
+
+    @model_validator(mode="after")
+    def _check_sequences(self) -> Self:
+        numbers = {"num_samples": self.num_samples, "greedy_samples": self.greedy_samples}
+        self._check_search(numbers, "horizon max_sequences num_iterations")
+        if self.min_deviation > self.first_min_deviation:
+            raise ValueError(
+                f"min_deviation={self.min_deviation}: must be at most first_min_deviation={self.first_min_deviation}"
+            )
+        return self
 
 
 class Prediction(NamedTuple):
@@ -101,71 +171,26 @@ class SequenceSearch:
 
     Args:
         parameter_dims: number of parameters of each discrete action.
-        horizon: number of steps in a sequence.
-        max_sequences: largest number of discrete sequences tried.
-        num_kept: number of sequences in the second iteration; half as many in each one after it, down to 1.
-        num_samples: parameter samples for each sequence in an iteration.
-        greedy_samples: the same in a greedy plan.
-        num_elites: number of the best of them that define the next iteration's Gaussians.
-        num_iterations: number of iterations, the first one included.
-        temperature: of the elites' weights exp(return / temperature).
-        first_min_deviation: smallest standard deviation of a parameter in the second iteration, in [-1, 1] units.
-        min_deviation: the same in the last iteration. In between it falls geometrically.
-
-    Raises:
-        ValueError: more elites than samples, deviations that rise, or a search that would try more than 1,000,000,000
-            actions.
+        options: the settings; single ones may be given by their names.
     """
 
     def __init__(
-        self,
-        parameter_dims: tuple[int, ...],
-        *,
-        horizon: int,
-        max_sequences: int,
-        num_kept: int,
-        num_samples: int,
-        greedy_samples: int,
-        num_elites: int,
-        num_iterations: int,
-        temperature: float,
-        first_min_deviation: float,
-        min_deviation: float,
+        self, parameter_dims: tuple[int, ...], options: SequenceSearchOptions | None = None, **settings: Any
     ) -> None:
-        for name, number in {"num_samples": num_samples, "greedy_samples": greedy_samples}.items():
-            if num_elites > number:
-                raise ValueError(f"num_elites={num_elites}, but must be at most {name}={number}")
-        if min_deviation > first_min_deviation:
-            raise ValueError(f"min_deviation={min_deviation}, but must be at most {first_min_deviation=}")
-        if horizon * max_sequences * max(num_samples, greedy_samples) * num_iterations > 1e9:
-            raise ValueError(
-                f"horizon={horizon}, max_sequences={max_sequences}, num_samples={num_samples}, "
-                f"greedy_samples={greedy_samples}, num_iterations={num_iterations}: a plan would try more than "
-                "1,000,000,000 actions"
-            )
+        self.options: SequenceSearchOptions = SequenceSearchOptions.of(options, settings)
         self.num_discrete = len(parameter_dims)
-        self.horizon = horizon
-        self.max_sequences = max_sequences
-        self.num_kept = num_kept
-        self.num_samples = num_samples
-        self.greedy_samples = greedy_samples
-        self.num_elites = num_elites
-        self.num_iterations = num_iterations
-        self.temperature = temperature
-        self.first_min_deviation = first_min_deviation
-        self.min_deviation = min_deviation
         own = torch.arange(max(parameter_dims)) < torch.tensor(parameter_dims).unsqueeze(-1)
         self.has_slot = own.float()  # [num_discrete, D]
 
     @property
     def tries_all(self) -> bool:
         """Whether the first iteration tries every sequence of discrete actions."""
-        return self.num_discrete**self.horizon <= self.max_sequences
+        return self.num_discrete**self.options.horizon <= self.options.max_sequences
 
     @property
     def num_sequences(self) -> int:
         """How many sequences the first iteration tries."""
-        return min(self.max_sequences, self.num_discrete**self.horizon)
+        return min(self.options.max_sequences, self.num_discrete**self.options.horizon)
 
     def sequences(self, num_states: int, device: torch.device, allowed: Tensor | None = None) -> list[Tensor]:
         """Return the discrete actions of the first iteration's sequences, int64 `[N, Q_h]` for each step.
@@ -175,8 +200,8 @@ class SequenceSearch:
         """
         if self.tries_all:
             each = torch.arange(self.num_discrete, device=device)
-            return [each.repeat(self.num_discrete**h).expand(num_states, -1) for h in range(self.horizon)]
-        shape = self.horizon, num_states, self.num_sequences
+            return [each.repeat(self.num_discrete**h).expand(num_states, -1) for h in range(self.options.horizon)]
+        shape = self.options.horizon, num_states, self.num_sequences
         sampled = torch.randint(self.num_discrete, shape, device=device)
         begin = torch.randint(self.num_discrete, (num_states, 1), device=device)
         sampled[0] = (begin + torch.arange(self.num_sequences, device=device)) % self.num_discrete
@@ -196,7 +221,7 @@ class SequenceSearch:
 
     def samples_of_a_sequence(self, is_greedy: bool) -> int:
         """Return how many samples of the parameters each sequence has in an iteration."""
-        return self.greedy_samples if is_greedy else self.num_samples
+        return self.options.greedy_samples if is_greedy else self.options.num_samples
 
     def __call__(
         self,
@@ -226,11 +251,11 @@ class SequenceSearch:
             mask = has_slot[number].unsqueeze(2)
             shape = *number.shape, num_samples, has_slot.shape[-1]
             steps.append(SequenceStep(number, (2.0 * _stratified(shape, device) - 1.0) * mask))
-        is_last = self.num_iterations == 1
+        is_last = self.options.num_iterations == 1
         value = returns(steps) if first_returns is None or is_last else first_returns(steps)
         is_allowed = None if allowed is None else self._are_allowed(steps, allowed)
         value = _without_forbidden(value, is_allowed)
-        kept = self._best_sequences(value, self.num_kept)
+        kept = self._best_sequences(value, self.options.num_kept)
         value = value.take_along_dim(kept.unsqueeze(-1), 1)
         is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
         # From here on [N, Q, H] and [N, Q, S, H, D], with Q sequences kept.
@@ -239,9 +264,9 @@ class SequenceSearch:
         discrete = torch.stack([step.discrete.gather(1, prefix) for step, prefix in parts], -1)
         row = torch.arange(num_states, device=device)
         unit = torch.stack([step.own[row.unsqueeze(-1), prefix] for step, prefix in parts], -2)
-        for refinement in range(self.num_iterations - 1):
+        for refinement in range(self.options.num_iterations - 1):
             if refinement > 0:
-                kept = self._best_sequences(value, self.num_kept >> refinement)
+                kept = self._best_sequences(value, self.options.num_kept >> refinement)
                 value = value.take_along_dim(kept.unsqueeze(-1), 1)
                 is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
                 discrete = discrete.take_along_dim(kept.unsqueeze(-1), 1)
@@ -253,7 +278,7 @@ class SequenceSearch:
             unit[:, :, -1] = mean
             unit[:, :, 0] = best
             unit = unit.clamp_(-1.0, 1.0) * has_slot[discrete].unsqueeze(2)
-            value = returns([SequenceStep(discrete[..., h], unit[..., h, :]) for h in range(self.horizon)])
+            value = returns([SequenceStep(discrete[..., h], unit[..., h, :]) for h in range(self.options.horizon)])
             value = _without_forbidden(value, is_allowed)
         best_value, place = value.amax(-1).max(-1)
         return Found(discrete[row, place, 0], _best_samples(value, unit)[row, place, 0], best_value)
@@ -265,12 +290,12 @@ class SequenceSearch:
 
     def _lower_bound(self, refinement: int) -> float:
         """Return the smallest deviation in a refinement, counted from 0."""
-        share = refinement / max(1, self.num_iterations - 2)
-        return self.first_min_deviation ** (1.0 - share) * self.min_deviation**share
+        fraction = refinement / max(1, self.options.num_iterations - 2)
+        return self.options.first_min_deviation ** (1.0 - fraction) * self.options.min_deviation**fraction
 
     def _gaussians(self, value: Tensor, unit: Tensor, lower_bound: float) -> tuple[Tensor, Tensor]:
         """Return mean and deviation `[N, Q, H, D]` of the elites, of returns `[N, Q, S]` of `[N, Q, S, H, D]`."""
-        place, weight = elite_weights(value, self.num_elites, self.temperature)
+        place, weight = elite_weights(value, self.options.num_elites, self.options.temperature)
         elites = unit.take_along_dim(place[..., None, None], 2)
         weight = weight[..., None, None]
         mean = (weight * elites).sum(2)

@@ -16,8 +16,8 @@ from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import Learner
-from hpamdp.policies.shared.frame import RandomSymmetry
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
+from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.settings import PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
 

@@ -1,9 +1,11 @@
 """The learned model of DLPA: transition, reward and termination under parameterised actions.
 
-Source: Zhang, Fu, Miao and Konidaris, 2024, arXiv 2404.03037, section 4. See `dlpa.py` for what differs.
+Source: Zhang, Fu, Miao and Konidaris, 2024, arXiv 2404.03037, section 4. See `learner.py` for what differs.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -30,7 +32,9 @@ class Predictor(nn.Module):
     mask: Tensor
     slots: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, form: str, num_members: int, hidden_dims: list[int], out_dim: int) -> None:
+    def __init__(
+        self, specs: PAMDPSpecs, form: str, num_members: int, hidden_dims: Sequence[int], out_dim: int
+    ) -> None:
         super().__init__()
         self.form = form
         self.num_discrete = specs.num_discrete
@@ -61,7 +65,7 @@ class PAMDPModel(nn.Module):
     state_scale: Tensor
     change_scale: Tensor
 
-    def __init__(self, specs: PAMDPSpecs, form: str, hidden_dims: list[int], num_members: int) -> None:
+    def __init__(self, specs: PAMDPSpecs, form: str, hidden_dims: Sequence[int], num_members: int) -> None:
         super().__init__()
         self.transition = Predictor(specs, form, 1, hidden_dims, specs.observation_dim)
         self.outcome = Predictor(specs, form, num_members, hidden_dims, 3)

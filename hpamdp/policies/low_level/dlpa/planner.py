@@ -1,0 +1,154 @@
+"""The planner of DLPA: model predictive path integral control, extended to parameterised actions.
+
+Source: Zhang, Fu, Miao and Konidaris, 2024, arXiv 2404.03037, section 4; Williams et al. 2015, arXiv 1509.01149. See
+`learner.py` for what differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, NamedTuple
+
+import torch
+from pydantic import Field, NonNegativeFloat, model_validator
+from torch import Tensor
+from torch.nn import functional as F
+from typing_extensions import Self
+
+from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
+from hpamdp.policies.shared.planning_policy import PlanningOptions
+from hpamdp.specs import PAMDPSpecs
+
+_CHUNK_ROWS = 4096  # states predicted at once when planning: fits the cache and bounds the memory
+
+
+class PlannerOptions(PlanningOptions):
+    """Settings of a `Planner`."""
+
+    momentum: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
+    """Weight of the old distribution in the new one."""
+    pessimism: NonNegativeFloat = 0.0
+    """Standard deviations between the members' returns that are subtracted from their mean.
+
+    With two members, 1 gives their minimum.
+    """
+
+    @model_validator(mode="after")
+    def _check_planner(self) -> Self:
+        self._check_search({"num_samples": self.num_samples}, "horizon num_iterations")
+        return self
+
+
+class Plan(NamedTuple):
+    """A distribution over action sequences: at each step a categorical and a Gaussian for each parameter."""
+
+    probability: Tensor  # [N, H, num_discrete]
+    mean: Tensor  # [N, H, num_parameters] in [-1, 1]
+    deviation: Tensor  # [N, H, num_parameters]
+
+
+class Planner:
+    """Find good action sequences in a model by iterated sampling, weighting the best more.
+
+    Args:
+        model: maps states, discrete actions and parameters in [-1, 1] to a `Prediction`.
+        specs: of the problem.
+        options: the settings; single ones may be given by their names.
+        end_value: maps the last state of a plan `[B, observation_dim]` to its value, `[B]`; None: nothing.
+    """
+
+    def __init__(
+        self,
+        model: Callable[[Tensor, Tensor, Tensor], Prediction],
+        specs: PAMDPSpecs,
+        options: PlannerOptions | None = None,
+        end_value: Callable[[Tensor], Tensor] | None = None,
+        **settings: Any,
+    ) -> None:
+        self.options: PlannerOptions = PlannerOptions.of(options, settings)
+        self.model = model
+        self.specs = specs
+        self.end_value = end_value
+        self.precision: torch.dtype = getattr(torch, self.options.planning_precision)
+
+    @torch.no_grad()
+    def plan(self, state: Tensor, action_mask: Tensor | None = None) -> Plan:
+        """Return the final distributions for states `[N, observation_dim]`.
+
+        Args:
+            state: where the plans begin.
+            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything. What it will
+                allow in predicted states is unknown, and taken to be everything.
+        """
+        size = max(1, _CHUNK_ROWS // self.options.num_samples)
+        masks = [None] * len(state) if action_mask is None else action_mask.split(size)
+        plans = [self._plan(rows, mask) for rows, mask in zip(state.split(size), masks, strict=False)]
+        return Plan(*(torch.cat(parts) for parts in zip(*plans, strict=True)))
+
+    def _plan(self, state: Tensor, action_mask: Tensor | None) -> Plan:
+        shape = state.shape[0], self.options.horizon
+        probability = state.new_full((*shape, self.specs.num_discrete), 1.0 / self.specs.num_discrete)
+        later = self.specs.allowed(state)
+        if later is not None:
+            probability = probability * later.unsqueeze(1)
+        if action_mask is not None:
+            probability[:, 0] *= action_mask
+        if later is not None or action_mask is not None:
+            # The iterations never leave these actions: what is not sampled is no elite.
+            probability = probability / probability.sum(-1, keepdim=True)
+        mean = state.new_zeros(*shape, self.specs.num_parameters)
+        plan = Plan(probability, mean, torch.ones_like(mean))
+        for _ in range(self.options.num_iterations):
+            discrete, unit = self.sample(plan)
+            plan = self.re_estimate(plan, discrete, unit, self.returns(state, discrete, unit))
+        return plan
+
+    def sample(self, plan: Plan) -> tuple[Tensor, Tensor]:
+        """Sample discrete actions `[N, S, H]` and parameters `[N, S, H, num_parameters]` in [-1, 1]."""
+        discrete = plan.probability.flatten(0, 1).multinomial(self.options.num_samples, replacement=True)
+        discrete = discrete.unflatten(0, plan.probability.shape[:2]).transpose(1, 2)
+        noise = torch.randn(*discrete.shape, self.specs.num_parameters, device=discrete.device, dtype=torch.float32)
+        unit = plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise
+        return discrete, unit.clamp(-1.0, 1.0)
+
+    def returns(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
+        """Return the predicted returns `[N, S]` of action sequences from states `[N, observation_dim]`."""
+        rows = state.repeat_interleave(discrete.shape[1], 0)
+
+        def steps() -> Iterator[Prediction]:
+            nonlocal rows
+            for h in range(discrete.shape[2]):
+                with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
+                    predicted = self.model(rows, discrete[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
+                rows = predicted.next_state
+                yield predicted
+
+        total = discounted_return(steps(), self.options.gamma, self.end_value)
+        value = total.mean(0)
+        if self.options.pessimism > 0.0:
+            value = value - self.options.pessimism * total.std(0, correction=0)
+        return value.unflatten(0, discrete.shape[:2])
+
+    def re_estimate(self, plan: Plan, discrete: Tensor, unit: Tensor, returns: Tensor) -> Plan:
+        """Return the distribution of the elites.
+
+        The parameters of a discrete action are estimated from the elites that choose it; they stay as they were if
+        there are none.
+        """
+        options = self.options
+        elite, elite_weight = elite_weights(returns, options.num_elites, options.temperature)
+        discrete = discrete.take_along_dim(elite[..., None], 1)
+        unit = unit.take_along_dim(elite[..., None, None], 1)
+        discrete_weight = elite_weight[..., None, None] * F.one_hot(discrete, self.specs.num_discrete)
+        parameter_weight = discrete_weight @ self.specs.parameter_mask.to(discrete_weight)
+        total = parameter_weight.sum(1)
+        parameter_weight = parameter_weight / total.clamp(min=1e-8).unsqueeze(1)
+        mean = (parameter_weight * unit).sum(1)
+        variance = (parameter_weight * (unit - mean.unsqueeze(1)).square()).sum(1)
+        deviation = variance.sqrt().clamp(min=options.min_deviation)
+        step = 1.0 - options.momentum
+        return Plan(
+            plan.probability.lerp(discrete_weight.sum(1), step),
+            plan.mean.lerp(torch.where(total > 1e-8, mean, plan.mean), step),
+            plan.deviation.lerp(torch.where(total > 1e-8, deviation, plan.deviation), step),
+        )

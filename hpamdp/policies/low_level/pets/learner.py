@@ -1,0 +1,225 @@
+"""PETS for parameterised actions: an ensemble learns the problem, every action is the first one of a plan in it.
+
+Members predict the next state, the reward and the end of an episode. A plan tries every sequence of discrete actions,
+each with Gaussians of its own for their parameters. To explore, an environment follows the plans of a single member
+until its episode ends; a greedy plan takes the mean of all members' returns. Meant for few steps: some hundreds.
+
+Sources: Chua, Calandra, McAllister and Levine 2018, *Deep Reinforcement Learning in a Handful of Trials using
+Probabilistic Dynamics Models*, arXiv 1805.12114: the ensemble, the probabilistic members, and a member for each
+imagined trajectory (TS-infinity). Posterior sampling: Osband, Russo and Van Roy 2013, arXiv 1306.0940. Reward and
+termination of parameterised actions: Zhang et al. 2024, arXiv 2404.03037. Symmetry: van der Pol et al. 2020, arXiv
+2006.16908.
+
+Differs from the sources:
+- the model has two stages: a small network predicts the change of the state in a step that does not terminate, and a
+  larger one, which sees where the step would lead by that prediction, whether it terminates and what it earns. An
+  end, such as at a wall or in a target, is a matter of where a step leads;
+- where the problem declares its geometry, states are turned until the discrete action points along +x before the
+  networks see them, with the lengths of all vectors among the inputs; of other declared symmetries, the mapped steps
+  are learned from as well (`augment`);
+- where states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
+  (`linear_part`): some hundred steps tell networks alone little of such a problem;
+- nor does an environment follow a single member there. Exploring plans are those of the mean of all members' returns
+  plus their standard deviation (`posterior_sampling`, `optimism`): all members are sure that what has never earned
+  anything never will, and agree best on actions that hardly do anything;
+- with `epsilon` a share of the exploring actions is random, for rewards that members which never met them agree not to
+  expect;
+- entries of the state whose changes depend linearly on those of others, such as a target's offset on one's own place,
+  are not predicted but derived from them;
+- members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
+- weight decay falls as steps come in, as the weight of a prior does;
+- the parameters of each sequence of discrete actions are searched by themselves (`policies.shared.planning`);
+- with `end_values` a plan also counts what its last state is worth (`policies.shared.end_values`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar
+
+import torch
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn import functional as F
+
+from hpamdp import keys
+from hpamdp.policies.low_level.pets.model import PETSModel
+from hpamdp.policies.low_level.pets.policy import PETSPolicy, PETSPolicyOptions
+from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.specs import PAMDPSpecs
+
+_LARGEST_COPIES = 16  # of a stored step under the problem's symmetries
+
+
+class PETSOptions(PETSPolicyOptions):
+    """Settings of `PETS`."""
+
+    weight_decay: NonNegativeFloat = 1.0
+    """Weight decay of AdamW. With much less, the networks overfit a few hundred steps, with overconfident errors."""
+    weight_decay_steps: PositiveInt = 256
+    """With more steps than these, the decay falls as 1 / steps, so that it does not blur the edges of targets."""
+    transition_weight: PositiveFloat = 2.0
+    """Weight of the change's error in the loss; those of termination and rewards are 1."""
+    warmup_steps: PositiveInt = 64
+    """Random steps of a learner before its first update; there are more until two rewards differ."""
+    updates_per_step: Annotated[float, Field(gt=0.0)] = 10.0
+    """Updates for each step that the learner collects; the first ones make up for the warm-up."""
+    batch_size: PositiveInt = 64
+    """Steps in a member's minibatch."""
+    buffer_size: PositiveInt = 20_000
+    """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
+
+
+class PETS(ReplayLearner):
+    """A PETSModel trained on all steps so far, and a SequenceSearch that plans in it."""
+
+    Options = PETSOptions
+    modes: ClassVar[tuple[str, ...]] = ("train",)
+    stores_own_parameters = True
+    catches_up = True
+
+    options: PETSOptions
+    policy: PETSPolicy
+
+    def __init__(
+        self,
+        specs: PAMDPSpecs,
+        device: torch.device | str = "cpu",
+        options: PETSOptions | None = None,
+        **settings: Any,
+    ) -> None:
+        options = PETSOptions.of(options, settings)
+        self.entries = list(range(specs.observation_dim))
+        if options.augment is not False:
+            self.entries, specs = specs.telling_entries, specs.with_telling_entries()
+        super().__init__(specs, device, options)
+        self.model = PETSModel(specs, options)
+        self.end_values = (
+            EndValues(specs.observation_dim, options.outcome_dims, options) if options.end_values else None
+        )
+        self.policy = PETSPolicy(self.model, specs, self.entries, options, self.end_values)
+        self.to(device)
+        adam = torch.optim.AdamW(self.model.parameters(), lr=options.lr, weight_decay=options.weight_decay, fused=True)
+        self.optimizers = {"model": adam}
+        if self.end_values is not None:
+            self.optimizers["end_values"] = self.end_values.optimizer()
+
+    def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """Update every member from its own minibatch of a sample `[num_members, batch_size]`.
+
+        Then update the values, if they are learned, from as many steps, mapped by no symmetry.
+        """
+        scalars = self.gradient_step("model", self._loss, sample)
+        if self.end_values is not None:
+            rows = self.buffer.sample(sample.numel())
+            state, next_state = rows["state"], rows["next_state"]
+            rows.set("next_state", rows["next_observation"])
+            scalars |= self.end_values.update(self, rows, state, next_state)
+        return scalars
+
+    def _loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return the sum of the members' losses, and the mean of each part of it."""
+        ends = sample["terminated"]
+        transition, outcome = self.model.in_frame(sample["turned"], sample["action"])
+        change = sample["change"]
+        if self.model.is_probabilistic:
+            mean, log_variance = self.model.moments(transition)
+            error = 0.5 * ((mean - change).square() * (-log_variance).exp() + log_variance)
+        else:
+            error = (transition - change).square()
+        is_predicted = self.model.is_predicted
+        error = (error * is_predicted).sum(-1) / is_predicted.sum().clamp(min=1.0)
+        logit, terminating, continuing = outcome.unbind(-1)
+        reward = torch.where(ends > 0.0, terminating, continuing)
+        parts = {
+            "change": (error * (1.0 - ends)).mean(),
+            "termination": F.binary_cross_entropy_with_logits(logit, ends),
+            "reward": (reward - sample["reward"]).square().mean(),
+        }
+        loss = self.options.transition_weight * parts["change"] + parts["termination"] + parts["reward"]
+        return loss * self.model.num_members, parts
+
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the values `[N]` of observations `[N, *]`.
+
+        With `end_values` they are what these have learned, whatever a mask allows; else see `PETSPolicy.value`.
+        """
+        if self.end_values is None:
+            return self.policy.value(observation, action_mask)
+        return self.end_values.of_own(observation[..., self.entries])
+
+    def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
+        """Yield samples `[num_members, batch_size]` of all stored steps, each with all its mirror images or maps."""
+        options = self.options
+        decay = options.weight_decay * min(1.0, options.weight_decay_steps / len(self.buffer))
+        for group in self.optimizers["model"].param_groups:
+            group["weight_decay"] = decay
+        rows = self.prepared()
+        shape = num_batches, options.num_members, options.batch_size
+        for places in torch.randint(len(rows), shape, device=rows.device):
+            yield rows[places]
+
+    def prepared(self) -> TensorDict:
+        """Fit the model's scales to all stored steps; return these in the canonical frame, as the model sees them."""
+        stored = self.buffer[:].select("state", "discrete", "unit", "next_state", "reward", "terminated")
+        frame = self.model.frame
+        if self.symmetry is not None and not frame.turns:
+            stored = self._with_all_maps(stored)
+        direction = frame.direction(stored["state"], stored["discrete"])
+        turned = [frame.turn(stored[name], direction) for name in ("state", "next_state")]
+        kind, own = frame.kind[stored["discrete"]], stored["unit"] * self.policy.search.has_slot[stored["discrete"]]
+        reward, terminated = stored["reward"], stored["terminated"]
+        if frame.turns and frame.geometry is not None and frame.geometry.has_mirror:
+            turned = [torch.cat([state, frame.mirror(state)]) for state in turned]
+            kind, own, reward, terminated = (torch.cat([part, part]) for part in (kind, own, reward, terminated))
+        action = self.model.action_inputs(kind, own)
+        self.model.fit_scales(turned[0], action, turned[1], reward, terminated)
+        mean, scale = self.model.reward_mean, self.model.reward_scale
+        which = terminated.long()
+        return TensorDict(
+            {
+                "turned": turned[0],
+                "action": action,
+                "change": self.model.target_change(turned[0], action, turned[1]),
+                "reward": (reward - mean[which]) / scale[which],
+                "terminated": terminated.float(),
+            },
+            batch_size=len(reward),
+        )
+
+    def _with_all_maps(self, stored: TensorDictBase) -> TensorDictBase:
+        """Return stored steps under all symmetries, or of many of them each under some."""
+        assert self.symmetry is not None
+        num_maps = len(self.symmetry.maps)
+        copies = min(num_maps, _LARGEST_COPIES)
+        number = torch.arange(copies, device=stored.device).repeat_interleave(len(stored))
+        if copies < num_maps:
+            number = torch.randint(num_maps, number.shape, device=stored.device)
+        rows = stored.repeat(copies)
+        rows = rows.set("unit", self._all_parameters(rows["discrete"], rows["unit"]))
+        rows = self.symmetry.mapped(number, rows)
+        return rows.set("unit", rows["unit"].gather(-1, self.slots[rows["discrete"]]))
+
+    def on_progress(self, steps: int) -> None:
+        """Let the policy plan once stored rewards or terminations differ, or at once if there are end values."""
+        if self.policy.is_trained:  # later steps may be the same because the plans are good
+            return
+        stored = self.buffer[:]
+        differ = [(stored[name] != stored[name][0]).any() for name in ("reward", "terminated")]
+        self.policy.is_trained.fill_(self.end_values is not None or bool(torch.stack(differ).any()))
+
+    def transitions(self, batch: TensorDictBase) -> TensorDict:
+        """Return the model's inputs and targets in a batch `[*B, T]`; a truncated step has not terminated.
+
+        Where values are learned, `next_observation` has all entries of the next state.
+        """
+        rows = super().transitions(batch)
+        if self.end_values is None:
+            rows = rows.exclude("discount", "action_mask", "next_action_mask")
+        else:
+            rows.set("next_observation", rows["next_state"])
+        for name in ("state", "next_state"):
+            rows.set(name, rows[name][..., self.entries])
+        return rows.set("terminated", batch["next", keys.TERMINATED].squeeze(-1))

@@ -1,0 +1,339 @@
+"""The model of PETS: an ensemble that predicts the change of the state, the end and the reward of a step.
+
+Source: Chua, Calandra, McAllister and Levine 2018, arXiv 1805.12114. See `learner.py` for what differs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from pydantic import PositiveInt
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from hpamdp.policies.shared.canonical_frame import CanonicalFrame, joined
+from hpamdp.policies.shared.networks import EnsembleLinear
+from hpamdp.policies.shared.planning import Prediction
+from hpamdp.policies.shared.planning_policy import PlanningOptions
+from hpamdp.policies.shared.scales import scale_of
+from hpamdp.settings import Widths
+from hpamdp.specs import PAMDPSpecs
+
+_LOG_VARIANCE_LOW, _LOG_VARIANCE_HIGH = -10.0, 1.0  # of a scaled change
+_RIDGE = 0.3  # of the linear part, whose inputs have a deviation of about 1
+
+
+class PETSModelOptions(PlanningOptions):
+    """Settings of a `PETSModel`."""
+
+    augment: Literal["auto"] | bool = "auto"
+    """Use the symmetry and the geometry that the problem declares: `auto` does if there are any, true requires them."""
+    num_members: PositiveInt = 5
+    """Models, each trained on minibatches of its own."""
+    transition_dims: Widths = (64, 64)
+    """Hidden layers of the networks that predict the change of the state."""
+    outcome_dims: Widths = (64, 64)
+    """Hidden layers of the networks that predict whether a step terminates, and its reward."""
+    probabilistic: bool = False
+    """Predict a variance of the change, for problems with noise."""
+    linear_part: Literal["auto"] | bool = "auto"
+    """Predict the change by a linear model, fitted by least squares, plus what the networks add to it.
+
+    It knows where steps lead after some hundred of them. `auto` uses it unless the problem declares a geometry that
+    makes its discrete actions alike.
+    """
+
+
+class MemberNet(nn.Module):
+    """Independent networks with ReLU, one for each member, `[E, B, in]` -> `[E, B, out]`."""
+
+    def __init__(self, num_members: int, in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> None:
+        super().__init__()
+        dims = [in_dim, *hidden_dims, out_dim]
+        layers = [EnsembleLinear(num_members, size, next_size) for size, next_size in pairwise(dims)]
+        for layer in layers:
+            nn.init.normal_(layer.weight, 0.0, 0.7 * (2.0 / layer.weight.shape[1]) ** 0.5)
+            nn.init.zeros_(layer.bias)
+        self.layers = nn.ModuleList(layers)
+
+    def forward(self, x: Tensor, precision: torch.dtype = torch.float32, output_map: Tensor | None = None) -> Tensor:
+        """Apply each member to its own slice of `x`.
+
+        Args:
+            x: `[E, B, in]`.
+            precision: of the layers.
+            output_map: `[out, M]`, by which the output is multiplied; as part of the last layer, it costs nothing.
+        """
+        x = x.mT.to(precision)  # [E, in, B]: see `joined`
+        for place, layer in enumerate(self.layers):
+            assert isinstance(layer, EnsembleLinear)
+            terms: tuple[Tensor, Tensor] = layer.bias, layer.weight
+            if output_map is not None and place == len(self.layers) - 1:
+                terms = terms[0] @ output_map, terms[1] @ output_map
+            bias, weight = (term.to(precision) for term in terms)
+            x = torch.baddbmm(bias.mT, weight.mT, x)
+            if place < len(self.layers) - 1:
+                x = x.relu_()
+        return x.mT.float()
+
+
+class PETSModel(nn.Module):
+    """`num_members` models of a step: the change of the state, then its end and its reward."""
+
+    state_mean: Tensor
+    state_scale: Tensor
+    change_scale: Tensor
+    is_predicted: Tensor
+    is_changing: Tensor
+    is_input: Tensor
+    derivation: Tensor
+    linear_weight: Tensor
+    reward_mean: Tensor
+    reward_scale: Tensor
+    feature_mean: Tensor
+    feature_scale: Tensor
+    slot_kind: Tensor
+    slot_number: Tensor
+
+    def __init__(self, specs: PAMDPSpecs, options: PETSModelOptions) -> None:
+        super().__init__()
+        dim = specs.observation_dim
+        self.num_members = options.num_members
+        self.is_probabilistic = options.probabilistic
+        self.frame = CanonicalFrame(specs, is_used=options.augment is not False)
+        self.has_linear_part = not self.frame.turns if options.linear_part == "auto" else options.linear_part
+        kinds = self.frame.kind.tolist()
+        of_kinds = zip(kinds, specs.parameter_dims, strict=True)
+        slots = sorted({(kind, slot) for kind, num_slots in of_kinds for slot in range(num_slots)})
+        places = torch.tensor(slots, dtype=torch.long).reshape(-1, 2)
+        self.register_buffer("slot_kind", places[:, 0], persistent=False)
+        self.register_buffer("slot_number", places[:, 1], persistent=False)
+        self.has_kinds = self.frame.num_kinds > 1
+        action_dim = 2 * len(slots) + (self.frame.num_kinds if self.has_kinds else 0)
+        num_vectors = self.frame.num_vectors
+        feature_dim = 4 * num_vectors if num_vectors else 2 * dim
+        in_dim = dim + action_dim
+        self.transition = MemberNet(
+            options.num_members, in_dim, options.transition_dims, dim * (2 if options.probabilistic else 1)
+        )
+        self.outcome = MemberNet(options.num_members, in_dim + dim + feature_dim, options.outcome_dims, 3)
+        # What a context means for a turned state is its direction alone: one model serves all of them.
+        is_input = torch.ones(dim, dtype=torch.float32)
+        if self.frame.turns and self.frame.geometry is not None:
+            is_input[self.frame.geometry.entries_of_contexts] = 0.0
+        buffers = {
+            "state_mean": torch.zeros(dim, dtype=torch.float32),
+            "state_scale": torch.ones(dim, dtype=torch.float32),
+            "change_scale": torch.ones(dim, dtype=torch.float32),
+            "is_predicted": is_input.clone(),
+            "is_changing": is_input.clone(),
+            "derivation": torch.eye(dim, dtype=torch.float32),
+            "reward_mean": torch.zeros(2, dtype=torch.float32),
+            "reward_scale": torch.ones(2, dtype=torch.float32),
+            "feature_mean": torch.zeros(feature_dim, dtype=torch.float32),
+            "feature_scale": torch.ones(feature_dim, dtype=torch.float32),
+        }
+        if self.has_linear_part:
+            buffers["linear_weight"] = torch.zeros(in_dim + len(slots) + 1, dim, dtype=torch.float32)
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
+        self.register_buffer("is_input", is_input, persistent=False)
+
+    def forward(
+        self, state: Tensor, discrete: Tensor, own: Tensor, precision: torch.dtype = torch.float32
+    ) -> Prediction:
+        """Predict one step with every member, each from states of its own.
+
+        Args:
+            state: `[E, B, observation_dim]`.
+            discrete: `[E, B]`.
+            own: parameters of the discrete actions, `[E, B, D]` in [-1, 1].
+            precision: of the networks.
+        """
+        direction = self.frame.direction(state, discrete)
+        turned = self.frame.turn(state, direction)
+        x = self._inputs(turned, self.action_inputs(self.frame.kind[discrete], own))
+        if self.is_probabilistic:
+            change = self._sampled(self.transition(x, precision)) @ self._change_map()
+        else:
+            change = self.transition(x, precision, self._change_map())
+        if self.has_linear_part:
+            change = change + self._linear_part(x) @ self._change_map()
+        outcome = self._outcome(x, turned, turned + change, precision)
+        logit, terminating, continuing = outcome.unbind(-1)
+        mean, scale = self.reward_mean, self.reward_scale
+        return Prediction(
+            self.frame.turn_back(turned + change, direction),
+            continuing * scale[0] + mean[0],
+            terminating * scale[1] + mean[1],
+            logit,
+        )
+
+    def action_inputs(self, kind: Tensor, own: Tensor) -> Tensor:
+        """Return what the networks see of actions of a kind `[*B]` with parameters `[*B, D]`.
+
+        That is the kind, and each kind's own parameters and their squares, 0 for the other kinds.
+        """
+        if not self.has_kinds:
+            return joined(own, own.square())
+        value = own[..., self.slot_number] * (kind.unsqueeze(-1) == self.slot_kind)
+        return joined(F.one_hot(kind, self.frame.num_kinds).to(own.dtype), value, value.square())
+
+    def in_frame(self, turned: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Predict a step in the canonical frame, to learn from it.
+
+        Args:
+            turned: states `[E, B, observation_dim]`.
+            action: of `action_inputs`, `[E, B, *]`.
+
+        Returns:
+            What the transition networks say, and what the outcome networks say: logit, scaled reward if the step
+            terminates, and if it does not. The loss of the latter does not reach the former.
+        """
+        x = self._inputs(turned, action)
+        transition = self.transition(x)
+        scaled = transition.detach()
+        if self.is_probabilistic:
+            scaled = self._sampled(scaled)
+        if self.has_linear_part:
+            scaled = scaled + self._linear_part(x)
+        return transition, self._outcome(x, turned, turned + scaled @ self._change_map(), torch.float32)
+
+    def target_change(self, turned: Tensor, action: Tensor, next_turned: Tensor) -> Tensor:
+        """Return the scaled change that is left to the transition networks, `[B, observation_dim]`.
+
+        Args:
+            turned, next_turned: states `[B, observation_dim]` in the canonical frame.
+            action: of `action_inputs`, `[B, *]`.
+        """
+        change = (next_turned - turned) / self.change_scale
+        return change - self._linear_part(self._inputs(turned, action)) if self.has_linear_part else change
+
+    def _linear_part(self, x: Tensor) -> Tensor:
+        """Return the scaled change by the linear model, of the networks' inputs `[*B, in]`."""
+        weight, of_cubes, bias = self.linear_weight.split([x.shape[-1], len(self.slot_kind), 1])
+        return x @ weight + self._parameters_in(x) ** 3 @ of_cubes + bias
+
+    def _parameters_in(self, x: Tensor) -> Tensor:
+        """Return the parameters of all slots, of the networks' inputs."""
+        end = x.shape[-1] - len(self.slot_kind)
+        return x[..., end - len(self.slot_kind) : end]
+
+    def _inputs(self, turned: Tensor, action: Tensor) -> Tensor:
+        return joined(_scaled(turned, self.state_mean, self.state_scale, self.is_input), action)
+
+    def _outcome(self, x: Tensor, turned: Tensor, next_turned: Tensor, precision: torch.dtype) -> Tensor:
+        next_x = _scaled(next_turned, self.state_mean, self.state_scale, self.is_changing)
+        features = _scaled(self.features(turned, next_turned), self.feature_mean, self.feature_scale)
+        return self.outcome(joined(x, next_x, features), precision)
+
+    def _change_map(self) -> Tensor:
+        """Return what makes changes of the state of scaled changes, `[observation_dim, observation_dim]`."""
+        return (self.is_predicted * self.change_scale).unsqueeze(-1) * self.derivation
+
+    def _sampled(self, transition: Tensor) -> Tensor:
+        """Return scaled changes, sampled from what the transition networks say."""
+        mean, log_variance = self.moments(transition)
+        return mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
+
+    def moments(self, transition: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and log-variance of the scaled change, from what the transition networks say."""
+        mean, raw = transition.chunk(2, -1)
+        return mean, _LOG_VARIANCE_LOW + (_LOG_VARIANCE_HIGH - _LOG_VARIANCE_LOW) * raw.sigmoid()
+
+    def features(self, turned: Tensor, next_turned: Tensor) -> Tensor:
+        """Return what helps to tell where a step ends, of states before and after it in the canonical frame.
+
+        With vectors of the plane, their lengths before and after the step, the smallest length on the straight way
+        between the two, and how far off the x axis they were, `[*B, 4 V]`; else the squares of all entries, of which
+        lengths are made, `[*B, 2 observation_dim]`.
+        """
+        if not self.frame.num_vectors:
+            mean, scale = self.state_mean, self.state_scale
+            return joined(_scaled(turned, mean, scale), _scaled(next_turned, mean, scale, self.is_changing)).square()
+        x, y = self.frame.vectors(turned)
+        next_x, next_y = self.frame.vectors(next_turned)
+        way_x, way_y = next_x - x, next_y - y
+        along = -(x * way_x + y * way_y) / (way_x.square() + way_y.square()).clamp(min=1e-12)
+        along = along.clamp(0.0, 1.0)
+        lengths = [torch.hypot(x + part * way_x, y + part * way_y) for part in (0.0, 1.0, along)]
+        return joined(*lengths, y.abs())
+
+    @torch.no_grad()
+    def fit_scales(
+        self, turned: Tensor, action: Tensor, next_turned: Tensor, reward: Tensor, terminated: Tensor
+    ) -> None:
+        """Set the scales of inputs and targets, which changes are derived from others, and the linear part.
+
+        Args:
+            turned, next_turned: states `[B, observation_dim]` in the canonical frame.
+            action: of `action_inputs`, `[B, *]`.
+            reward: `[B]`.
+            terminated: bool `[B]`.
+        """
+        self.state_mean.copy_(turned.mean(0))
+        self.state_scale.copy_(scale_of(turned))
+        change = (next_turned - turned)[~terminated]
+        if len(change) > 1:
+            self.change_scale.copy_(scale_of(change))
+            self.is_changing.copy_((change.abs().amax(0) > 1e-6).float() * self.is_input)
+            self._derive(change / self.change_scale)
+            if self.has_linear_part:
+                self._fit_linear_part(self._inputs(turned, action)[~terminated], change / self.change_scale)
+        for place, rows in enumerate((reward[~terminated], reward[terminated])):
+            if len(rows) > 1:
+                self.reward_mean[place] = rows.mean()
+                self.reward_scale[place] = scale_of(rows)
+        features = self.features(turned, next_turned)
+        self.feature_mean.copy_(features.mean(0))
+        self.feature_scale.copy_(scale_of(features))
+
+    def _derive(self, change: Tensor) -> None:
+        """Find the entries whose scaled changes `[B, observation_dim]` are linear in those of entries before them."""
+        dim = change.shape[-1]
+        is_predicted = [False] * dim
+        derivation = torch.zeros(dim, dim, dtype=torch.float64, device=change.device)
+        columns = change.double()
+        if len(columns) < 4 * dim:  # too few to tell
+            self.is_predicted.copy_(self.is_input)
+            return
+        for entry in range(dim):
+            if self.is_changing[entry] == 0.0:
+                continue
+            column = columns[:, entry]
+            basis = [place for place in range(dim) if is_predicted[place]]
+            if basis:
+                solved = torch.linalg.lstsq(columns[:, basis], column.unsqueeze(-1), driver="gelsd")
+                weight = solved.solution.squeeze(-1)
+                if (columns[:, basis] @ weight - column).abs().amax() < 1e-3:
+                    derivation[basis, entry] = weight
+                    continue
+            is_predicted[entry] = True
+            derivation[entry, entry] = 1.0
+        scale = self.change_scale.double()
+        self.derivation.copy_(derivation * scale / scale.unsqueeze(-1))
+        self.is_predicted.copy_(torch.tensor(is_predicted, device=change.device).float())
+
+    def _fit_linear_part(self, x: Tensor, change: Tensor) -> None:
+        """Fit the linear model to the networks' inputs `[B, in]` and the scaled changes `[B, observation_dim]`.
+
+        It is ridge regression on the inputs and the cubes of the parameters. Entries whose changes it predicts worse
+        than no change does, each step by the fit to all others, are left to the networks.
+        """
+        inputs = torch.cat([x, self._parameters_in(x) ** 3, torch.ones_like(x[:, :1])], -1).double()
+        ridge = torch.full_like(inputs[0], _RIDGE)
+        ridge[-1] = 1e-6
+        solver = torch.linalg.solve(inputs.mT @ inputs + ridge.diag(), inputs.mT)
+        weight = solver @ change.double()
+        leverage = (inputs * solver.mT).sum(-1, keepdim=True)
+        error = (change - inputs @ weight) / (1.0 - leverage).clamp(min=0.05)
+        self.linear_weight.copy_(weight * (error.square().mean(0) < change.square().mean(0)))
+
+
+def _scaled(rows: Tensor, mean: Tensor, scale: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return `(rows - mean) / scale * mask` in one pass."""
+    factor = 1.0 / scale if mask is None else mask / scale
+    return torch.addcmul(-mean * factor, rows, factor)

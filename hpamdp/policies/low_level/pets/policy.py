@@ -1,0 +1,249 @@
+"""The policy of PETS: it searches for a sequence of actions in the ensemble, and takes the first one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import torch
+from pydantic import NonNegativeFloat
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.policies.base import is_greedy
+from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
+from hpamdp.policies.shared.end_values import EndValues
+from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
+from hpamdp.policies.shared.planning import (
+    Found,
+    Prediction,
+    Returns,
+    SequenceSearch,
+    SequenceSearchOptions,
+    SequenceStep,
+    discounted_return,
+)
+from hpamdp.policies.shared.planning_policy import PlanningPolicy
+from hpamdp.settings import Fraction
+from hpamdp.specs import PAMDPSpecs
+
+MEMBER = "member"  # which member an environment follows, int64 [*B]
+
+_CHUNK_ROWS = 8192  # states predicted at once when planning: fits the cache and bounds the memory
+
+
+class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelOptions):
+    """Settings of a `PETSPolicy`."""
+
+    posterior_sampling: Literal["auto"] | bool = "auto"
+    """Let exploring environments follow the plans of one member each until their episode ends; else of all members.
+
+    So environments try what members disagree on. `auto` does if the problem declares a geometry that makes its discrete
+    actions alike; elsewhere a single member knows too little for its plans to lead anywhere.
+    """
+    optimism: NonNegativeFloat = 1.0
+    """Without posterior sampling: standard deviations of the members' returns that exploring plans add to the mean."""
+    caution: NonNegativeFloat = 0.0
+    """Standard deviations of the members' returns that greedy plans subtract from the mean.
+
+    It avoids plans that only an error of some members makes look good, where a slip ends the episode.
+    """
+    parameter_noise: NonNegativeFloat = 0.05
+    """Standard deviation of the exploring noise on the parameters, in units where their bounds are [-1, 1]."""
+    epsilon: Fraction = 0.0
+    """Probability of a uniformly random action in place of an exploring plan's.
+
+    If no member has seen a reward, all of them predict none, and planning alone never finds it.
+    """
+
+
+class PETSPolicy(PlanningPolicy):
+    """The first action of a plan; exploring, of one with the member that the environment follows in this episode.
+
+    Acts uniformly at random until the stored steps differ in their rewards or in whether they terminate: before, all
+    plans have the same value.
+    """
+
+    def __init__(
+        self,
+        model: PETSModel,
+        specs: PAMDPSpecs,
+        entries: list[int],
+        options: PETSPolicyOptions,
+        end_value: EndValues | None,
+    ) -> None:
+        super().__init__(specs, options.epsilon)
+        self.in_keys = [*self.in_keys, keys.IS_DECISION, MEMBER]
+        self.out_keys = [*self.out_keys, MEMBER]
+        self.options = options
+        self.entries = entries
+        self.model = model
+        self.search = SequenceSearch(specs.parameter_dims, options)
+        auto = options.posterior_sampling == "auto"
+        self.samples_posterior = model.frame.turns if auto else bool(options.posterior_sampling)
+        self.precision: torch.dtype = getattr(torch, options.planning_precision)
+        self.end_value = end_value
+        self.register_buffer("slots", specs.parameter_slots, persistent=False)
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write the discrete action, the member `[*B]` and the parameters `[*B, num_parameters]`."""
+        return super().forward(td.set(MEMBER, self._members(td)))
+
+    def _members(self, td: TensorDictBase) -> Tensor:
+        """Return the members that environments follow, `[*B]`: a random one where an episode or an option begins."""
+        shape = td.batch_size
+        fresh = torch.randint(self.model.num_members, shape, device=self.is_trained.device)
+        held, begins = td.get(MEMBER, None), td.get(keys.IS_DECISION, None)
+        if held is None:
+            return fresh
+        return held if begins is None else torch.where(begins.reshape(shape), fresh, held)
+
+    def first_action(
+        self, td: TensorDictBase, observation: Tensor, is_planned: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the first action of each plan, see `PlanningPolicy.first_action`."""
+        observation = observation[is_planned]
+        member = td.get(MEMBER).flatten()[is_planned] if self._follows_member else None
+        found = self.plan(observation[:, self.entries], member, self._allowed(observation, mask))
+        own = found.own if is_greedy() else with_exploring_noise(found.own, self.options.parameter_noise)
+        unit = own.new_zeros(len(own), self.specs.num_parameters)
+        return found.discrete, unit.scatter(-1, self.slots[found.discrete], own)
+
+    @torch.no_grad()
+    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+        """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
+
+        Greedily that is by the mean of all members, and `caution`; exploring by posterior sampling, by a random member
+        for each observation, or else by the mean and `optimism`, so that what members disagree on is tried. Before
+        the policy plans, the value assumes the only known reward at every step; while exploring, it is infinite.
+        """
+        num = len(observation)
+        if not bool(self.is_trained):
+            known = self.model.reward_mean[0] * sum(self.options.gamma**h for h in range(self.options.horizon))
+            return known.expand(num) if is_greedy() else torch.full_like(observation[:, 0], torch.inf)
+        member = torch.randint(self.model.num_members, (num,), device=observation.device)
+        allowed = self._allowed(observation, action_mask)
+        return self.plan(observation[:, self.entries], member if self._follows_member else None, allowed).value
+
+    @property
+    def _follows_member(self) -> bool:
+        return self.samples_posterior and not is_greedy()
+
+    def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> Found:
+        """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all.
+
+        Args:
+            state: where the plans begin.
+            member: of each of them.
+            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
+        """
+        num_members = self.model.num_members
+        if member is None:
+            return self._plan(state.expand(num_members, -1, -1), allowed, is_mean=True)
+        # All members at once, each with as many states as the one with the most, some of them zeros.
+        is_own = member.unsqueeze(-1) == torch.arange(num_members, device=member.device)
+        place = (is_own.cumsum(0) - 1).gather(1, member.unsqueeze(-1)).squeeze(-1)
+        num_places = int(place.max()) + 1
+        stacked = state.new_zeros(num_members, num_places, state.shape[-1])
+        stacked[member, place] = state
+        if allowed is not None:
+            of_members = allowed.new_ones(num_members, num_places, *allowed.shape[1:])
+            of_members[member, place] = allowed
+            allowed = of_members
+        found = self._plan(stacked, allowed, is_mean=False)
+        row = member * num_places + place
+        return Found(*(part[row] for part in found))
+
+    def _allowed(self, observation: Tensor, action_mask: Tensor | None) -> Tensor | None:
+        """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`; None: all.
+
+        What the environment will allow in predicted states is unknown, and taken to be everything.
+        """
+        first = self.specs.allowed(observation, action_mask)
+        if first is None:
+            return None
+        later = self.specs.allowed(observation)
+        later = torch.ones_like(first) if later is None else later
+        return torch.stack([first] + [later] * (self.options.horizon - 1), 1)
+
+    def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> Found:
+        """Plan from states `[E, N, observation_dim]`: N plans by the mean of all members, or one for each state.
+
+        In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time.
+        `allowed` is bool `[N, horizon, num_discrete]`, or `[E, N, horizon, num_discrete]`.
+        """
+        search = self.search
+        num_sequences = min(self.options.num_kept, search.num_sequences) if is_mean else search.num_sequences
+        size = max(1, _CHUNK_ROWS // (num_sequences * search.samples_of_a_sequence(is_greedy())))
+        found = []
+        for begin in range(0, state.shape[1], size):
+            piece = state[:, begin : begin + size]
+            own = allowed
+            if own is not None:
+                own = own[begin : begin + size] if is_mean else own[:, begin : begin + size].flatten(0, 1)
+            num_plans = piece.shape[1] if is_mean else piece.shape[:2].numel()
+            first_returns = self._returns_of_single_members(piece[0]) if is_mean else None
+            returns = self._returns(piece, is_mean)
+            part = search(returns, num_plans, state.device, own, first_returns, is_greedy=is_greedy())
+            found.append(part if is_mean else Found(*(each.unflatten(0, piece.shape[:2]) for each in part)))
+        joined_found = Found(*(torch.cat(part, 0 if is_mean else 1) for part in zip(*found, strict=True)))
+        return joined_found if is_mean else Found(*(part.flatten(0, 1) for part in joined_found))
+
+    def _returns(self, state: Tensor, is_mean: bool) -> Returns:
+        num_members, num_states = state.shape[:2]
+
+        def for_members(part: Tensor) -> Tensor:
+            """Return `[N, ...]` or `[E * N, ...]` as `[E, N, ...]`."""
+            return part.expand(num_members, *part.shape) if is_mean else part.unflatten(0, (num_members, num_states))
+
+        def returns(steps: Sequence[SequenceStep]) -> Tensor:
+            num_sequences = steps[-1].discrete.shape[1]
+
+            def predictions() -> Iterator[Prediction]:
+                # [E, observation_dim, N, Q_h, S]: see `joined`
+                rows = state.mT[..., None, None].expand(-1, -1, -1, 1, steps[0].own.shape[2])
+                for step in steps:
+                    shape = num_states, *step.own.shape[1:3]
+                    rows = _each_repeated(rows, shape[1] // rows.shape[-2]).flatten(2)
+                    discrete = for_members(step.discrete).unsqueeze(-1).expand(num_members, *shape).flatten(1)
+                    own = for_members(step.own).flatten(1, 3)
+                    ahead = self.model(rows.mT, discrete, own, self.precision)
+                    rows = ahead.next_state.mT.unflatten(-1, shape)
+                    parts = (part.unflatten(1, shape) for part in ahead[1:])
+                    yield Prediction(rows, *(_each_repeated(part, num_sequences // shape[1]) for part in parts))
+
+            end_value = None if self.end_value is None else self._end_value_of_joined
+            total = discounted_return(predictions(), self.options.gamma, end_value)
+            if not is_mean:
+                return total.flatten(0, 1)
+            weight = -self.options.caution if is_greedy() else self.options.optimism
+            return total.mean(0) if weight == 0.0 else total.mean(0) + weight * total.std(0, correction=0)
+
+        return returns
+
+    def _end_value_of_joined(self, rows: Tensor) -> Tensor:
+        """Return what states `[E, observation_dim, N, Q, S]` are worth at the end of a plan, `[E, N, Q, S]`."""
+        assert self.end_value is not None
+        value: Tensor = self.end_value(rows.movedim(1, -1))
+        return value
+
+    def _returns_of_single_members(self, state: Tensor) -> Returns:
+        """Return what maps sequences to the returns that a single member expects, from states `[N, observation_dim]`.
+
+        Each member serves as many of the states.
+        """
+        num_members, num_states = self.model.num_members, len(state)
+        num_places = -(-num_states // num_members)
+
+        def padded(part: Tensor) -> Tensor:
+            last = part[-1:].expand(num_members * num_places - num_states, *part.shape[1:])
+            return torch.cat([part, last])
+
+        returns = self._returns(padded(state).unflatten(0, (num_members, num_places)), is_mean=False)
+        return lambda steps: returns([SequenceStep(*map(padded, step)) for step in steps])[:num_states]
+
+
+def _each_repeated(rows: Tensor, times: int) -> Tensor:
+    """Return `[..., Q, S]` with each of Q repeated, `[..., Q * times, S]`."""
+    return rows if times == 1 else rows.unsqueeze(-2).expand(*rows.shape[:-1], times, -1).flatten(-3, -2)

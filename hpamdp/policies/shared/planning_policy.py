@@ -1,0 +1,94 @@
+"""The policy that the model-based learners share, which acts by the first action of a plan, and their settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import torch
+from pydantic import Field, PositiveInt
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from hpamdp import keys
+from hpamdp.policies.base import is_greedy
+from hpamdp.policies.masks import random_choice
+from hpamdp.policies.shared.end_values import EndValueOptions
+from hpamdp.policies.shared.planning import SearchOptions
+from hpamdp.policies.shared.replay import ReplayOptions
+from hpamdp.settings import LearningRate
+from hpamdp.specs import PAMDPSpecs
+
+
+class PlanningOptions(SearchOptions, EndValueOptions, ReplayOptions):
+    """Settings of a learner that plans in a learned model."""
+
+    warmup_steps: PositiveInt = 1000
+    """Random steps of a learner before its first update, which the first updates make up for."""
+    num_members: PositiveInt = 2
+    """Members of the ensemble of models."""
+    lr: LearningRate = 1e-3
+    """Learning rate of the model."""
+    epsilon: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.05
+    """Probability of a uniformly random action in place of an exploring plan's."""
+    planning_precision: Literal["float32", "bfloat16"] = "bfloat16"
+    """Precision of the networks when planning; training is always in float32.
+
+    bfloat16 is faster on hardware with instructions for it (AVX-512 BF16, AMX, GPUs) and slower elsewhere.
+    """
+
+
+class PlanningPolicy(TensorDictModuleBase):
+    """Takes the first action of a plan; a random one until `is_trained`, and with probability `epsilon` if it explores.
+
+    Nothing is planned for finished episodes: their action is random, too, and is ignored. A subclass implements
+    `first_action`.
+    """
+
+    is_trained: Tensor
+    in_keys: list[NestedKey]
+    out_keys: list[NestedKey]
+
+    def __init__(self, specs: PAMDPSpecs, epsilon: float) -> None:
+        super().__init__()
+        self.in_keys = [keys.OBSERVATION, keys.DONE]
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
+        self.specs = specs
+        self.epsilon = epsilon
+        self.register_buffer("is_trained", torch.zeros((), dtype=torch.bool))
+
+    @torch.no_grad()
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
+        observation = td.get(keys.OBSERVATION).flatten(0, -2)
+        num, device = len(observation), observation.device
+        mask = td.get(keys.ACTION_MASK, None)
+        mask = None if mask is None else mask.flatten(0, -2)
+        allowed = self.specs.allowed(observation, mask)
+        discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed, device)
+        unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
+        is_planned = self.is_trained.expand(num)
+        done = td.get(keys.DONE, None)
+        if done is not None:
+            is_planned = is_planned & ~done.flatten()
+        if self.epsilon > 0.0 and not is_greedy():
+            is_planned = is_planned & (torch.rand(num, device=device, dtype=torch.float32) >= self.epsilon)
+        if is_planned.any():
+            mask = None if mask is None else mask[is_planned]
+            discrete[is_planned], unit[is_planned] = self.first_action(td, observation, is_planned, mask)
+        shape = td.batch_size
+        parameters = self.specs.from_unit(unit).reshape(*shape, self.specs.num_parameters)
+        return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": parameters}})
+
+    def first_action(
+        self, td: TensorDictBase, observation: Tensor, is_planned: Tensor, mask: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return the discrete actions `[N]` and the parameters `[N, num_parameters]` in [-1, 1] of N plans.
+
+        Args:
+            td: the step, `[*B]`.
+            observation: its observations, one after another, `[prod(B), observation_dim]`.
+            is_planned: which of them to plan from, N in all, bool `[prod(B)]`.
+            mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+        """
+        raise NotImplementedError
