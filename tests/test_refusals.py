@@ -62,7 +62,7 @@ REFUSED = [
     ("high=meta_critic high.batch_size=60000", "high: batch_size=60000: must be at most buffer_size=50000"),
     ("low=pdqn low.n_step=5", "low.n_step=5: must be at most steps_per_batch=4, as sums of rewards end with a batch"),
     ("low=qpamdp low.sigma_final=5", "low: sigma_final=5.0: must be at most sigma=0.1"),
-    ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_samples=256, num_iterations=5: a plan would try"),
+    ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_iterations=5, num_samples=256: a plan would try"),
     ("low=hppo low.epochs=100000", "low: epochs=100000: must be at most 1000"),
     ("low.updates_per_step=1e9", "low: updates_per_step=1000000000.0: must be at most 1000"),
     ("low=qpamdp low.features=[]", "low: features=[]: name some of the observation's entries 0 to 15; null: all"),

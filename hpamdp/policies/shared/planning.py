@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -33,22 +34,19 @@ class SearchOptions(Settings):
     min_deviation: NonNegativeFloat = 0.02
     """Smallest standard deviation of a parameter."""
 
-    def _check_search(self, numbers: dict[str, int], tried: str) -> None:
-        """Refuse more elites than one of the numbers of samples, and searches that try too many actions.
+    def _check_search(self, samples: Sequence[str], factors: Sequence[str]) -> None:
+        """Refuse more elites than samples, and searches that try too many actions.
 
         Args:
-            numbers: of samples, by the name of the setting.
-            tried: names of the settings whose product is the number of actions, apart from the samples.
+            samples: names of the settings that are numbers of samples.
+            factors: names of the other settings whose product is the number of actions.
         """
-        for name, number in numbers.items():
-            if self.num_elites > number:
-                raise ValueError(f"num_elites={self.num_elites}: must be at most {name}={number}")
-        factors = {name: getattr(self, name) for name in tried.split()}
-        total = max(numbers.values())
-        for factor in factors.values():
-            total *= factor
-        if total > 1_000_000_000:
-            given = ", ".join(f"{name}={value}" for name, value in (factors | numbers).items())
+        for name in samples:
+            if self.num_elites > getattr(self, name):
+                raise ValueError(f"num_elites={self.num_elites}: must be at most {name}={getattr(self, name)}")
+        most = max(getattr(self, name) for name in samples)
+        if most * math.prod(getattr(self, name) for name in factors) > 1_000_000_000:
+            given = ", ".join(f"{name}={getattr(self, name)}" for name in (*factors, *samples))
             raise ValueError(f"{given}: a plan would try more than 1,000,000,000 actions")
 
 
@@ -75,8 +73,7 @@ class SequenceSearchOptions(SearchOptions):
 
     @model_validator(mode="after")
     def _check_sequences(self) -> Self:
-        numbers = {"num_samples": self.num_samples, "greedy_samples": self.greedy_samples}
-        self._check_search(numbers, "horizon max_sequences num_iterations")
+        self._check_search(("num_samples", "greedy_samples"), ("horizon", "max_sequences", "num_iterations"))
         if self.min_deviation > self.first_min_deviation:
             raise ValueError(
                 f"min_deviation={self.min_deviation}: must be at most first_min_deviation={self.first_min_deviation}"

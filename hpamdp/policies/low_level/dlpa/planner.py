@@ -35,7 +35,7 @@ class PlannerOptions(PlanningOptions):
 
     @model_validator(mode="after")
     def _check_planner(self) -> Self:
-        self._check_search({"num_samples": self.num_samples}, "horizon num_iterations")
+        self._check_search(("num_samples",), ("horizon", "num_iterations"))
         return self
 
 
