@@ -171,7 +171,7 @@ def test_an_argument_with_the_name_of_a_value_of_the_run_is_refused_in_one_line(
     ("words", "complaint"),
     [
         (["recipe=goal_pdqm"], "recipe=goal_pdqm: no such file in conf/recipe; did you mean goal_pdqn? It has "),
-        (["recipe=boatdock_random"], "recipe=boatdock_random: no such file in conf/recipe; did you mean "),
+        (["recipe=boatdock_hyr"], "recipe=boatdock_hyr: no such file in conf/recipe; did you mean "),
         (
             ["recipe/high=boatdock_uc"],
             "recipe/high=boatdock_uc: no such file in conf/recipe/high; did you mean ",
