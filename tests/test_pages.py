@@ -165,3 +165,10 @@ def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
         name = re.sub("_(incongruent|congruent)$", "_NAME", name)
         text = page(level, low if level == "low" else high).read_text()
         assert f"`{name}`" in text, column
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["README.md", "docs/usage.md"])
+def test_the_python_of_a_front_page_runs(name):
+    for code in re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(), re.MULTILINE | re.DOTALL):
+        exec(compile(code, name, "exec"), {})

@@ -55,6 +55,16 @@ def test_the_readme_is_short():
     assert len((ROOT / "README.md").read_text().splitlines()) <= 155
 
 
+def test_the_page_of_the_architecture_is_short():
+    assert len((ROOT / "docs/architecture.md").read_text().splitlines()) <= 160
+
+
+@pytest.mark.parametrize("page", sorted(ROOT.glob("experiments/*/README.md")), ids=lambda page: page.parent.name)
+def test_a_study_answers_its_question_before_all_else(page):
+    first, *_ = re.split(r"^(?:## |\||!\[|```)", page.read_text(), maxsplit=1, flags=re.MULTILINE)
+    assert re.search(r"^\*\*Questions?\.\*\*.+^\*\*Answer\.\*\*", first, re.MULTILINE | re.DOTALL)
+
+
 def test_the_changelog_and_the_citation_have_this_version():
     assert f"## [{hpamdp.__version__}]" in (ROOT / "CHANGELOG.md").read_text()
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == hpamdp.__version__
