@@ -51,10 +51,10 @@ class BC(ReplayLearner):
         **settings: Any,
     ) -> None:
         options = BCOptions.of(options, settings)
+        # A data set alone fills the buffer, so there is no warm-up.
         sizes = ReplayOptions(buffer_size=options.buffer_size, batch_size=options.batch_size, warmup_steps=0)
         super().__init__(specs, device, sizes)
-        initial_scale = (options.min_scale * options.max_scale) ** 0.5
-        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range, initial_scale)
+        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
         optimizer = torch.optim.AdamW(

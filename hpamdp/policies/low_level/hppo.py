@@ -1,20 +1,20 @@
 """H-PPO: proximal policy optimisation with a discrete actor and a continuous actor for the parameters.
 
 Both actors share an encoder, and one critic V(s) serves both. Each actor has its own probability ratio and its own
-clipped surrogate; the ratio of the parameters covers the chosen action's own parameters alone.
+clipped surrogate. The ratio of the parameters covers only the chosen action's own parameters.
 
 Source: Fan, Su, Zhang and Yu, *Hybrid Actor-Critic Reinforcement Learning in Parameterized Action Space*, 2019, arXiv
 1903.01344, section 4; PPO: Schulman, Wolski, Dhariwal, Radford and Klimov 2017, arXiv 1707.06347, equation 7; GAE:
 Schulman, Moritz, Levine, Jordan and Abbeel 2016, arXiv 1506.02438, equation 16.
 
 Differs from the source:
-- the parameters are Gaussian in units where their bounds are [-1, 1]; the ratio is that of the raw sample, which is
-  clipped only for execution, because the density of a squashed sample diverges at the bounds;
-- the Gaussian's standard deviation has a lower limit, because the ratios explode where it shrinks faster than the mean
-  moves; this limit, the learning rate and the entropy bonus are annealed over `anneal_steps` steps of the whole run;
-- with `vector_products` actors and critic see products of the vectors that the problem declares, too.
+- The parameters are Gaussian in units where their bounds are [-1, 1]. The ratio is that of the raw sample, which is
+  clipped only for execution: the density of a squashed sample diverges at the bounds.
+- The Gaussian's standard deviation has a lower limit. Without it the ratios explode when the standard deviation shrinks
+  faster than the mean moves. This limit, the learning rate and the entropy bonus are annealed over `anneal_steps`.
+- With `vector_products` actors and critic also see products of the vectors that the problem declares.
 
-The advantages are TorchRL's. Its ClipPPOLoss is not used because it multiplies the ratios of all heads and clips the
+The advantages are TorchRL's. Its ClipPPOLoss does not fit: it multiplies the ratios of all heads and clips the
 product.
 """
 
@@ -118,8 +118,8 @@ class HPPO(OnPolicy, Learner):
         **settings: Any,
     ) -> None:
         super().__init__(specs)
-        self.options: HPPOOptions = HPPOOptions.of(options, settings)
-        options = self.options
+        options = HPPOOptions.of(options, settings)
+        self.options: HPPOOptions = options
         self.actor = HybridActor(
             specs,
             options.hidden_dims,
@@ -180,8 +180,8 @@ class HPPO(OnPolicy, Learner):
             "scale": distribution.log_scale.detach().mean().exp(),
             "discrete_kl": kl_estimate(discrete_log_ratio.detach()),
             "parameter_kl": kl_estimate(parameter_log_ratio.detach()),
-            "discrete_clipped": self._clipped_fraction(discrete_log_ratio.detach()),
-            "parameter_clipped": self._clipped_fraction(parameter_log_ratio.detach()),
+            "discrete_clipped": clipped_fraction(discrete_log_ratio.detach(), self.options.clip),
+            "parameter_clipped": clipped_fraction(parameter_log_ratio.detach(), self.options.clip),
         }
 
     @torch.no_grad()
@@ -287,9 +287,6 @@ class HPPO(OnPolicy, Learner):
         """Return the size of a minibatch."""
         return {"minibatch_size": self.options.minibatch_size}
 
-    def _clipped_fraction(self, log_ratio: Tensor) -> Tensor:
-        return (log_ratio.expm1().abs() > self.options.clip).float().mean()
-
 
 def kl_estimate(log_ratio: Tensor) -> Tensor:
     """Estimate the divergence of the new policy from the old one as the mean of r - 1 - log(r), never negative.
@@ -297,3 +294,8 @@ def kl_estimate(log_ratio: Tensor) -> Tensor:
     Source: Schulman 2020, *Approximating KL Divergence*, http://joschu.net/blog/kl-approx.html.
     """
     return (log_ratio.expm1() - log_ratio).mean()
+
+
+def clipped_fraction(log_ratio: Tensor, clip: float) -> Tensor:
+    """Return the fraction of the ratios that are further from 1 than `clip`."""
+    return (log_ratio.expm1().abs() > clip).float().mean()

@@ -100,7 +100,7 @@ class HSACActor(nn.Module):
 
         Args:
             state: the observations.
-            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
         """
         logits, mean, raw_scale = before_tanh(self.net(state)).split(self.sizes, -1)
         mean = mean + self.initial(state)

@@ -1,14 +1,14 @@
 """Implicit Q-learning: the value of the better actions in the data, and a policy that imitates these.
 
-V(s) is an upper expectile of Q(s, k, x) over the actions in the data, Q is fitted to r + gamma V(s'), and the policy
+V(s) is an upper expectile of Q(s, k, x) over the actions in the data. Q is fitted to r + gamma V(s'). The policy
 maximises the log-likelihood of the data's actions, weighted by exp(temperature * (Q - V)). Q is never evaluated at an
 action that is not in the data.
 
 Source: Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q-Learning*, arXiv 2110.06169,
 equations 5 to 7.
 
-Differs from the source: an action is a discrete action and its own parameters, so the policy is H-PPO's (Fan et al.
-2019, arXiv 1903.01344) and Q sees the chosen action's own parameters alone, as in MP-DQN (Bester et al. 2019, arXiv
+Differs from the source: an action is a discrete action and its own parameters. So the policy is H-PPO's (Fan et al.
+2019, arXiv 1903.01344). Q sees only the chosen action's own parameters, as in MP-DQN (Bester et al. 2019, arXiv
 1905.04388).
 
 TorchRL's IQLLoss does not fit: it reads a single action leaf.
@@ -72,8 +72,7 @@ class IQL(ReplayLearner):
     ) -> None:
         options = IQLOptions.of(options, settings)
         super().__init__(specs, device, options)
-        initial_scale = (options.min_scale * options.max_scale) ** 0.5
-        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range, initial_scale)
+        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range)
         self.state_value = mlp(specs.observation_dim, options.hidden_dims, 1)
         self.critics = HybridCritics(specs, 2, options.hidden_dims, is_multipass=True)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)

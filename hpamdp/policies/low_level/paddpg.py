@@ -96,7 +96,7 @@ def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:
 
     Args:
         output: scores and parameters, `[*B, num_discrete + num_parameters]` in [-1, 1].
-        allowed: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
+        allowed: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
     """
     if allowed is None:
         return output

@@ -104,7 +104,7 @@ class TD3BCPolicy(TensorDictModuleBase):
 
         Args:
             state: `[B, observation_dim]`.
-            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; if None, all.
         """
         log_probs = masked_logits(self.behaviour(state), allowed).log_softmax(-1)
         is_rare = log_probs < log_probs.amax(-1, keepdim=True) + self.log_threshold

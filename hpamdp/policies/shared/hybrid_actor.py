@@ -29,8 +29,8 @@ RAW = "raw_parameters"
 class HybridDistribution(NamedTuple):
     """A categorical over the discrete actions and a Gaussian for all their parameters.
 
-    Raw parameters are samples of the Gaussian in units where the bounds are [-1, 1]. They can be brought within the
-    bounds in two ways:
+    Raw parameters are samples of the Gaussian in units where the bounds are [-1, 1]. There are two ways to bring them
+    within the bounds:
 
     - clipped: the learner keeps the raw sample, whose likelihood is `log_prob`, and clips it only for execution;
     - squashed by tanh: `sample_squashed` returns parameters within the bounds and their log-densities, and gradients
@@ -132,12 +132,12 @@ class HybridActor(nn.Module):
         specs: sizes and bounds of the problem.
         hidden_dims: sizes of the encoder's layers.
         scale_range: smallest and largest standard deviation, in units where the bounds are [-1, 1].
-        initial_scale: standard deviation at initialisation, strictly within `scale_range`.
+        initial_scale: standard deviation at initialisation, strictly within `scale_range`; if None, its geometric mean.
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
         vector_products: whether the encoder also sees `VectorProducts`.
 
     Attributes:
-        products: appends these to observations; None: there are none.
+        products: appends these products to observations; None if there are none.
         num_inputs: how many numbers the encoder sees.
     """
 
@@ -149,7 +149,7 @@ class HybridActor(nn.Module):
         specs: PAMDPSpecs,
         hidden_dims: Sequence[int],
         scale_range: tuple[float, float],
-        initial_scale: float,
+        initial_scale: float | None = None,
         initial_parameters: InitialParameters = "none",
         *,
         vector_products: bool = False,
@@ -164,6 +164,8 @@ class HybridActor(nn.Module):
         log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
         self.register_buffer("log_min_scale", torch.tensor(log_min_scale, dtype=torch.float32))
         self.log_max_scale = log_max_scale
+        if initial_scale is None:
+            initial_scale = (scale_range[0] * scale_range[1]) ** 0.5
         fraction = (math.log(initial_scale) - log_min_scale) / (log_max_scale - log_min_scale)
         with torch.no_grad():
             for head in (self.discrete_head, self.parameter_head):
@@ -177,7 +179,7 @@ class HybridActor(nn.Module):
 
         Args:
             observation: of the states.
-            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; None: all.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
         """
         hidden = self.encoder(observation if self.products is None else self.products(observation))
         mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
