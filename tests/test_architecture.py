@@ -87,7 +87,7 @@ def test_the_physics_imports_only_the_constants_of_the_task():
 
 
 def test_what_a_boat_for_gymnasium_runs_through_imports_no_torch():
-    for module in ("task", "layouts", "kernel", "fleet", "numpy_boats", "gymnasium_adapter"):
+    for module in ("task", "layouts", "kernel", "numpy_boats", "gymnasium_adapter"):
         loaded = loaded_with(f"hpamdp.env.boatdock.{module}")
         assert not [name for name in loaded if any(is_in(name, library) for library in TORCH)], module
 

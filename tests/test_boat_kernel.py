@@ -14,8 +14,9 @@ from numba import njit
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, kernels
-from hpamdp.env.boatdock import episode, physics
+from hpamdp.env.boatdock import physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.task import MAX_PRESSES
 
 POSITIONS = ("start_x", "start_y", "goal_x", "goal_y", "x", "y")
 SETTINGS = {
@@ -70,14 +71,17 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
     if is_evaluation:
         env.seed_evaluation(seed)
     td = env.reset()
-    arguments = env._seed, env._environment, env.rules
+    by_tensors = BoatDockEnv(num_envs, seed=seed, first_env=7, **rules)
+    by_tensors.rows = None
+    by_tensors._streams = env._streams
     generator = torch.Generator().manual_seed(seed)
     outcomes, num_different = set(), 0
     for _ in range(num_steps):
         action = random_action(num_envs, generator, len(env.option_names))
         before = env.state
-        chosen = action[keys.OPTION] if env.has_choice else before.controller
-        moved, reward, _ = episode.step(before, chosen, action[keys.DISCRETE], action[keys.PARAMETERS], *arguments)
+        option = action[keys.OPTION] if env.has_choice else None
+        is_idle = before.outcome != physics.SAILING
+        moved, reward, _ = by_tensors._advance(before, option, action[keys.DISCRETE], action[keys.PARAMETERS], is_idle)
         for name, leaf in action.items():
             if name != keys.OPTION or env.has_choice:
                 td[name] = leaf
@@ -85,19 +89,20 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
         after = td["next"]
         same = after[keys.OUTCOME] == moved.outcome
         num_different += int((~same).sum())
-        reading = episode.read(moved, *arguments)
+        by_tensors._columns = moved
+        reading = by_tensors._read()
         for name in ("observation", "fuel", "done", "terminated", "truncated"):
-            left, right = after[name][same].float(), getattr(reading, name)[same].float()
+            left, right = after[name][same].float(), reading[name][same].float()
             assert torch.allclose(left, right, atol=1e-3 if rules.get("observation") == "pixels" else 3e-5), name
         assert torch.allclose(after[keys.REWARD][same, 0], reward[same], atol=1e-5)
         # What starts anew is compared from the same state, too.
         done = after[keys.DONE][:, 0]
-        fresh = episode.reset(moved, done, *arguments)
+        fresh = by_tensors._restart(moved, done)
         is_other_try = (env.state.start_x - fresh.start_x).abs() > 1.0
         num_different += int((is_other_try & same).sum())
         same = same & ~is_other_try
         compare(env.state, fresh, same)
-        again = episode.read(fresh, *arguments).observation
+        again = by_tensors.observe(fresh)
         assert torch.allclose(
             root["observation"][same], again[same], atol=1e-3 if rules.get("observation") == "pixels" else 3e-5
         )
@@ -134,7 +139,7 @@ def test_all_outcomes_come_up_in_the_comparison():
 def test_a_time_limit_is_the_tensor_functions_one():
     env = BoatDockEnv(2)
     td = env.reset()
-    for _ in range(episode.MAX_PRESSES):
+    for _ in range(MAX_PRESSES):
         for name in (keys.OPTION, keys.DISCRETE):
             td[name] = torch.zeros(2, dtype=torch.long)
         td[keys.PARAMETERS] = torch.zeros(2, 3)

@@ -16,7 +16,7 @@ from torchrl.envs.utils import check_env_specs
 from hpamdp import keys
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import FUEL, SCALED_NAMES
+from hpamdp.env.boatdock.task import FUEL, SCALED_NAMES
 
 CENTRE = torch.tensor(harbour.CENTRE)
 NOISE = {"motor_noise": 0.2, "sensor_noise": 3.0, "slip": 0.3}

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import MAX_PRESSES, OBSERVATION_NAMES
+from hpamdp.env.boatdock.task import MAX_PRESSES, OBSERVATION_NAMES
 
 CENTRE = torch.tensor(harbour.CENTRE)
 

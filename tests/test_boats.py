@@ -11,11 +11,13 @@ from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.config import read
+from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics, planner, rendering
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Rules
+from hpamdp.env.state_columns import where
 from hpamdp.run.assemble import assemble
 
 THREE = ["congruent", "incongruent1", "incongruent2"]
@@ -207,11 +209,13 @@ def test_an_evolutionary_search_over_presses_and_boats_never_beats_the_planner(n
             zeros + 1, zeros, zeros, zeros
         )  # fmt: skip
         flat = episode.BoatState(*(column.reshape(-1) for column in state))
-        seed, environment = torch.zeros((), dtype=torch.int32), torch.zeros(flat.x.shape, dtype=torch.int32)
+        row = torch.zeros(flat.x.shape, dtype=torch.int32)
+        rng = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.NOISE, row, row)
         for number in range(num_presses):
-            duration = durations[..., number].reshape(-1, 1).expand(-1, 3)
+            duration = durations[..., number].reshape(-1)
             option, key = boats[..., number].reshape(-1), pressed[..., number].reshape(-1)
-            flat = episode.step(flat, option, key, duration, seed, environment, rules)[0]
+            after, _ = episode.act(flat, option, key, duration, rng, rules)
+            flat = where(flat.outcome == physics.SAILING, after, flat)
         return harbour.score(flat.outcome, flat.fuel / physics.TANK).reshape(shape)
 
     boats, pressed = (torch.randint(3, (num, samples, num_presses), generator=generator) for _ in range(2))
@@ -251,10 +255,11 @@ def test_gymnasium_has_the_boats_and_their_changes():
 
 
 def test_compiled_adapters_take_other_boats():
-    from hpamdp.env.boatdock.tensor_fleet import TensorFleet
-
-    options = BoatDockOptions(boats=["congruent", "sideways"], switch_cost=0.5, controllers=SIDEWAYS)
-    assert TensorFleet(2, options, device="cpu")._env.rules == options.rules
+    options = BoatDockOptions(
+        boats=["congruent", "sideways"], switch_cost=0.5, controllers=SIDEWAYS, compile_rules=True
+    )
+    boats = BoatDockVector(2, options=options)._problem
+    assert boats.rows._env.rules == options.rules and boats.observation_space.shape == (16,)
 
 
 def test_the_fuel_of_a_change_is_not_drawn_as_a_press():

@@ -67,7 +67,7 @@ def play(env, num_steps: int, tolerance: float) -> tuple[set[int], int]:
     for _ in range(num_steps):
         td = env.rand_action(td)
         before = env.state
-        moved, reward = env._advance(before, *env._read_action(td), before.outcome != 0)
+        moved, reward, _ = env._advance(before, *env._action_leaves(td), before.outcome != 0)
         fresh = env._restart(moved, moved.outcome != 0)
         td, root = env.step_and_maybe_reset(td)
         pairs = [

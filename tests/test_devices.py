@@ -25,8 +25,8 @@ from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.env.counter_env import Action
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.policies.low_level.hyar import LATENT
@@ -124,17 +124,15 @@ def test_rules_stay_on_their_device(problem):
     rng = counter_rng.rng_key(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
     state = env.start(number, rng)
     parameters = torch.zeros(4, max(env.parameter_dims), device=META)
-    after, reward = env.act(state, number.long(), parameters, rng, number.bool())
+    after, reward = env.act(state, Action(number.long(), parameters, None), rng, number.bool())
     assert {column.device for column in (*state, *after, reward, env.observe(after))} == {META}
 
 
 def test_the_boats_rules_stay_on_their_device():
-    env = BoatDockEnv(4)
+    rules = BoatDockEnv(4).rules
     number = torch.zeros(4, dtype=torch.int32, device=META)
-    seed = counter_rng.seed_tensor(0, META)
-    state = BoatState(*(torch.empty_like(column, device=META) for column in env.state))
-    state = episode.reset(state, number.bool(), seed, number, env.rules)
-    durations = torch.zeros(4, 3, device=META)
-    after, reward, _ = episode.step(state, number, number.long(), durations, seed, number, env.rules)
-    reading = episode.read(after, seed, number, env.rules)
-    assert {column.device for column in (*after, reward, *reading)} == {META}
+    rng = counter_rng.rng_key(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
+    state = episode.start(number, rng, rules)
+    after, reward = episode.act(state, number, number.long(), torch.zeros(4, device=META), rng, rules)
+    observation = episode.observe(after, rng, rules)
+    assert {column.device for column in (*after, reward, observation)} == {META}

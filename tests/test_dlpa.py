@@ -7,8 +7,11 @@ from torch.nn import functional as F
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.env.boatdock import episode, physics
+from hpamdp.env import counter_rng
+from hpamdp.env.boatdock import episode, physics, task
 from hpamdp.env.boatdock.environment import BoatDockEnv
+from hpamdp.env.boatdock.task import Rules
+from hpamdp.env.state_columns import where
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.planner import Plan, Planner
@@ -46,12 +49,15 @@ def boats(seen: torch.Tensor) -> episode.BoatState:
 
 def true_model(state: torch.Tensor, discrete: torch.Tensor, unit: torch.Tensor) -> Prediction:
     """Predict a step of the boat task with its own rules."""
-    rules, seed, row = episode.Rules("congruent"), torch.zeros((), dtype=torch.int32), torch.arange(len(state)).int()
+    rules, row = Rules("congruent"), torch.arange(len(state)).int()
+    rng = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.NOISE, row, torch.zeros_like(row))
     before = boats(state)
-    after, reward, _ = episode.step(before, before.controller, discrete, unit + 1.0, seed, row, rules)
-    reading = episode.read(after, seed, row, rules)
-    logit = torch.where(reading.terminated.squeeze(-1), 50.0, -50.0)
-    return Prediction(reading.observation, reward[None], reward[None], logit[None])
+    duration = (unit + 1.0).clamp(0.0, physics.MAX_DURATION).gather(1, discrete.unsqueeze(1)).squeeze(1)
+    after, reward = episode.act(before, None, discrete, duration, rng, rules)
+    is_over = before.outcome != physics.SAILING
+    after, reward = where(is_over, before, after), torch.where(is_over, 0.0, reward)
+    logit = torch.where((after.outcome != physics.SAILING) & (after.presses < task.MAX_PRESSES), 50.0, -50.0)
+    return Prediction(episode.observe(after, None, rules), reward[None], reward[None], logit[None])
 
 
 def test_planning_in_the_true_model_comes_close_to_the_ceiling():

@@ -12,6 +12,7 @@ import torch
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics
 from hpamdp.env.boatdock.harbour import CONGRUENT, INCONGRUENT, Layout
+from hpamdp.env.state_columns import where
 
 NUM = 200_000
 
@@ -89,7 +90,8 @@ def test_the_layouts_of_an_environment_depend_neither_on_the_batch_nor_on_other_
     def reset(state: episode.BoatState, *rows: int) -> episode.BoatState:
         mask = torch.zeros(len(state.x), dtype=torch.bool)
         mask[list(rows)] = True
-        return episode.reset(state, mask, seed, counter(len(state.x)), rules)
+        rng = counter_rng.rng_key(seed, counter_rng.TRAINING, counter(len(state.x)), state.episode + 1)
+        return where(mask, episode.start(state.episode + 1, rng, rules), state)
 
     small = reset(reset(reset(blank(3), 0, 1, 2), 1), 1)
     large = reset(reset(reset(reset(blank(10), *range(10)), 0, 1, 7), 0, 2), 1, 9)
@@ -157,8 +159,8 @@ def test_the_steps_of_two_streams_meet_at_most_once_in_two_to_the_thirty():
 def test_random_controllers_and_key_maps_are_uniform_and_independent_of_the_layout():
     rules = episode.Rules(controller="random", keymap="random")
     num = 100_000
-    blank = episode.BoatState(*[torch.zeros(num)] * 9, *[counter(num)] * 4, episode=torch.full_like(counter(num), -1))
-    state = episode.reset(blank, counter(num) >= 0, counter_rng.seed_tensor(0), counter(num), rules)
+    rng = counter_rng.rng_key(counter_rng.seed_tensor(0), counter_rng.TRAINING, counter(num), counter(num) * 0)
+    state = episode.start(counter(num) * 0, rng, rules)
     columns = torch.stack(
         [state.controller, state.keymap - 1, state.start_x, state.start_y, state.goal_x, state.goal_y]
     )

@@ -24,7 +24,7 @@ from hpamdp.data.human.released_file import HumanData, read
 from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import FUEL
+from hpamdp.env.boatdock.task import FUEL
 from hpamdp.env.decisions import with_decisions
 
 

@@ -11,6 +11,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics
 from hpamdp.env.boatdock.physics import OUT_OF_BOUNDS, OUT_OF_FUEL, SAILING, SUCCESS, TOO_FAST
 
@@ -228,7 +229,7 @@ def test_a_press_of_no_duration_changes_nothing():
 
 
 def press_and_step(columns: tuple[torch.Tensor, ...], arguments: tuple) -> tuple:
-    return physics.press(*columns), episode.step(*arguments)
+    return physics.press(*columns), episode.act(*arguments)
 
 
 @pytest.fixture(scope="module")
@@ -243,14 +244,14 @@ def test_compiled_and_eager_agree(compiled):
     rows = torch.arange(num, dtype=torch.int32)
     seed = torch.tensor(7, dtype=torch.int32)
     rules = episode.Rules()
-    blank = episode.BoatState(*[torch.zeros(num)] * 9, *[torch.zeros_like(rows)] * 5)
-    state = episode.reset(blank, torch.ones(num, dtype=torch.bool), seed, rows, rules)
+    rng = counter_rng.rng_key(seed, counter_rng.TRAINING, rows, torch.zeros_like(rows))
+    state = episode.start(torch.zeros_like(rows), rng, rules)
     generator = torch.Generator().manual_seed(0)
     durations = 1.5 * torch.rand(num, 3, generator=generator)
     options, keys = (torch.randint(n, (num,), generator=generator) for n in (2, 3))
     direction = harbour.direction(options, state.keymap, keys)
     columns = (state.x, state.y, state.fuel, state.goal_x, state.goal_y, *direction, durations[:, 0])
-    arguments = (state, options, keys, durations, seed, rows, rules)
+    arguments = (state, options, keys, durations[:, 0], rng, rules)
     eager = flat(press_and_step(columns, arguments))
     fast = flat(compiled(columns, arguments))
     # Rounding may change the outcome of a boat that nearly touches a circle; the others must agree.

@@ -12,25 +12,24 @@ import importlib
 from collections.abc import Mapping
 from typing import Any
 
-import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv
 from hpamdp.env.gymnasium_adapter import (
-    After,
     GymnasiumAdapter,
     GymnasiumVectorAdapter,
-    NumpyEnv,
+    NumpyRows,
     RenderMode,
     as_array,
     describe,
 )
+from hpamdp.env.kernel_rows import KernelRows, Results
 from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
 
 
@@ -73,18 +72,88 @@ class CounterVectorAdapter(GymnasiumVectorAdapter):
         super().__init__(NumpyCounterEnv(env, (num_envs,)), num_envs, autoreset_mode)
 
 
-class NumpyCounterEnv(NumpyEnv):
+class TensorRows:
+    """What `KernelRows` is, for a `CounterEnv` that its tensor functions move: on a GPU, or compiled."""
+
+    def __init__(self, env: CounterEnv) -> None:
+        self._env = env
+
+    @property
+    def floats(self) -> np.ndarray:
+        """The float32 columns of the state."""
+        return np.stack([to_numpy(column) for column in self._env.state if column.is_floating_point()])
+
+    @property
+    def integers(self) -> np.ndarray:
+        """The int32 columns of the state."""
+        return np.stack([to_numpy(column) for column in self._env.state if not column.is_floating_point()])
+
+    def begin(self, seed: int) -> None:
+        """Put every row before its first episode of training with this seed."""
+        self._env.set_seed(seed, static_seed=True)
+
+    def act(self, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> Results:
+        """Take an action in every row; an invalid one raises the environment's own error."""
+        td = TensorDict(batch_size=self._env.batch_size, device=self._env.device)
+        td[keys.DISCRETE], td[keys.PARAMETERS] = torch.from_numpy(discrete), torch.from_numpy(parameters)
+        if option is not None:
+            td[keys.OPTION] = torch.from_numpy(option)
+        return self._results(self._env.step(td)["next"])
+
+    def act_or_restart(self, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> Results:
+        """Take an action, and instead start a new episode where one is over; actions are not read there."""
+        was_over = self.integers[OUTCOME_ROW] != GOING_ON
+        option = None if option is None else np.where(was_over, 0, option)
+        discrete, parameters = np.where(was_over, 0, discrete), np.where(was_over[:, None], np.float32(0.0), parameters)
+        results = self.act(option, discrete, parameters)
+        return self.restart(was_over)._replace(rewards=results.rewards) if was_over.any() else results
+
+    def restart(self, mask: np.ndarray | None = None) -> Results:
+        """Start new episodes, in the rows of `mask` or in all."""
+        td = TensorDict(batch_size=self._env.batch_size, device=self._env.device)
+        if mask is not None:
+            td["_reset"] = torch.from_numpy(mask.copy()).to(self._env.device).unsqueeze(-1)
+        return self._results(self._env.reset(td))
+
+    def read(self) -> Results:
+        """Return what is observed."""
+        return self.restart(np.zeros(self._env.num_envs, np.bool_))
+
+    def put(self, columns: Mapping[int, np.ndarray], mask: np.ndarray | None) -> None:
+        """Set columns of the state by their places."""
+        state = [to_numpy(column) for column in self._env.state]
+        for place, column in columns.items():
+            np.copyto(state[place], column, where=True if mask is None else mask)
+        self._env.state = type(self._env.state)(*map(torch.from_numpy, state))
+
+    def _results(self, td: TensorDictBase) -> Results:
+        flags = np.stack([to_numpy(td[name])[:, 0] for name in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)])
+        reward = td.get(keys.REWARD, None)
+        return Results(
+            observations=to_numpy(td[keys.OBSERVATION])[None],
+            outcomes=to_numpy(td[keys.OUTCOME])[None],
+            entries=np.empty((1, 0, len(flags[0])), np.float32),  # which no adapter reads
+            flags=flags[None],
+            rewards=np.zeros(len(flags[0]), np.float32) if reward is None else to_numpy(reward)[:, 0],
+        )
+
+
+def rows_of(env: CounterEnv) -> KernelRows | TensorRows:
+    """Return what moves the rows of an environment."""
+    return TensorRows(env) if env.rows is None else env.rows
+
+
+class NumpyCounterEnv(NumpyRows):
     """A `CounterEnv` with NumPy in and out: one environment (`batch=()`) or many (`batch=(N,)`)."""
 
     final_infos = ("is_success",)
 
     def __init__(self, env: CounterEnv, batch: tuple[int, ...]) -> None:
-        self.is_reset = False
+        super().__init__(rows_of(env), batch)
         self.action_space = _action_space(env)
         low, high = (np.array(side, np.float32) for side in env.observation_bounds)
         self.observation_space = spaces.Box(low, high, dtype=np.float32)
         self._env = env
-        self._batch = batch
         self._outcome_names = np.array(env.outcomes, dtype=object)
 
     @property
@@ -92,61 +161,12 @@ class NumpyCounterEnv(NumpyEnv):
         """The columns of the state."""
         return self._env.state
 
-    def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
-        """Start new episodes; there are no options."""
-        if options:
-            raise ValueError(f"reset: unknown options {sorted(options)}; there are none")
-        if seed is not None:
-            self._env.set_seed(seed, static_seed=True)
-        self.is_reset = True
-        if self._env.rows is not None:
-            return self._env.rows.restart(mask).observations[0]
-        given = TensorDict(batch_size=self._env.batch_size, device=self._env.device)
-        if mask is not None:
-            given["_reset"] = torch.from_numpy(mask.copy()).to(self._env.device).unsqueeze(-1)
-        return to_numpy(self._env.reset(given)[keys.OBSERVATION])
-
-    def step(self, action: Any, *, restarts: bool = False) -> After:
-        """Return what follows an action in every environment."""
-        if not self.is_reset:
-            raise gymnasium.error.ResetNeeded("step: call reset first")
-        given, joined = self._leaves(action)
-        if self._env.rows is not None:
-            act = self._env.rows.act_or_restart if restarts else self._env.rows.act
-            results = act(given, joined)
-            if not isinstance(results, int):
-                return After(results.observations[0], results.rewards, results.flags[0, 1], results.flags[0, 2])
-        discrete, parameters = torch.from_numpy(given), torch.from_numpy(joined)
-        over = self._env.state.outcome != GOING_ON
-        restarts = restarts and bool(over.any())
-        if restarts:
-            discrete[over.cpu()] = 0
-            parameters[over.cpu()] = 0.0
-        td = TensorDict(batch_size=self._env.batch_size, device=self._env.device)
-        td[keys.DISCRETE] = discrete
-        td[keys.PARAMETERS] = parameters
-        after = self._env.step(td)["next"]
-        observations, flags = after[keys.OBSERVATION], (after[keys.TERMINATED], after[keys.TRUNCATED])
-        if restarts:
-            # Finished episodes stayed as they were and earned 0, so only the other results of their rows change.
-            observations = self._env.reset(td.empty().set("_reset", over.unsqueeze(-1)))[keys.OBSERVATION]
-            flags = tuple(flag & ~over.unsqueeze(-1) for flag in flags)
-        return After(to_numpy(observations), *(to_numpy(column)[:, 0] for column in (after[keys.REWARD], *flags)))
-
-    @property
-    def is_over(self) -> np.ndarray:
-        """Which episodes are over, bool `[N]`."""
-        return self._integers()[1] != GOING_ON
-
-    def _integers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the counts of steps and the outcomes, `[N]` each."""
-        if self._env.rows is not None:
-            return self._env.rows.integers[STEPS_ROW], self._env.rows.integers[OUTCOME_ROW]
-        return to_numpy(self._env.state.steps), to_numpy(self._env.state.outcome)
+    def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
+        return self._env.invalid_action(row, option, discrete, parameters)
 
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each."""
-        steps, outcome = self._integers()
+        steps, outcome = self.rows.integers[STEPS_ROW], self.rows.integers[OUTCOME_ROW]
         return {
             "outcome": self._outcome_names[outcome],
             "steps": steps.astype(np.int64),
@@ -155,12 +175,12 @@ class NumpyCounterEnv(NumpyEnv):
 
     def info(self) -> dict[str, Any]:
         """Return the infos of the first environment as Python's numbers."""
-        steps, outcome = (int(column[0]) for column in self._integers())
+        steps, outcome, _ = self.rows.integers[STEPS_ROW:, 0].tolist()
         values = {"outcome": self._env.outcomes[outcome], "steps": steps}
         return values if outcome == GOING_ON else {**values, "is_success": outcome == SUCCESS}
 
-    def _leaves(self, action: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Check the structure, types and shapes of an action and return its leaves, `[N]` and `[N, num_parameters]`."""
+    def _leaves(self, action: Any) -> tuple[None, np.ndarray, np.ndarray]:
+        """Check an action's structure, types and shapes; return discrete actions and parameters."""
         if not isinstance(action, (tuple, list)) or len(action) != 2:
             raise ValueError(f"step: the action must be a tuple (discrete, parameters), but is {describe(action)}")
         discrete, parameters = action
@@ -174,7 +194,7 @@ class NumpyCounterEnv(NumpyEnv):
         ]
         joined = np.empty((self._env.num_envs, sum(dims)), np.float32)
         np.concatenate(arrays, axis=-1, out=joined if self._batch else joined[0], casting="same_kind")
-        return given.reshape(self._env.num_envs), joined
+        return None, given.reshape(self._env.num_envs), joined
 
 
 def _load(problem: str) -> type[Any]:

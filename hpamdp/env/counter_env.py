@@ -10,27 +10,26 @@ import itertools
 import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import torch
 from PIL import Image
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.actions import invalid_action
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.kernel_rows import Advance, KernelRows, Results
+from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import Settings
 
-# What a tensordict has whose next root holds nothing else.
-_PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.ACTION}
+# What a tensordict has whose next root holds nothing else, beside the entries of the problem.
+_PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
 _SECONDS_A_STEP = 0.25  # in films
@@ -53,6 +52,21 @@ class EpisodeColumns(Columns, Protocol):
 
 
 EpisodeState = TypeVar("EpisodeState", bound=EpisodeColumns)
+
+
+class Action(NamedTuple):
+    """An action in every environment.
+
+    Attributes:
+        discrete: the chosen actions, int64 `[N]`.
+        parameters: of the chosen actions, within their bounds, `[N, D]`, where D is the largest number of parameters
+            that an action has. Parameters that an action does not have are 0.
+        option: the chosen options, int64 `[N]`; None if the agent does not choose.
+    """
+
+    discrete: Tensor
+    parameters: Tensor
+    option: Tensor | None
 
 
 class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
@@ -86,15 +100,19 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     options: Any  # of the class Options
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
     observation_names: tuple[str, ...]
+    entry_names: tuple[str, ...] = ()  # of entries `[N, 1]` in [0, 1] beside the observation and the outcome
+    start_keys: frozenset[str] = frozenset()  # entries of a tensordict that `reset` takes, to start from
+    action_names: ClassVar[tuple[str, str]] = ("discrete", "parameters")  # what errors call an action
     # Bounds of the parameters of all discrete actions, side by side.
     parameter_low: Sequence[float]
     parameter_high: Sequence[float]
     row_kernel: ClassVar[Advance | None] = None  # stands for `start`, `act` and `observe` on the CPU
-    result_keys = (keys.OUTCOME,)
+    result_keys: tuple[str, ...] = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
     rows: KernelRows | None = None  # what the kernel moves; None where the tensor functions do
     limit_terminates = False  # whether values stop at the time limit, as at any other end
+    float_type = torch.float32  # of observations and rewards
     _has_oracle = False
 
     def __init__(
@@ -113,6 +131,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         facts = self.facts(self.options)
+        self._chooses = facts.has_choice
         self.option_names = facts.option_names
         self.can_change_option = facts.can_change_option
         self.plans_change_options = facts.plans_change_options
@@ -160,7 +179,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _use_kernel(self) -> None:
         """Let the kernel move the environments on the CPU, unless rules are compiled or replaced by a subclass."""
-        if self.row_kernel is None or self.device.type != "cpu" or self._is_compiled:
+        is_on_cpu = self.device is None or self.device.type == "cpu"
+        if self.row_kernel is None or not is_on_cpu or self._is_compiled:
             return
         owner = next(cls for cls in type(self).__mro__ if "row_kernel" in vars(cls))
         if any(getattr(type(self), name) is not getattr(owner, name) for name in ("start", "act", "observe")):
@@ -172,10 +192,10 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             self.row_kernel,
             self.num_envs,
             num_columns=(len(state._fields) - num_integers, num_integers),
-            observation_dim=len(self.observation_names),
+            reading_dims=(len(self.observation_names), len(self.entry_names)),
             parameter_dims=self.parameter_dims,
             bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(),
-            settings=[self.max_steps, *self.kernel_settings()],
+            settings=[self.max_steps, len(self.option_names) if self._chooses else 0, *self.kernel_settings()],
             first_env=int(self._environment[0]),
         )
         self.rows.set_seed(int(self._seed), self._streams)
@@ -205,16 +225,12 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         """
 
     @abstractmethod
-    def act(
-        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
-    ) -> tuple[EpisodeState, Tensor]:
+    def act(self, state: EpisodeState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[EpisodeState, Tensor]:
         """Return the states after one action in every environment, and the rewards `[N]`.
 
         Args:
             state: before the action.
-            discrete: the chosen actions, int64 `[N]`.
-            parameters: of the chosen actions, within their bounds, `[N, D]`, where D is the largest number of
-                parameters that an action has; what an action does not have is 0.
+            action: what is done.
             rng: keys of the episodes' noise, `[N]`.
             is_idle: bool `[N]`: rows whose result is thrown away, since their episode is over or their step is masked.
         """
@@ -222,6 +238,21 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     @abstractmethod
     def observe(self, state: EpisodeState) -> Tensor:
         """Return the observations `[N, observation_dim]`."""
+
+    def entries(self, state: EpisodeState) -> Sequence[Tensor]:
+        """Return the further entries that the environment writes, `[N]` each, in the order of `entry_names`."""
+        return ()
+
+    def start_columns(self, given: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """Check what `reset` was given to start from, and return the columns `[N]` of the state that it sets.
+
+        Args:
+            given: entries among `start_keys`.
+
+        Raises:
+            ValueError: an entry is missing, or has another shape or a value that is not allowed.
+        """
+        return {}
 
     def scripted_action(self, state: EpisodeState) -> tuple[Tensor, Tensor]:
         """Return the action of a hand-written player and its one parameter, `[N]` each, for comparison with learners.
@@ -248,9 +279,19 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             yield from itertools.repeat(picture, max(1, round(fps * _SECONDS_A_STEP)))
 
     @property
+    def has_choice(self) -> bool:
+        """Whether the agent chooses an option."""
+        return self._chooses or self.option_actions is not None
+
+    @property
     def state(self) -> EpisodeState:
-        """The columns of the state, `[N]` each."""
+        """The columns of the state, `[N]` each; assign others to put the environments elsewhere."""
         return self._state if self.rows is None else cloned(self._state)
+
+    @state.setter
+    def state(self, state: EpisodeState) -> None:
+        self._state = type(state)(*(column.to(self.device) for column in state))
+        self._has_episodes = True
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -273,7 +314,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             ValueError: a number is invalid.
         """
         super().check_env_state(columns)
-        check_range(columns, {"steps": (0, 2**30), "outcome": (0, len(self.outcomes)), "episode": (-1, 2**30)})
+        steps, outcome, episode = self._state._fields[-3:]
+        check_range(columns, {steps: (0, 2**30), outcome: (0, len(self.outcomes)), episode: (-1, 2**30)})
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`; an empty one starts new episodes.
@@ -284,7 +326,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         if not columns:
             self._reset()
             return
-        self._state = restored(columns, self._state, type(self).__name__)
+        self.state = restored(columns, self._state, type(self).__name__)
 
     def seed_evaluation(self, seed: int) -> None:
         """Begin with the episodes of an evaluation, which no training meets, whatever its seed."""
@@ -294,20 +336,36 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _make_specs(self, low: Tensor, high: Tensor) -> None:
         n, device = self.num_envs, self.device
+        entries = {
+            name: Bounded(0.0, 1.0, shape=(n, 1), device=device, dtype=torch.float32) for name in self.entry_names
+        }
+        observation = Unbounded(shape=(n, len(self.observation_names)), device=device, dtype=self.float_type)
+        outcome = Categorical(len(self.outcomes), shape=(n,), device=device)
+        knowledge = self._knowledge_specs()
+        self._has_knowledge = bool(knowledge)
         self.observation_spec = Composite(
-            observation=Unbounded(shape=(n, len(self.observation_names)), device=device, dtype=torch.float32),
-            outcome=Categorical(len(self.outcomes), shape=(n,), device=device),
+            {keys.OBSERVATION: observation, keys.OUTCOME: outcome, **entries, **knowledge}, shape=(n,), device=device
+        )
+        self.action_spec = self.make_action_spec(low, high, has_option=self._chooses)
+        self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=self.float_type)
+        self.done_spec = self.make_done_spec()
+
+    def _knowledge_specs(self) -> dict[str, Composite]:
+        """Return the specs of what is known beside the observation, such as the action of a scripted player."""
+        if not self._has_oracle:
+            return {}
+        n, device = self.num_envs, self.device
+        oracle = Composite(
+            discrete=Categorical(len(self.parameter_dims), shape=(n, 1), device=device),
+            parameters=Unbounded(shape=(n, 1), device=device, dtype=torch.float32),
             shape=(n,),
         )
-        if self._has_oracle:
-            self.observation_spec["oracle"] = Composite(
-                discrete=Categorical(len(self.parameter_dims), shape=(n, 1), device=device),
-                parameters=Unbounded(shape=(n, 1), device=device, dtype=torch.float32),
-                shape=(n,),
-            )
-        self.action_spec = self.make_action_spec(low, high)
-        self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=torch.float32)
-        self.done_spec = self.make_done_spec()
+        return {"oracle": oracle}
+
+    def _knowledge(self) -> dict[str, Any]:
+        """Return what `_knowledge_specs` describes, for the current states."""
+        discrete, parameter = self.scripted_action(self._state)
+        return {"oracle": {"discrete": discrete.unsqueeze(-1), "parameters": parameter.unsqueeze(-1)}}
 
     def _place_parameters(self, low: Tensor, high: Tensor) -> None:
         """Note where the parameters of each discrete action lie, and their bounds, `[K, D]` each."""
@@ -325,6 +383,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _begin(self) -> None:
         """Put every environment before its first episode."""
+        self._has_episodes = False
         self._state = self._start(torch.full_like(self._environment, -1))
         if self.rows is not None:
             self.rows.set_seed(int(self._seed), self._streams)
@@ -332,104 +391,163 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def _start(self, episode: Tensor) -> EpisodeState:
         return self.start(episode, counter_rng.rng_key(self._seed, self._streams[0], self._environment, episode))
 
+    def _noise_rng(self, state: EpisodeState) -> RngKey:
+        """Return the keys of the episodes' noise, `[N]`."""
+        return counter_rng.rng_key(self._seed, self._streams[1], self._environment, state.episode)
+
     def _restart(self, state: EpisodeState, mask: Tensor) -> EpisodeState:
         """Return the states with new episodes in the rows of `mask` `[N]`."""
         return where(mask, self._start(state.episode + 1), state)
 
     def _advance(
-        self, state: EpisodeState, discrete: Tensor, parameters: Tensor, is_idle: Tensor
-    ) -> tuple[EpisodeState, Tensor]:
-        """Return the states after one action, with the time limit, and the rewards; idle rows stay as they are."""
-        rng = counter_rng.rng_key(self._seed, self._streams[1], self._environment, state.episode)
-        after, reward = self.act(state, discrete, parameters, rng, is_idle)
+        self, state: EpisodeState, option: Tensor | None, discrete: Tensor, parameters: Tensor, is_idle: Tensor
+    ) -> tuple[EpisodeState, Tensor, Tensor]:
+        """Return the states after one action, with the time limit, the rewards, and whether the actions are valid.
+
+        Idle rows stay as they are. The other results of an invalid action are meaningless.
+        """
+        action, is_valid = self._chosen(option, discrete, parameters)
+        after, reward = self.act(state, action, self._noise_rng(state), is_idle)
         is_out_of_time = (after.steps >= self.max_steps) & (after.outcome == GOING_ON)
         after = replaced(after, outcome=torch.where(is_out_of_time, len(self.outcomes) - 1, after.outcome))
-        return where(is_idle, state, after), torch.where(is_idle, 0.0, reward)
+        return where(is_idle, state, after), torch.where(is_idle, 0.0, reward), is_valid
+
+    def _chosen(self, option: Tensor | None, discrete: Tensor, parameters: Tensor) -> tuple[Action, Tensor]:
+        """Return the actions as `act` takes them, and whether they are valid `[N]`."""
+        exists = (discrete >= 0) & (discrete < len(self.parameter_dims))
+        action = torch.where(exists, discrete, 0)
+        own = parameters.to(self._parameter_low.dtype).gather(-1, self._parameter_place[action])
+        has_parameter = self._has_parameter[action]
+        is_finite = own.isfinite()
+        is_valid = exists & (is_finite | ~has_parameter).all(-1)
+        if option is not None:
+            is_valid = is_valid & (option >= 0) & (option < len(self.option_names))
+        own = torch.where(has_parameter & is_finite, own, 0.0)
+        own = own.clamp(self._parameter_low[action], self._parameter_high[action])
+        return Action(action, torch.where(has_parameter, own, 0.0), option), is_valid
 
     def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         mask = self.reset_mask(tensordict)
+        given = self._given_columns(tensordict)
+        results = None
         if self.rows is not None:
-            return self._reading(self.rows.restart(mask.numpy()))
-        self._state = self._pure_reset(self._state, mask)
-        return self._read()
+            results = self.rows.restart(mask.numpy())
+        else:
+            self._state = self._pure_reset(self._state, mask)
+        if given:
+            state = self._state
+            self._state = where(mask, replaced(state, **given), state)
+            results = None
+        self._has_episodes = True
+        self._on_start(mask)
+        return self._read() if results is None else self._reading(results)
+
+    def _on_start(self, mask: Tensor) -> None:
+        """Prepare what the episodes that have just begun, in the rows of `mask` `[N]`, need beside their state."""
+
+    def _given_columns(self, tensordict: TensorDictBase | None) -> dict[str, Tensor]:
+        """Return the columns of the state that `reset` was given."""
+        names = () if tensordict is None else self.start_keys & set(tensordict.keys())
+        if tensordict is None or not names:
+            return {}
+        columns = self.start_columns({name: tensordict.get(name).cpu().numpy() for name in names})
+        return {name: torch.from_numpy(column).to(self.device) for name, column in columns.items()}
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_step", None)
         mask = None if mask is None else mask.reshape(self.num_envs)
+        leaves = self._action_leaves(tensordict)
         if self.rows is not None:
-            results = self._act(tensordict, mask)
-            if results is not None:
-                return self._reading(results, has_reward=True)
-        discrete, parameters = self._read_action(tensordict)
+            return self._reading(self._act(leaves, mask), has_reward=True)
         before = self._state
         is_idle = before.outcome != GOING_ON
         if mask is not None:
             is_idle = is_idle | ~mask
-        self._state, reward = self._pure_step(before, discrete, parameters, is_idle)
+        after, reward, is_valid = self._pure_step(before, *leaves, is_idle)
+        if not is_valid.all():
+            raise self.invalid_action(int((~is_valid).nonzero()[0]), *leaves)
+        self._state = after
         return self._read().set(keys.REWARD, reward.unsqueeze(-1))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        is_plain = self.rows is not None and not self._has_oracle and _PLAIN_KEYS.issuperset(tensordict.keys())
-        results = self._act(tensordict, None, restarts=True) if is_plain else None
-        if results is None:
+        is_plain = self.rows is not None and not self._has_knowledge and tensordict.device == self.device
+        if not is_plain or not _PLAIN_KEYS.union(self.entry_names).issuperset(tensordict.keys()):
             return super()._step_and_maybe_reset(tensordict)
+        leaves = self._action_leaves(tensordict)
+        if self.rows is None:  # the parameters require gradients
+            return super()._step_and_maybe_reset(tensordict)
+        results = self._act(leaves, None, restarts=True)
         # The same in one pass: TorchRL's own steps between ours take longer than the kernel. It keeps the action, too;
         # in a tensordict of its own, since an update of the root changes it in place.
         action = TensorDict._new_unsafe(
             dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
         )
-        root = self._reading(results, number=1, kept={keys.ACTION: action})
+        kept: dict[str, Any] = {keys.ACTION: action}
+        if keys.OPTION in tensordict.keys():
+            kept[keys.OPTION] = tensordict.get(keys.OPTION)
+        root = self._reading(results, number=1, kept=kept)
         return tensordict.set("next", self._reading(results, has_reward=True)), root
 
-    def _act(self, tensordict: TensorDictBase, mask: Tensor | None, *, restarts: bool = False) -> Results | None:
-        """Act with the kernel; None where it cannot, since the parameters require gradients: it is given up then."""
-        assert self.rows is not None
+    def _action_leaves(self, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor, Tensor]:
+        """Return option, discrete actions and parameters, whose values are still to be checked.
+
+        Parameters that require gradients end the use of the kernel.
+
+        Raises:
+            RuntimeError: no episode has begun since the last seed.
+        """
+        if not self._has_episodes:
+            raise RuntimeError(f"{self.title}: no episode has begun; call reset before step")
         self.check_action(tensordict)
-        discrete, parameters = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
-        if parameters.requires_grad and torch.is_grad_enabled():
+        action = tensordict.get(keys.ACTION)
+        discrete, parameters = action.get("discrete").long(), action.get("parameters").float()
+        if self.rows is not None and parameters.requires_grad and torch.is_grad_enabled():
             self._columns, self.rows = self.state, None
-            return None
+        return tensordict.get(keys.OPTION).long() if self._chooses else None, discrete, parameters
+
+    def _act(
+        self, leaves: tuple[Tensor | None, Tensor, Tensor], mask: Tensor | None, *, restarts: bool = False
+    ) -> Results:
+        """Act with the kernel."""
+        assert self.rows is not None
+        option, discrete, parameters = leaves
         results = self.rows.act(
-            discrete.long().contiguous().numpy(),
-            parameters.detach().float().contiguous().numpy(),
-            mask=None if mask is None else mask.numpy(),
+            None if option is None else _array(option),
+            _array(discrete),
+            _array(parameters),
+            mask=None if mask is None else _array(mask),
             restarts=restarts,
         )
         if isinstance(results, int):
-            self._read_action(tensordict)
-            raise AssertionError(f"row {results}")
+            raise self.invalid_action(results, *leaves)
         return results
 
-    def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Check the action; return its discrete part `[N]` and its own parameters `[N, D]`, clipped, as `act` does."""
-        self.check_action(tensordict)
-        given = tensordict.get(keys.DISCRETE).long()
-        exists = (given >= 0) & (given < len(self.parameter_dims))
-        discrete = torch.where(exists, given, 0)
-        own = tensordict.get(keys.PARAMETERS).to(self._parameter_low.dtype).gather(-1, self._parameter_place[discrete])
-        has_parameter = self._has_parameter[discrete]
-        is_valid = exists & (own.isfinite() | ~has_parameter).all(-1)
-        if not is_valid.all():
-            row = int((~is_valid).nonzero()[0])
-            values: dict[str, tuple[object, str]] = {
-                "discrete": (given[row].item(), f"allowed 0 to {len(self.parameter_dims) - 1}")
-            }
-            if exists[row]:
-                values["parameters"] = (own[row].tolist(), "those of the chosen action must be finite")
-            raise invalid_action(row, values)
-        own = own.clamp(self._parameter_low[discrete], self._parameter_high[discrete])
-        return discrete, torch.where(has_parameter, own, 0.0)
+    def invalid_action(self, row: int, option: Any, discrete: Any, parameters: Any) -> ValueError:
+        """Return the error for the action of a row, given tensors or arrays of all rows."""
+        return invalid_choice(
+            row,
+            option=None if option is None else option[row].item(),
+            discrete=discrete[row].item(),
+            parameters=parameters[row].tolist(),
+            parameter_dims=self.parameter_dims,
+            num_options=len(self.option_names),
+            names=self.action_names,
+        )
 
     def _read(self) -> TensorDict:
-        outcome = self._state.outcome.long()
+        if self.rows is not None:
+            return self._reading(self.rows.read())
+        state = self._state
+        outcome = state.outcome.long()
         done = (outcome != GOING_ON).unsqueeze(-1)
         truncated = (outcome == len(self.outcomes) - 1).unsqueeze(-1)
         leaves = {
-            keys.OBSERVATION: self._pure_observe(self._state),
+            keys.OBSERVATION: self._pure_observe(state),
             keys.OUTCOME: outcome,
+            **{name: entry.unsqueeze(-1) for name, entry in zip(self.entry_names, self.entries(state), strict=True)},
             **self._flags(done, done & ~truncated, truncated),
         }
-        return self._with_oracle(TensorDict(leaves, batch_size=self.batch_size, device=self.device))
+        return self._with_knowledge(TensorDict(leaves, batch_size=self.batch_size, device=self.device))
 
     def _reading(
         self, results: Results, *, number: int = 0, has_reward: bool = False, kept: Mapping[str, Any] | None = None
@@ -442,10 +560,12 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             keys.OUTCOME: torch.from_numpy(results.outcomes[number]),
             **self._flags(*flags.unbind(0)),
         }
+        for place, name in enumerate(self.entry_names):
+            leaves[name] = torch.from_numpy(results.entries[number, place]).unsqueeze(-1)
         if has_reward:
             leaves[keys.REWARD] = torch.from_numpy(results.rewards).unsqueeze(-1)
         # The checks of the constructor would take longer than a hundred rows.
-        return self._with_oracle(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
+        return self._with_knowledge(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
 
     def _flags(self, done: Tensor, terminated: Tensor, truncated: Tensor) -> dict[Any, Tensor]:
         """Return the flags `[N, 1]` as leaves."""
@@ -453,8 +573,12 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             terminated, truncated = done.clone(), torch.zeros_like(done)
         return {keys.DONE: done, keys.TERMINATED: terminated, keys.TRUNCATED: truncated}
 
-    def _with_oracle(self, seen: TensorDict) -> TensorDict:
-        if self._has_oracle:
-            discrete, parameter = self.scripted_action(self._state)
-            seen.set("oracle", {"discrete": discrete.unsqueeze(-1), "parameters": parameter.unsqueeze(-1)})
+    def _with_knowledge(self, seen: TensorDict) -> TensorDict:
+        if self._has_knowledge:
+            for name, leaf in self._knowledge().items():
+                seen.set(name, leaf)
         return seen
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().contiguous().numpy()

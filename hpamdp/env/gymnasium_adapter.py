@@ -14,6 +14,9 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from hpamdp.env.kernel_rows import KernelRows
+from hpamdp.env.kernels import OUTCOME_ROW
+
 RenderMode = Literal["rgb_array"] | None
 
 
@@ -61,6 +64,62 @@ class NumpyEnv(Protocol):
             for name in self.final_infos:
                 del values[name]
         return {name: value.item(0) for name, value in values.items()}
+
+
+class NumpyRows(NumpyEnv):
+    """Environments with NumPy in and out whose rows a kernel moves, or what has the same methods.
+
+    Args:
+        rows: what moves the environments.
+        batch: `()` for one environment, `(N,)` for many.
+    """
+
+    def __init__(self, rows: Any, batch: tuple[int, ...]) -> None:
+        self.is_reset = False
+        self.rows: KernelRows = rows
+        self._batch = batch
+        self._num_envs = batch[0] if batch else 1
+
+    def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
+        """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, observation_dim]`."""
+        columns = self._start_columns(options or {})
+        if seed is not None:
+            self.rows.begin(seed)
+        self.is_reset = True
+        results = self.rows.restart(mask)
+        if columns:
+            self.rows.put(columns, mask)
+            results = self.rows.read()
+        return results.observations[0]
+
+    def step(self, action: Any, *, restarts: bool = False) -> After:
+        """Return what follows an action in every environment."""
+        if not self.is_reset:
+            raise gymnasium.error.ResetNeeded("step: call reset first")
+        leaves = self._leaves(action)
+        results = self.rows.act_or_restart(*leaves) if restarts else self.rows.act(*leaves)
+        if isinstance(results, int):
+            raise self._invalid(results, *leaves)
+        return After(results.observations[0], results.rewards, results.flags[0, 1], results.flags[0, 2])
+
+    @property
+    def is_over(self) -> np.ndarray:
+        """Which episodes are over, bool `[N]`."""
+        return self.rows.integers[OUTCOME_ROW] != 0
+
+    def _start_columns(self, options: Mapping[str, Any]) -> Mapping[int, np.ndarray]:
+        """Check the options of a reset and return the columns of the state that they set, by their places."""
+        if options:
+            raise ValueError(f"reset: unknown options {sorted(options)}; there are none")
+        return {}
+
+    def _leaves(self, action: Any) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
+        """Check an action's structure, types and shapes; return options, discrete actions and parameters."""
+        raise NotImplementedError
+
+    def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
+        """Return the error for the action of a row."""
+        raise NotImplementedError
 
 
 class GymnasiumAdapter(gymnasium.Env):

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from hpamdp.env import kernels
 from hpamdp.env.kernels import ACT, ACT_AND_RESTART, ACT_OR_RESTART, RESTART
+from hpamdp.env.rng_streams import NOISE, TRAINING
+from hpamdp.messages import invalid_action
 
 # Moves all rows; its arguments are those of `KernelRows.advance`, in this order.
 Advance = Callable[..., int]
@@ -17,12 +19,13 @@ Advance = Callable[..., int]
 class Results(NamedTuple):
     """What R readings of N rows say; R is 2 where rows that are over started anew, before and after that.
 
-    `observations` float32 `[R, N, D]`, `outcomes` int64 `[R, N]`, `flags` bool `[R, 3, N]` (done, terminated,
-    truncated) and `rewards` float32 `[N]`.
+    `observations` float32 `[R, N, D]`, `outcomes` int64 `[R, N]`, `entries` float32 `[R, E, N]` (what a problem reports
+    besides), `flags` bool `[R, 3, N]` (done, terminated, truncated) and `rewards` float32 `[N]`.
     """
 
     observations: np.ndarray
     outcomes: np.ndarray
+    entries: np.ndarray
     flags: np.ndarray
     rewards: np.ndarray
 
@@ -34,11 +37,11 @@ class KernelRows:
         advance: the kernel of the problem.
         num_rows: N.
         num_columns: how many float32 and how many int32 columns the state has.
-        observation_dim: D.
+        reading_dims: D and E.
         parameter_dims: number of parameters of each discrete action.
         bounds: lowest and highest values of all parameters, `[2, P]`.
-        settings: MAX_STEPS and the problem's own.
-        first_env: number of the first row, where other processes have those before it.
+        settings: MAX_STEPS, NUM_OPTIONS (0 if the agent does not choose) and the problem's own.
+        first_env: number of the first row, if other processes have those before it.
     """
 
     def __init__(
@@ -47,22 +50,24 @@ class KernelRows:
         num_rows: int,
         *,
         num_columns: tuple[int, int],
-        observation_dim: int,
+        reading_dims: tuple[int, int],
         parameter_dims: Sequence[int],
-        bounds: np.ndarray,
+        bounds: np.ndarray | Sequence[Sequence[float]],
         settings: Sequence[float],
-        first_env: int,
+        first_env: int = 0,
     ) -> None:
         self.floats = np.zeros((num_columns[0], num_rows), np.float32)
         self.integers = np.zeros((num_columns[1], num_rows), np.int32)
+        self.integers[kernels.EPISODE_ROW] = -1
         self._advance = advance
         self._num_rows = num_rows
-        self._observation_dim = observation_dim
+        self._observation_dim, self._num_entries = reading_dims
         self._places = np.concatenate([[0], np.cumsum(parameter_dims)]).astype(np.int64)
         self._bounds = np.ascontiguousarray(bounds, np.float32)
         self._settings = np.array([0.0, 0.0, 0.0, first_env, *settings])
         self._all = np.ones(num_rows, np.bool_)
-        self._no_discrete = np.zeros(num_rows, np.int64)
+        # What a start reads of actions.
+        self._no_choice = np.zeros(num_rows, np.int64)
         self._no_parameters = np.zeros((num_rows, sum(parameter_dims)), np.float32)
 
     def set_seed(self, seed: int, streams: tuple[int, int]) -> None:
@@ -70,8 +75,16 @@ class KernelRows:
         self._settings[kernels.SEED] = kernels.folded(seed)
         self._settings[kernels.EPISODE_STREAM], self._settings[kernels.NOISE_STREAM] = streams
 
+    def begin(self, seed: int) -> None:
+        """Put every row before its first episode of training with this seed."""
+        self.floats[:] = 0.0
+        self.integers[:] = 0
+        self.integers[kernels.EPISODE_ROW] = -1
+        self.set_seed(seed, (TRAINING, NOISE))
+
     def act(
         self,
+        option: np.ndarray | None,
         discrete: np.ndarray,
         parameters: np.ndarray,
         *,
@@ -81,6 +94,7 @@ class KernelRows:
         """Take an action in every row; those whose episode is over stay as they are.
 
         Args:
+            option: int64 `[N]`; None if the agent does not choose.
             discrete: int64 `[N]`.
             parameters: float32 `[N, P]`, of all discrete actions, side by side.
             mask: bool `[N]`, the rows that move; all by default.
@@ -89,15 +103,15 @@ class KernelRows:
         Returns:
             The results, or the number of the first row whose action is invalid, where nothing has changed.
         """
-        return self.advance(ACT_AND_RESTART if restarts else ACT, discrete, parameters, mask)
+        return self.advance(ACT_AND_RESTART if restarts else ACT, option, discrete, parameters, mask)
 
-    def act_or_restart(self, discrete: np.ndarray, parameters: np.ndarray) -> Results | int:
+    def act_or_restart(self, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> Results | int:
         """Take an action, and instead start a new episode where one is over; actions are not read there."""
-        return self.advance(ACT_OR_RESTART, discrete, parameters, None)
+        return self.advance(ACT_OR_RESTART, option, discrete, parameters, None)
 
     def restart(self, mask: np.ndarray | None = None) -> Results:
         """Start new episodes, in the rows of `mask` bool `[N]` or in all."""
-        results = self.advance(RESTART, self._no_discrete, self._no_parameters, mask)
+        results = self.advance(RESTART, None, self._no_choice, self._no_parameters, mask)
         assert not isinstance(results, int)
         return results
 
@@ -105,20 +119,33 @@ class KernelRows:
         """Return what is observed."""
         return self.restart(~self._all)
 
+    def put(self, columns: Mapping[int, np.ndarray], mask: np.ndarray | None) -> None:
+        """Set columns of the state, by their places among floats and then integers, in the rows of `mask` or in all."""
+        state = [*self.floats, *self.integers]
+        for place, column in columns.items():
+            np.copyto(state[place], column, where=True if mask is None else mask)
+
     def advance(
-        self, mode: int, discrete: np.ndarray, parameters: np.ndarray, mask: np.ndarray | None
+        self,
+        mode: int,
+        option: np.ndarray | None,
+        discrete: np.ndarray,
+        parameters: np.ndarray,
+        mask: np.ndarray | None,
     ) -> Results | int:
         """Call the kernel."""
         num_readings, n = 2 if mode == ACT_AND_RESTART else 1, self._num_rows
         results = Results(
             np.empty((num_readings, n, self._observation_dim), np.float32),
             np.empty((num_readings, n), np.int64),
+            np.empty((num_readings, self._num_entries, n), np.float32),
             np.empty((num_readings, 3, n), np.bool_),
             np.zeros(n, np.float32),
         )
         invalid = self._advance(
             self.floats,
             self.integers,
+            self._no_choice if option is None else option,
             discrete,
             parameters,
             self._places,
@@ -129,3 +156,33 @@ class KernelRows:
             *results,
         )
         return results if invalid < 0 else invalid
+
+
+def invalid_choice(
+    row: int,
+    *,
+    option: int | None,
+    discrete: int,
+    parameters: Sequence[float],
+    parameter_dims: Sequence[int],
+    num_options: int,
+    names: tuple[str, str],
+) -> ValueError:
+    """Return the error for an invalid action of a row.
+
+    Args:
+        row: its number.
+        option, discrete, parameters: the action, with the parameters of all discrete actions.
+        parameter_dims: number of parameters of each discrete action.
+        num_options: how many options there are.
+        names: what the error calls `discrete` and `parameters`.
+    """
+    values: dict[str, tuple[object, str]] = {}
+    if option is not None:
+        values["option"] = option, f"allowed 0 to {num_options - 1}"
+    values[names[0]] = discrete, f"allowed 0 to {len(parameter_dims) - 1}"
+    if 0 <= discrete < len(parameter_dims):
+        first = sum(parameter_dims[:discrete])
+        own = list(parameters[first : first + parameter_dims[discrete]])
+        values[names[1]] = own, "those of the chosen action must be finite"
+    return invalid_action(row, values)

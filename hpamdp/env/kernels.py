@@ -181,7 +181,7 @@ def atan2(y: Any, x: Any) -> Any:
 # Each kernel states its loop over the rows itself. A factory that closes over the problem's functions would compile it
 # anew in every process: Numba's cache on disk never hits for closures over compiled functions.
 ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
-SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, OWN = range(6)
+SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, NUM_OPTIONS, OWN = range(7)
 STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1
 
 _FEW = 16  # parameters of a row that lie within a line of the cache
@@ -207,26 +207,33 @@ def all_finite(values: Any) -> Any:
 
 
 @part
-def invalid_row(discrete: Any, parameters: Any, places: Any, integers: Any, mode: Any) -> Any:
-    """Return the first row whose action is unknown or has a parameter that is not finite, or -1.
+def invalid_row(
+    option: Any, discrete: Any, parameters: Any, places: Any, integers: Any, settings: Any, mode: Any
+) -> Any:
+    """Return the first row whose option or action is unknown or has a parameter that is not finite, or -1.
 
     Args:
+        option: int64 `[N]`; it counts if the agent chooses among options.
         discrete: int64 `[N]`.
         parameters: float32 `[N, P]`, of all actions, side by side.
         places: int64 `[K + 1]`; the parameters of action k are those from `places[k]` to `places[k + 1]`.
         integers: of the state.
+        settings: of the problem.
         mode: with ACT_OR_RESTART, rows that start anew may have any action; with RESTART, all.
     """
     if mode == RESTART:
         return -1
     # All at once: a branch on each row's action cost a sixth of Catch Point's step. The loop below finds the row.
-    if parameters.shape[1] <= _FEW and all_below(discrete, len(places) - 1) and all_finite(parameters):
+    num_options = settings[NUM_OPTIONS]
+    are_known = all_below(discrete, len(places) - 1) and (num_options == 0 or all_below(option, num_options))
+    if parameters.shape[1] <= _FEW and are_known and all_finite(parameters):
         return -1
     for row in range(len(discrete)):
         is_valid = (discrete[row] >= 0) & (discrete[row] < len(places) - 1)
         if is_valid:
             for place in range(places[discrete[row]], places[discrete[row] + 1]):
                 is_valid &= math.isfinite(parameters[row, place])
+        is_valid &= (num_options == 0) | ((option[row] >= 0) & (option[row] < num_options))
         if not is_valid and not (mode == ACT_OR_RESTART and integers[OUTCOME_ROW, row] != 0):
             return row
     return -1

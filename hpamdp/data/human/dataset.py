@@ -22,7 +22,7 @@ from hpamdp.data.human.released_file import SHA256, default_path, load_bytes, re
 from hpamdp.data.human.transitions import transitions
 from hpamdp.data.row_checks import TRAJECTORY, check_actions, check_transitions
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.env.boatdock.episode import MAX_PRESSES, ObservationForm, RewardForm
+from hpamdp.env.boatdock.task import MAX_PRESSES, ObservationForm, RewardForm
 from hpamdp.messages import reason_of
 from hpamdp.specs import PAMDPSpecs
 

@@ -10,8 +10,8 @@ from hpamdp import keys
 from hpamdp.data import minari as generic
 from hpamdp.data.errors import DataError
 from hpamdp.env.boatdock import physics
-from hpamdp.env.boatdock.episode import SCALED_NAMES
 from hpamdp.env.boatdock.registration import BOAT_DOCK_ID
+from hpamdp.env.boatdock.task import SCALED_NAMES
 
 if TYPE_CHECKING:
     import minari

@@ -22,9 +22,8 @@ from hpamdp import keys
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.released_file import FRAMES_PER_SECOND, HumanData
 from hpamdp.data.row_checks import TRAJECTORY
-from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics
-from hpamdp.env.boatdock.episode import BoatState, ObservationForm, RewardForm, Rules
+from hpamdp.env.boatdock.task import FUEL, BoatState, ObservationForm, RewardForm, Rules
 
 _REWARDS = ("paper", "sparse")
 _OBSERVATIONS = ("scaled", "pixels")
@@ -251,6 +250,14 @@ def _final_position(
 
 def _read(state: BoatState, rules: Rules) -> TensorDict:
     """Return what the environment would show of these boats, without noise."""
-    num = len(state.x)
-    reading = episode.read(state, counter_rng.seed_tensor(0), torch.arange(num, dtype=torch.int32), rules)
-    return TensorDict(reading._asdict(), batch_size=[num])
+    done = (state.outcome != physics.SAILING).unsqueeze(-1)
+    truncated = (state.outcome == physics.TIME_LIMIT).unsqueeze(-1)
+    reading = {
+        keys.OBSERVATION: episode.observe(state, None, rules),
+        keys.OUTCOME: state.outcome.long(),
+        FUEL: (state.fuel / physics.TANK).unsqueeze(-1),
+        keys.DONE: done,
+        keys.TERMINATED: done & ~truncated,
+        keys.TRUNCATED: truncated,
+    }
+    return TensorDict(reading, batch_size=state.x.shape)

@@ -15,23 +15,23 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.data import Composite
 
 from hpamdp import keys
-from hpamdp.env import counter_rng
-from hpamdp.env.base import Metric, PAMDPEnv
-from hpamdp.env.boatdock import episode, harbour, physics, planner
-from hpamdp.env.boatdock.episode import BoatState
-from hpamdp.env.boatdock.fleet import Fleet, Readings
+from hpamdp.env.base import Metric
+from hpamdp.env.boatdock import episode as episode_rules
+from hpamdp.env.boatdock import harbour, kernel, planner, task
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
-from hpamdp.env.boatdock.task import invalid_press
+from hpamdp.env.boatdock.task import BoatState
+from hpamdp.env.counter_env import Action, CounterEnv
+from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.state_columns import check_range, cloned, from_arrays, overwrite, where
+from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 
 if TYPE_CHECKING:
@@ -42,22 +42,10 @@ if TYPE_CHECKING:
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
 _MOST_SWAPPED = 4  # boats; of more, symmetries swap none
 
-_CONTROLLER_ENTRY = episode.OBSERVATION_NAMES.index("controller")
-# What a tensordict has whose next root holds nothing else.
-_PLAIN_KEYS = {
-    keys.OBSERVATION,
-    keys.OUTCOME,
-    episode.FUEL,
-    keys.DONE,
-    keys.TERMINATED,
-    keys.TRUNCATED,
-    keys.OPTION,
-    keys.ACTION,
-}
-_LAYOUT_KEYS = {"start", "goal", "controller", "keymap"}
+_CONTROLLER_ENTRY = task.OBSERVATION_NAMES.index("controller")
 
 
-class BoatDockEnv(PAMDPEnv):
+class BoatDockEnv(CounterEnv[BoatState]):
     """Dock boats in `num_envs` harbours at once.
 
     Action leaves:
@@ -78,10 +66,6 @@ class BoatDockEnv(PAMDPEnv):
         first_env: number of the first boat, if other processes have those before it.
         settings: single settings by name, in place of those in `options`.
 
-    On the CPU the boats are moved by the kernel of `hpamdp.env.boatdock.kernel`; other devices, compiled rules, and
-    gradients (from the first durations that require them on) have the tensor functions of `episode`. Numbers agree to
-    rounding.
-
     `reset` also takes layouts to play: a tensordict with `start` and `goal` `[N, 2]` in screen px and, optionally,
     `controller` and `keymap` int `[N]`.
 
@@ -91,11 +75,18 @@ class BoatDockEnv(PAMDPEnv):
     """
 
     Options = BoatDockOptions
+    options: BoatDockOptions
     guarded_settings = ("recording",)
-    parameter_dims = (1,) * harbour.NUM_KEYS
-    max_steps = episode.MAX_PRESSES
-    result_keys = (keys.OUTCOME, episode.FUEL)
-    reset_returns_all_rows = True
+    parameter_dims = (1,) * task.NUM_KEYS
+    parameter_low = (0.0,) * task.NUM_KEYS
+    parameter_high = (task.MAX_DURATION,) * task.NUM_KEYS
+    max_steps = task.MAX_PRESSES
+    outcomes = task.OUTCOMES
+    entry_names = (task.FUEL,)
+    result_keys = (keys.OUTCOME, task.FUEL)
+    start_keys = frozenset({"start", "goal", "controller", "keymap"})
+    action_names = ("key", "durations")
+    row_kernel = staticmethod(kernel.advance)
     choice_setting: ClassVar[str] = "env.controller=choose"
     change_setting: ClassVar[str] = "env.switch_cost=0.2"
     no_choice_setting: ClassVar[str] = "env.controller=congruent, incongruent, random"
@@ -132,74 +123,51 @@ class BoatDockEnv(PAMDPEnv):
         first_env: int = 0,
         **settings: Any,
     ) -> None:
-        options = self.options = BoatDockOptions.of(options, settings)
-        if num_envs < 1:
-            raise ValueError(f"BoatDockEnv: {num_envs=}, but must be at least 1")
-        if human and not options.are_peoples:
-            raise ValueError(
-                f"{options.unlike_peoples()}: people kept one of their two boats, so what they chose says nothing "
-                "here; leave it out"
-            )
-        facts, rules, compile_rules = self.facts(options), options.rules, options.compile_rules
-        self.option_names = facts.option_names
-        self.can_change_option = facts.can_change_option
-        self.plans_change_options = facts.plans_change_options
-        self._played = None if options.recording is None else _figures_of(options.recording, options.controller)
-        super().__init__(device=device, batch_size=[num_envs])
-        self.num_envs = num_envs
-        self.rules = rules
-        is_on_cpu = self.device is None or self.device.type == "cpu"
-        self._fleet = Fleet(num_envs, rules, first_env) if is_on_cpu and not compile_rules else None
-        self._pure_step = episode.step
-        self._pure_reset = episode.reset
-        self._pure_read = episode.read
-        if compile_rules:
-            arguments: Any = counter_rng.COMPILE_ARGUMENTS
-            self._pure_step = torch.compile(episode.step, **arguments)
-            self._pure_reset = torch.compile(episode.reset, **arguments)
-            self._pure_read = torch.compile(episode.read, **arguments)
-        self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
-        self._make_specs()
-        self._has_human, self._oracle = human, None
-        if human:
-            self.observation_spec["human"] = human_spec(num_envs, self.device)
-        if oracle:
-            self._oracle = BoatDockOracle(num_envs, rules, self.device)
-            self.observation_spec["oracle"] = oracle_spec(num_envs, rules, self.device)
-        self._set_seed(seed)
+        self._has_oracle, self._has_human = oracle, human
+        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
         """Return what these settings tell of the problem."""
         return options.facts(cls.__name__)
 
-    @property
-    def has_choice(self) -> bool:
-        """Whether the agent picks the controller."""
-        return self.rules.controller == "choose"
+    def _prepare(self) -> None:
+        options = self.options
+        if self._has_human and not options.are_peoples:
+            raise ValueError(
+                f"{options.unlike_peoples()}: people kept one of their two boats, so what they chose says nothing "
+                "here; leave it out"
+            )
+        self.rules = options.rules
+        self.observation_names = task.observation_names(self.rules.observation)
+        self._played = None if options.recording is None else _figures_of(options.recording, options.controller)
+        self._oracle = BoatDockOracle(self.num_envs, self.rules, self.device) if self._has_oracle else None
 
-    @property
-    def state(self) -> BoatState:
-        """The boats as they are; assign a state to put them elsewhere (checkpoints do)."""
-        return self._columns if self._fleet is None else cloned(self._state)
+    def kernel_settings(self) -> Sequence[float]:
+        """Return the rules in numbers."""
+        return kernel.settings_of(self.rules)
 
-    @state.setter
-    def state(self, state: BoatState) -> None:
-        self._put(BoatState(*(column.to(self.device) for column in state)))
-        self._has_layouts = True
+    def start(self, episode: Tensor, rng: RngKey) -> BoatState:
+        """Return boats in new layouts."""
+        return episode_rules.start(episode, rng, self.rules)
 
-    @property
-    def _state(self) -> BoatState:
-        """The boats as they are; where the kernel moves them, the columns change with them."""
-        if self._fleet is None:
-            return self._columns
-        return from_arrays(BoatState, (*self._fleet.floats, *self._fleet.integers))
+    def act(self, state: BoatState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[BoatState, Tensor]:
+        """Return the boats after one press, and the rewards `[N]`."""
+        duration = action.parameters.squeeze(-1)
+        return episode_rules.act(state, action.option, action.discrete, duration, rng, self.rules)
 
-    def _put(self, state: BoatState) -> None:
-        if self._fleet is None:
-            self._columns = state
-        else:
-            overwrite(self._state, state)
+    def observe(self, state: BoatState) -> Tensor:
+        """Return the observations, `[N, 16]`, or `[N, 14]` in pixels."""
+        rng = self._noise_rng(state) if self.rules.sensor_noise > 0.0 else None
+        return episode_rules.observe(state, rng, self.rules)
+
+    def entries(self, state: BoatState) -> Sequence[Tensor]:
+        """Return the fraction of fuel that is left."""
+        return (state.fuel / task.TANK,)
+
+    def start_columns(self, given: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """Check a layout and return the columns of the state that it sets."""
+        return layout_columns(given, self.num_envs, self.rules)
 
     @property
     def position(self) -> Tensor:
@@ -224,7 +192,7 @@ class BoatDockEnv(PAMDPEnv):
                     found.append((each, order, torch.stack(mapped)))
                     break
         kept = torch.stack([each for each, _, _ in found])
-        weight, offset = on_observations(kept, self._observation_dim, *self._vectors())
+        weight, offset = on_observations(kept, len(self.observation_names), *self._vectors())
         keys_after = torch.stack([mapped for _, _, mapped in found])
         contexts = torch.tensor([order for _, order, _ in found])
         return make_symmetries(
@@ -265,7 +233,7 @@ class BoatDockEnv(PAMDPEnv):
             directions=torch.stack([table[0] for table in tables]).float() if is_known else None,
             kinds=(0,) * harbour.NUM_KEYS if is_known else (),
             has_mirror=True,
-            redundant=tuple(episode.OBSERVATION_NAMES.index(name) for name in names),
+            redundant=tuple(task.OBSERVATION_NAMES.index(name) for name in names),
         )
 
     def _directions(self) -> list[list[Tensor]]:
@@ -282,10 +250,6 @@ class BoatDockEnv(PAMDPEnv):
             return [both[harbour.CONTROLLERS.index(self.rules.controller)]]
         return both
 
-    @property
-    def _observation_dim(self) -> int:
-        return self.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
-
     def _vectors(self) -> tuple[tuple[tuple[int, int], ...], tuple[tuple[float, float], ...]]:
         """Return which entries of the observation are vectors, and from where on they are measured."""
         places: tuple[tuple[int, int], ...] = ((0, 1), (2, 3), (8, 9))
@@ -300,18 +264,11 @@ class BoatDockEnv(PAMDPEnv):
         points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
         return TensorDict(points, batch_size=self.batch_size, device=self.device)
 
-    def seed_evaluation(self, seed: int) -> None:
-        """Seed episodes and noise as `set_seed` does, but from streams that training never meets, whatever its seed."""
-        self.set_seed(seed)
-        self.rules = self.rules._replace(is_evaluation=True)
-        if self._fleet is not None:
-            self._fleet.set_streams(is_evaluation=True)
-
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `outcome`, `fuel` (fraction), `score` and `success` `[M]` of finished (or abandoned) episodes."""
-        outcome, fuel = last.get(keys.OUTCOME), last.get(episode.FUEL).squeeze(-1)
+        outcome, fuel = last.get(keys.OUTCOME), last.get(task.FUEL).squeeze(-1)
         score = harbour.score(outcome, fuel)
-        return {"outcome": outcome, "fuel": fuel, "score": score, "success": outcome == physics.SUCCESS}
+        return {"outcome": outcome, "fuel": fuel, "score": score, "success": outcome == task.SUCCESS}
 
     def describe(self) -> dict[str, Tensor]:
         """Return the boats' layouts for evaluation, px from the harbour's centre.
@@ -393,14 +350,13 @@ class BoatDockEnv(PAMDPEnv):
         return {**self.state._asdict(), **plans}
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Refuse controllers, keymaps and outcomes that do not exist.
+        """Refuse controllers, key maps, counters and outcomes that do not exist.
 
         Raises:
             ValueError: a number is invalid.
         """
         super().check_env_state(columns)
-        limits = {"controller": (-1, len(self.rules.names)), "outcome": (0, len(physics.OUTCOMES))}
-        check_range(columns, {**limits, "keymap": (0, 3), "presses": (0, 2**30), "episode": (-1, 2**30)})
+        check_range(columns, {"controller": (-1, len(self.rules.names)), "keymap": (0, 3)})
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue from an `env_state`.
@@ -408,165 +364,31 @@ class BoatDockEnv(PAMDPEnv):
         Raises:
             ValueError: it is not the state of this many boats.
         """
+        super().set_env_state({name: column for name, column in columns.items() if not name.startswith(_PLAN)})
         plans = {name.removeprefix(_PLAN): plan for name, plan in columns.items() if name.startswith(_PLAN)}
-        boats = {name: column for name, column in columns.items() if not name.startswith(_PLAN)}
-        if len(boats["episode"]) != self.num_envs:
-            raise ValueError(f"BoatDockEnv: the state of {len(boats['episode'])} boats, but there are {self.num_envs}")
-        self.state = BoatState(**boats)
         if self._oracle is not None and plans:
             self._oracle.set_plans(plans)
 
-    def _make_specs(self) -> None:
-        n, device = self.num_envs, self.device
-        names = episode.OBSERVATION_NAMES if self.rules.observation == "pixels" else episode.SCALED_NAMES
-        self.observation_spec = Composite(
-            observation=Unbounded(shape=(n, len(names)), device=device, dtype=torch.float32),
-            outcome=Categorical(len(physics.OUTCOMES), shape=(n,), device=device),
-            fuel=Bounded(0.0, 1.0, shape=(n, 1), device=device, dtype=torch.float32),
-            shape=(n,),
-        )
-        longest = torch.full((harbour.NUM_KEYS,), physics.MAX_DURATION, dtype=torch.float32)
-        self.action_spec = self.make_action_spec(torch.zeros_like(longest), longest, has_option=self.has_choice)
-        self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=torch.float32)
-        self.done_spec = self.make_done_spec()
-
-    def _set_seed(self, seed: int | None) -> None:
-        self.rules = self.rules._replace(is_evaluation=False)
-        self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
-        self._has_layouts = False
-        if self._fleet is not None:
-            self._fleet.set_seed(0 if seed is None else seed, is_evaluation=False)
-            return
-        floats = torch.zeros(self.num_envs, device=self.device, dtype=torch.float32)
-        integers = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
-        columns = [floats] * 9 + [integers] * 4 + [integers - 1]
-        self._columns = BoatState(*columns)
-
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        mask = self.reset_mask(tensordict)
-        given = None
-        if tensordict is not None and _LAYOUT_KEYS & set(tensordict.keys()):
-            given = self._given_layout(tensordict)
-        readings = None
-        if self._fleet is None:
-            self._columns = self._pure_reset(self._columns, mask, self._seed, self._environment, self.rules)
-        else:
-            readings = self._fleet.restart(mask.numpy())
-        if given is not None:
-            state = self._state
-            self._put(where(mask, state._replace(**given), state))
-            readings = None
+    def _on_start(self, mask: Tensor) -> None:
         if self._oracle is not None:
             self._oracle.plan(self._state, mask)
-        self._has_layouts = True
-        return self._read() if readings is None else self._reading(readings)
 
-    def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
-        """Check a user's layout and return the state's columns that it sets."""
-        arrays = {name: given.get(name).cpu().numpy() for name in _LAYOUT_KEYS & set(given.keys())}
-        columns = layout_columns(arrays, self.num_envs, self.rules)
-        return {name: torch.from_numpy(column).to(self.device) for name, column in columns.items()}
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        key, durations, option = self._read_action(tensordict)
-        mask = tensordict.get("_step", None)
-        mask = None if mask is None else mask.reshape(self.num_envs)
-        if self._fleet is not None:
-            return self._reading(*self._press(key, durations, option, mask))
-        chosen = self._columns.controller if option is None else option
-        state, reward, is_action = self._pure_step(
-            self._columns, chosen, key, durations, self._seed, self._environment, self.rules
-        )
-        if not is_action.all():
-            raise self._invalid(int((~is_action).nonzero()[0]), key, durations, chosen)
-        if mask is not None:
-            state, reward = where(mask, state, self._columns), torch.where(mask, reward, 0.0)
-        self._columns = state
-        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
-
-    def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-        is_plain = self._fleet is not None and self._oracle is None and not self._has_human
-        if not is_plain or tensordict.device != self.device or not _PLAIN_KEYS.issuperset(tensordict.keys()):
-            return super()._step_and_maybe_reset(tensordict)
-        # The same in one pass: TorchRL's own steps between ours take longer than the boats.
-        key, durations, option = self._read_action(tensordict)
-        if self._fleet is None:  # the durations require gradients
-            return super()._step_and_maybe_reset(tensordict)
-        readings, rewards = self._press(key, durations, option, None, restarts=True)
-        # TorchRL keeps the action, too; in a tensordict of its own, since an update of the root changes it in place.
-        action = TensorDict._new_unsafe(
-            dict(tensordict.get(keys.ACTION).items()), batch_size=self.batch_size, device=self.device
-        )
-        kept: dict[str, Any] = {keys.ACTION: action}
-        if keys.OPTION in tensordict.keys():
-            kept[keys.OPTION] = tensordict.get(keys.OPTION)
-        return tensordict.set("next", self._reading(readings, rewards)), self._reading(readings, number=1, kept=kept)
-
-    def _read_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Return keys, durations and, where the agent chooses, options; their values are still to be checked."""
-        if not self._has_layouts:
-            raise RuntimeError("BoatDockEnv: the boats have no layouts yet; call reset before step")
-        self.check_action(tensordict)
-        action = tensordict.get(keys.ACTION)
-        key, durations = action.get("discrete"), action.get("parameters").float()
-        if self._fleet is not None and durations.requires_grad and torch.is_grad_enabled():
-            self._columns, self._fleet = self.state, None
-        return key, durations, tensordict.get(keys.OPTION) if self.has_choice else None
-
-    def _press(
-        self, key: Tensor, durations: Tensor, option: Tensor | None, mask: Tensor | None, *, restarts: bool = False
-    ) -> tuple[Readings, np.ndarray]:
-        """Press a key with the kernel."""
-        assert self._fleet is not None
-        result = self._fleet.press(
-            None if option is None else _array(option.long()),
-            _array(key.long()),
-            _array(durations),
-            mask=None if mask is None else _array(mask),
-            restarts=restarts,
-        )
-        if isinstance(result, int):
-            raise self._invalid(result, key, durations, self._state.controller if option is None else option)
-        return result
-
-    def _invalid(self, row: int, key: Tensor, durations: Tensor, option: Tensor) -> ValueError:
-        values = option[row].item(), key[row].item(), durations[row].tolist()
-        return invalid_press(row, *values, len(self.option_names))
-
-    def _read(self) -> TensorDict:
-        if self._fleet is not None:
-            return self._reading(self._fleet.read())
-        reading = self._pure_read(self._columns, self._seed, self._environment, self.rules)
-        return self._with_knowledge(TensorDict(reading._asdict(), batch_size=self.batch_size, device=self.device))
-
-    def _reading(
-        self,
-        readings: Readings,
-        rewards: np.ndarray | None = None,
-        number: int = 0,
-        kept: Mapping[str, Any] | None = None,
-    ) -> TensorDict:
-        """Return one of the kernel's readings, with rewards or other leaves."""
-        flags = torch.from_numpy(readings.flags[number]).unsqueeze(-1)
-        leaves: dict[str, Any] = {
-            **(kept or {}),
-            keys.OBSERVATION: torch.from_numpy(readings.observations[number]),
-            keys.OUTCOME: torch.from_numpy(readings.outcomes[number]),
-            episode.FUEL: torch.from_numpy(readings.fuel[number]).unsqueeze(-1),
-            keys.DONE: flags[0],
-            keys.TERMINATED: flags[1],
-            keys.TRUNCATED: flags[2],
-        }
-        if rewards is not None:
-            leaves[keys.REWARD] = torch.from_numpy(rewards).unsqueeze(-1)
-        # The checks of the constructor would take longer than a hundred boats.
-        return self._with_knowledge(TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=self.device))
-
-    def _with_knowledge(self, seen: TensorDict) -> TensorDict:
-        """Add what people and the planner know."""
+    def _knowledge_specs(self) -> dict[str, Composite]:
+        specs = {}
         if self._has_human:
-            seen.set(keys.HUMAN_OPTION, human_shares(self._state))
-        return seen if self._oracle is None else seen.set("oracle", self._oracle.read(self._state))
+            specs["human"] = human_spec(self.num_envs, self.device)
+        if self._has_oracle:
+            specs["oracle"] = oracle_spec(self.num_envs, self.rules, self.device)
+        return specs
+
+    def _knowledge(self) -> dict[str, Any]:
+        """Return how often people choose each boat, and what the planner knows."""
+        known: dict[str, Any] = {}
+        if self._has_human:
+            known["human"] = {"option": human_shares(self._state)}
+        if self._oracle is not None:
+            known["oracle"] = self._oracle.read(self._state)
+        return known
 
 
 def _figures_of(recording: str, controller: str) -> dict[str, float]:
@@ -596,7 +418,3 @@ def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) ->
             return None
         found = keys_after
     return found
-
-
-def _array(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().contiguous().numpy()

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics, rendering
-from hpamdp.env.boatdock.episode import MAX_PRESSES, BoatState
 from hpamdp.env.boatdock.rendering import Leg, Scene
-from hpamdp.env.boatdock.task import Boats, Rules
+from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, BoatState, Rules
 
 
 def film(

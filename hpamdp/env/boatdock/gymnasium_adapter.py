@@ -98,10 +98,15 @@ class BoatDockVector(GymnasiumVectorAdapter):
         **settings: Any,
     ) -> None:
         options = BoatDockOptions.of(options, settings)
-        make_fleet = None
+        make_rows = None
         if options.compile_rules or str(device) != "cpu":
-            # It brings torch along.
-            from hpamdp.env.boatdock.tensor_fleet import TensorFleet
+            make_rows = partial(_tensor_rows, num_envs, options, device)
+        super().__init__(NumpyBoats(options.rules, (num_envs,), action_format, make_rows), num_envs, autoreset_mode)
 
-            make_fleet = partial(TensorFleet, options=options, device=device)
-        super().__init__(NumpyBoats(options.rules, (num_envs,), action_format, make_fleet), num_envs, autoreset_mode)
+
+def _tensor_rows(num_envs: int, options: BoatDockOptions, device: Any) -> Any:
+    """Return boats that the tensor functions move."""
+    from hpamdp.env.boatdock.environment import BoatDockEnv  # it brings torch along
+    from hpamdp.env.counter_adapter import TensorRows
+
+    return TensorRows(BoatDockEnv(num_envs, options=options, device=device))

@@ -7,8 +7,8 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite
 
 from hpamdp.env.boatdock import harbour
-from hpamdp.env.boatdock.episode import BoatState
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
+from hpamdp.env.boatdock.task import BoatState
 
 
 def human_spec(num_envs: int, device: torch.device) -> Composite:

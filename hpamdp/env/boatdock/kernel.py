@@ -15,16 +15,23 @@ import numpy as np
 from numba import int32
 
 from hpamdp.env.boatdock import task
+from hpamdp.env.boatdock.task import Rules
 from hpamdp.env.kernels import (
+    ACT_OR_RESTART,
+    EPISODE_STREAM,
+    FIRST_ENV,
     HALF,
+    NOISE_STREAM,
     ONE,
+    OWN,
+    RESTART,
+    SEED,
     TURN,
     TWO,
     ZERO,
-    all_below,
-    all_finite,
     episode_hash,
     inlined,
+    invalid_row,
     kernel,
     normal,
     part,
@@ -39,12 +46,8 @@ from hpamdp.env.kernels import (
 START_X, START_Y, GOAL_X, GOAL_Y, X, Y, VELOCITY_X, VELOCITY_Y, FUEL = range(9)
 CONTROLLER, KEYMAP, PRESSES, OUTCOME, EPISODE = range(5)
 
-# Places in the settings, float64.
+# Places of the boats' own settings, float64.
 (
-    SEED,
-    EPISODE_STREAM,
-    NOISE_STREAM,
-    FIRST_ENV,
     SET_CONTROLLER,
     SET_KEYMAP,
     IS_SPARSE,
@@ -54,15 +57,11 @@ CONTROLLER, KEYMAP, PRESSES, OUTCOME, EPISODE = range(5)
     NUM_BOATS,
     HAS_KEYMAPS,
     SWITCH_COST,
-) = range(13)
-NUM_SETTINGS = 13
-# Behind them each boat has its motor noise and, unless the directions follow from the key map, x and y of each key.
+) = range(OWN, OWN + 9)
+FIRST_BOAT = OWN + 9
+# From there on each boat has its motor noise and, unless the directions follow from the key map, x and y of each key.
 NUM_BOAT_SETTINGS = 7
 RANDOM = -2  # of SET_CONTROLLER and SET_KEYMAP
-
-# What `advance` does: press a key where the episode is not over; the same, but start new episodes where they are over
-# instead, or where they end, after they were read; or start new episodes in the marked rows and do nothing else.
-PRESS, PRESS_OR_RESTART, PRESS_AND_RESTART, RESTART = range(4)
 
 _BLOCK = 128
 
@@ -172,24 +171,6 @@ def _attempt(bits: Any, step: Any, first: Any) -> Any:
 
 
 @part
-def _invalid_row(option: Any, key: Any, durations: Any, integers: Any, is_later: Any, settings: Any) -> Any:
-    """Return the first row whose action is invalid, or -1; those that start anew instead may have any."""
-    chooses = settings[SET_CONTROLLER] == task.NOT_CHOSEN
-    # All at once, without a branch on each row's key. The loop below finds the row.
-    are_known = all_below(key, task.NUM_KEYS) and (not chooses or all_below(option, settings[NUM_BOATS]))
-    if are_known and all_finite(durations):
-        return -1
-    for row in range(len(key)):
-        is_key = (key[row] >= 0) & (key[row] < task.NUM_KEYS)
-        is_option = (not chooses) | ((option[row] >= 0) & (option[row] < settings[NUM_BOATS]))
-        duration = durations[row, key[row] if is_key else 0]
-        is_ignored = is_later & (integers[OUTCOME, row] != task.SAILING)
-        if not (is_key & is_option & math.isfinite(duration)) and not is_ignored:
-            return row
-    return -1
-
-
-@part
 def _load(floats: Any, integers: Any, mask: Any, first: Any, count: Any, scratch: Any, numbers: Any) -> None:
     for column in range(9):
         for j in range(count):
@@ -238,7 +219,7 @@ def _has_motor_noise(settings: Any) -> Any:
     """Return whether the presses of any boat vary."""
     has_noise = False
     for boat in range(int(settings[NUM_BOATS])):
-        has_noise |= settings[NUM_SETTINGS + boat * NUM_BOAT_SETTINGS] > 0.0
+        has_noise |= settings[FIRST_BOAT + boat * NUM_BOAT_SETTINGS] > 0.0
     return has_noise
 
 
@@ -270,7 +251,7 @@ def _aim(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
             scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j] = dir_x, dir_y
         return
     for j in range(count):
-        place = NUM_SETTINGS + _controller(numbers, j) * NUM_BOAT_SETTINGS + 1 + 2 * numbers[_KEY * _BLOCK + j]
+        place = FIRST_BOAT + _controller(numbers, j) * NUM_BOAT_SETTINGS + 1 + 2 * numbers[_KEY * _BLOCK + j]
         scratch[_DIR_X * _BLOCK + j], scratch[_DIR_Y * _BLOCK + j] = _F(settings[place]), _F(settings[place + 1])
 
 
@@ -289,14 +270,14 @@ def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
             drawn = uniform(bits, step, index + task.SLIPPED_KEY) * _F(task.NUM_KEYS)
             numbers[_KEY * _BLOCK + j] = int32(drawn)
         if has_motor_noise:
-            deviation = _F(settings[NUM_SETTINGS + _controller(numbers, j) * NUM_BOAT_SETTINGS])
+            deviation = _F(settings[FIRST_BOAT + _controller(numbers, j) * NUM_BOAT_SETTINGS])
             factor = _F(math.exp(deviation * normal(bits, step, index // 2 + task.MOTOR)))
             scratch[_DURATION * _BLOCK + j] = min(scratch[_DURATION * _BLOCK + j] * factor, _LONGEST)
 
 
 @part
 def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, rewards: Any) -> None:
-    """Press a key in every row that moves: `episode.step`."""
+    """Press a key in every row that moves: `episode.act`."""
     is_sparse = settings[IS_SPARSE] != 0.0
     for j in range(count):
         x, y, fuel = scratch[X * _BLOCK + j], scratch[Y * _BLOCK + j], scratch[FUEL * _BLOCK + j]
@@ -335,7 +316,7 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
 
 @part
 def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Start new episodes in the marked rows of a block: `episode.reset` and `harbour.sample_layout`."""
+    """Start new episodes in the marked rows of a block: `episode.start` and `harbour.sample_layout`."""
     base = stream_hash(settings[SEED], int32(settings[EPISODE_STREAM]))
     step = stream_step(int32(settings[EPISODE_STREAM]))
     first_env = int32(settings[FIRST_ENV]) + int32(first)
@@ -412,7 +393,7 @@ def _add_sensor_noise(first: Any, count: Any, scratch: Any, numbers: Any, settin
 
 @part
 def _observe(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, observation: Any) -> None:
-    """Write what is observed of the rows of a block: `episode.read`."""
+    """Write what is observed of the rows of a block: `episode.observe`."""
     # The six coordinates are the first columns of the state and, where the sensors are noisy, of the observation.
     seen = 0
     if settings[SENSOR_NOISE] > 0.0:
@@ -471,47 +452,33 @@ def advance(
     floats: Any,
     integers: Any,
     option: Any,
-    key: Any,
-    durations: Any,
+    discrete: Any,
+    parameters: Any,
+    places: Any,
+    bounds: Any,
     mask: Any,
     settings: Any,
     mode: Any,
-    rewards: Any,
     observations: Any,
     outcomes: Any,
-    fuel: Any,
+    entries: Any,
     flags: Any,
+    rewards: Any,
 ) -> int:
-    """Press a key in every boat, or start new episodes, in place, and write what follows.
-
-    Args:
-        floats, integers: the state, `[9, N]` and `[5, N]`.
-        option, key: int64 `[N]`.
-        durations: float32 `[N, 3]`.
-        mask: bool `[N]`, the rows that move or, with RESTART, start anew; the others stay as they are.
-        settings: float64, NUM_SETTINGS and then NUM_BOAT_SETTINGS of each boat.
-        mode: PRESS, PRESS_OR_RESTART (in which rows that start anew may have any action), PRESS_AND_RESTART or RESTART.
-        rewards: float32 `[N]`, 0 where nothing moves.
-        observations, outcomes, fuel, flags: the reading, float32 `[R, N, D]`, int64 `[R, N]`, float32 `[R, N]`, bool
-            `[R, 3, N]` (done, terminated, truncated). R is 1, and with PRESS_AND_RESTART 2: before and after the start.
-
-    Returns:
-        The first row whose action is invalid, where nothing has changed; else -1.
-    """
-    if mode != RESTART:
-        invalid = _invalid_row(option, key, durations, integers, mode == PRESS_OR_RESTART, settings)
-        if invalid >= 0:
-            return invalid
+    """Press or restart in every row, in place; see `hpamdp.env.kernel_rows`. The one entry is the fraction of fuel."""
+    invalid = invalid_row(option, discrete, parameters, places, integers, settings, mode)
+    if invalid >= 0:
+        return invalid
     scratch = np.empty(_NUM_FLOATS * _BLOCK, np.float32)
     numbers = np.empty(_NUM_INTEGERS * _BLOCK, np.int32)
     has_noise = (settings[SLIP_CHANCE] > 0.0) | _has_motor_noise(settings)
     for first in range(0, len(mask), _BLOCK):
         count = min(_BLOCK, len(mask) - first)
         _load(floats, integers, mask, first, count, scratch, numbers)
-        if mode == PRESS_OR_RESTART:
+        if mode == ACT_OR_RESTART:
             _mark_over(count, numbers)
         if mode != RESTART:
-            _load_actions(option, key, durations, first, count, scratch, numbers, settings)
+            _load_actions(option, discrete, parameters, first, count, scratch, numbers, settings)
             if settings[SWITCH_COST] >= 0.0:
                 _switch(count, scratch, numbers, settings)
             if has_noise:
@@ -521,9 +488,31 @@ def advance(
         for reading in range(len(observations)):
             if reading == 1:
                 _mark_over(count, numbers)
-            if reading == 1 or mode in (RESTART, PRESS_OR_RESTART):
+            if reading == 1 or mode in (RESTART, ACT_OR_RESTART):
                 _restart(first, count, scratch, numbers, settings)
             _observe(first, count, scratch, numbers, settings, observations[reading])
-            _report(first, count, scratch, numbers, outcomes[reading], fuel[reading], flags[reading])
+            _report(first, count, scratch, numbers, outcomes[reading], entries[reading, 0], flags[reading])
         _store(floats, integers, first, count, scratch, numbers)
     return -1
+
+
+def settings_of(rules: Rules) -> list[float]:
+    """Return the boats' own settings for the kernel."""
+    special = {"choose": task.NOT_CHOSEN, "random": RANDOM}
+    chosen = rules.controller
+    boats: np.ndarray = np.zeros((len(rules.names), NUM_BOAT_SETTINGS))
+    boats[:, 0] = rules.motor_noise
+    if rules.boats is not None:
+        boats[:, 1:] = np.array(rules.boats.directions).reshape(len(rules.names), -1)
+    return [
+        special[chosen] if chosen in special else rules.names.index(chosen),
+        RANDOM if rules.keymap == "random" else rules.keymap,
+        rules.reward == "sparse",
+        rules.observation == "pixels",
+        rules.sensor_noise,
+        rules.slip,
+        len(rules.names),
+        rules.boats is None,
+        -1.0 if rules.switch_cost is None else rules.switch_cost,
+        *boats.reshape(-1).tolist(),
+    ]

@@ -14,15 +14,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
 
 from hpamdp.env.boatdock import kernel, task
-from hpamdp.env.boatdock.fleet import Fleet, Readings
 from hpamdp.env.boatdock.layouts import layout_columns
-from hpamdp.env.boatdock.task import OBSERVATION_NAMES, SCALED_NAMES, BoatState, Rules
-from hpamdp.env.gymnasium_adapter import After, NumpyEnv, as_array, describe
+from hpamdp.env.boatdock.task import BoatState, Rules
+from hpamdp.env.gymnasium_adapter import NumpyRows, as_array, describe
+from hpamdp.env.kernel_rows import KernelRows, invalid_choice
 
 ActionFormat = Literal["dict", "tuple"]
 
@@ -67,19 +66,32 @@ def observation_space(rules: Rules) -> spaces.Box:
             bounds[f"{point}_{axis}"] = (centre - reach * unit, centre + reach * unit)
         bounds[f"velocity_{axis}"] = (-top_speed, top_speed)
         bounds[f"to_goal_{axis}"] = (-2.0 * reach * unit, 2.0 * reach * unit)
-    names = OBSERVATION_NAMES if is_pixels else SCALED_NAMES
-    low, high = np.array([bounds[name] for name in names], dtype=np.float32).T
+    low, high = np.array([bounds[name] for name in task.observation_names(rules.observation)], dtype=np.float32).T
     return spaces.Box(low, high, dtype=np.float32)
 
 
-class NumpyBoats(NumpyEnv):
+def boat_rows(num_boats: int, rules: Rules) -> KernelRows:
+    """Return boats that the kernel moves."""
+    has_choice = rules.controller == "choose"
+    return KernelRows(
+        kernel.advance,
+        num_boats,
+        num_columns=(9, 5),
+        reading_dims=(len(task.observation_names(rules.observation)), 1),
+        parameter_dims=(1,) * task.NUM_KEYS,
+        bounds=[[0.0] * task.NUM_KEYS, [task.MAX_DURATION] * task.NUM_KEYS],
+        settings=[task.MAX_PRESSES, len(rules.names) if has_choice else 0, *kernel.settings_of(rules)],
+    )
+
+
+class NumpyBoats(NumpyRows):
     """Boats with NumPy in and out: one (`batch=()`) or many (`batch=(N,)`).
 
     Args:
         rules: of the environment.
         batch: see above.
         action_format: `dict` or `tuple`.
-        make_fleet: returns what moves the boats, given their number; the kernel by default.
+        make_rows: returns what moves the boats; the kernel by default.
     """
 
     final_infos = ("score",)
@@ -89,21 +101,18 @@ class NumpyBoats(NumpyEnv):
         rules: Rules,
         batch: tuple[int, ...],
         action_format: ActionFormat,
-        make_fleet: Callable[[int], Any] | None = None,
+        make_rows: Callable[[], Any] | None = None,
     ) -> None:
         if action_format not in ("dict", "tuple"):
             raise ValueError(f"BoatDock: action_format={action_format!r}, but must be dict or tuple")
         num_boats = batch[0] if batch else 1
         if num_boats < 1:
             raise ValueError(f"BoatDock: num_envs={num_boats}, but must be at least 1")
+        super().__init__(boat_rows(num_boats, rules) if make_rows is None else make_rows(), batch)
         self._rules = rules
-        self.num_boats = num_boats
-        self.is_reset = False
         self.has_choice = rules.controller == "choose"
         self.action_space = action_space(rules, action_format)
         self.observation_space = observation_space(rules)
-        self._fleet: Any = Fleet(num_boats, rules, first_env=0) if make_fleet is None else make_fleet(num_boats)
-        self._batch = batch
         self._is_tuple = action_format == "tuple"
         self._leaf_names = ("option", "key", "duration") if self.has_choice else ("key", "duration")
         self._leaf_set = set(self._leaf_names)
@@ -111,43 +120,23 @@ class NumpyBoats(NumpyEnv):
     @property
     def state(self) -> BoatState:
         """The boats as they are."""
-        return BoatState(*(column.copy() for column in self._fleet.columns()))
+        return BoatState(*self.rows.floats.copy(), *self.rows.integers.copy())
 
-    def reset(self, seed: int | None, options: Mapping[str, Any] | None, mask: np.ndarray | None = None) -> np.ndarray:
-        """Start new episodes, in the rows of `mask` or in all, and return the observations `[N, observation_dim]`."""
-        columns = self._layout(options) if options else {}
-        if seed is not None:
-            self._fleet.set_seed(seed, is_evaluation=False)
-        self.is_reset = True
-        readings: Readings = self._fleet.restart(mask)
-        if columns:
-            self._fleet.put(columns, mask)
-            readings = self._fleet.read()
-        return readings.observations[0]
-
-    def step(self, action: Any, *, restarts: bool = False) -> After:
-        """Press a key in every boat and return what follows."""
-        if not self.is_reset:
-            raise gymnasium.error.ResetNeeded("step: call reset first")
-        option, key, durations = self._leaves(action)
-        press = self._fleet.press_or_restart if restarts else self._fleet.press
-        result = press(option, key, durations)
-        if isinstance(result, int):
-            chosen = self._fleet.integers[kernel.CONTROLLER] if option is None else option
-            values = chosen[result].item(), key[result].item(), durations[result].tolist()
-            raise task.invalid_press(result, *values, len(self._rules.names))
-        readings, rewards = result
-        return After(readings.observations[0], rewards, readings.flags[0, 1], readings.flags[0, 2])
-
-    @property
-    def is_over(self) -> np.ndarray:
-        """Which episodes are over, bool `[N]`."""
-        return self._fleet.integers[kernel.OUTCOME] != task.SAILING
+    def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
+        return invalid_choice(
+            row,
+            option=None if option is None else option[row].item(),
+            discrete=discrete[row].item(),
+            parameters=parameters[row].tolist(),
+            parameter_dims=(1,) * task.NUM_KEYS,
+            num_options=len(self._rules.names),
+            names=("key", "durations"),
+        )
 
     def infos(self) -> dict[str, np.ndarray]:
         """Return the infos, `[N]` each; `score` is meaningless where the episode is not over."""
-        integers = self._fleet.integers
-        fuel = (self._fleet.floats[kernel.FUEL] / _TANK).astype(np.float64)
+        integers = self.rows.integers
+        fuel = (self.rows.floats[kernel.FUEL] / _TANK).astype(np.float64)
         outcome = integers[kernel.OUTCOME]
         return {
             "outcome": _OUTCOME_NAMES[outcome],
@@ -159,15 +148,16 @@ class NumpyBoats(NumpyEnv):
 
     def info(self) -> dict[str, Any]:
         """Return the infos of the first boat as Python's numbers."""
-        controller, _, presses, outcome, _ = self._fleet.integers[:, 0].tolist()
-        fuel = float(self._fleet.floats[kernel.FUEL, 0] / _TANK)
+        controller, _, presses, outcome, _ = self.rows.integers[:, 0].tolist()
+        fuel = float(self.rows.floats[kernel.FUEL, 0] / _TANK)
         values = {"outcome": task.OUTCOMES[outcome], "fuel": fuel, "presses": presses, "controller": controller}
         if outcome != task.SAILING:
             values["score"] = task.SUCCESS_REWARD * fuel if outcome == task.SUCCESS else task.FAILURE_REWARD
         return values
 
-    def _layout(self, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Check the options of a reset and return the columns of the state that they set."""
+    def _start_columns(self, options: Mapping[str, Any]) -> Mapping[int, np.ndarray]:
+        if not options:
+            return {}
         unknown = set(options) - set(_OPTION_SHAPES)
         if unknown:
             raise ValueError(f"reset: unknown options {sorted(unknown)}; allowed: {', '.join(_OPTION_SHAPES)}")
@@ -178,8 +168,9 @@ class NumpyBoats(NumpyEnv):
         for name, value in options.items():
             shape = _OPTION_SHAPES[name]
             array = as_array(f"reset: {name}", value, self._batch + shape, is_integer=shape == ())
-            given[name] = array.reshape(self.num_boats, *shape)
-        return layout_columns(given, self.num_boats, self._rules)
+            given[name] = array.reshape(self._num_envs, *shape)
+        columns = layout_columns(given, self._num_envs, self._rules)
+        return {BoatState._fields.index(name): column for name, column in columns.items()}
 
     def _leaves(self, action: Any) -> tuple[np.ndarray | None, np.ndarray, np.ndarray]:
         """Check the structure, types and shapes of an action and return options, keys and durations."""

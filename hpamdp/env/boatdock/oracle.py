@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite
 
 from hpamdp.env.boatdock import harbour, physics, planner
-from hpamdp.env.boatdock.episode import BoatState, Rules
+from hpamdp.env.boatdock.task import BoatState, Rules
 
 
 def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:

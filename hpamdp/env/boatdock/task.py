@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from hpamdp.messages import invalid_action
-
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -74,6 +72,12 @@ OBSERVATION_NAMES = (
 )
 SCALED_NAMES = (*OBSERVATION_NAMES, "to_goal_x", "to_goal_y")
 
+
+def observation_names(form: ObservationForm) -> tuple[str, ...]:
+    """Return the names of the observation's entries in one of its forms."""
+    return OBSERVATION_NAMES if form == "pixels" else SCALED_NAMES
+
+
 # Each press has 16 random numbers of its episode's noise; Gaussian number i is made of the uniform ones 2i and 2i + 1.
 NUMBERS_PER_PRESS = 16
 # Indices of these: uniform ones, then Gaussian ones.
@@ -108,7 +112,6 @@ class Rules(NamedTuple):
     slip: float = 0.0
     boats: Boats | None = None  # None: people's two
     switch_cost: float | None = None  # seconds of fuel; None: a boat is kept for the episode
-    is_evaluation: bool = False  # whether episodes and noise come from the streams of evaluation
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -142,14 +145,7 @@ class BoatState(NamedTuple):
     outcome: Tensor
     episode: Tensor
 
-
-def invalid_press(row: int, option: object, key: object, durations: object, num_options: int) -> ValueError:
-    """Return the error for an invalid action of boat `row`."""
-    return invalid_action(
-        row,
-        {
-            "option": (option, f"allowed 0 to {num_options - 1}"),
-            "key": (key, "allowed 0 to 2"),
-            "durations": (durations, "the pressed key's must be finite"),
-        },
-    )
+    @property
+    def steps(self) -> Tensor:
+        """Number of presses of the episode so far."""
+        return self.presses

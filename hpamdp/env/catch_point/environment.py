@@ -16,6 +16,7 @@ from torch import Tensor
 from hpamdp.env import point_agent
 from hpamdp.env.catch_point import kernel, rules
 from hpamdp.env.catch_point.rules import CatchPointState
+from hpamdp.env.counter_env import Action
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
@@ -107,12 +108,11 @@ class CatchPointEnv(PointEnv[CatchPointState]):
         return rules.start(episode, rng)
 
     def act(
-        self, state: CatchPointState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
+        self, state: CatchPointState, action: Action, rng: RngKey, is_idle: Tensor
     ) -> tuple[CatchPointState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
-        return rules.act(
-            state, discrete, parameters.squeeze(-1), catches=self.options.catches, late_end=self.options.late_end
-        )
+        catches, late_end = self.options.catches, self.options.late_end
+        return rules.act(state, action.discrete, action.parameters.squeeze(-1), catches=catches, late_end=late_end)
 
     def observe(self, state: CatchPointState) -> Tensor:
         """Return the observations `[N, 4]`, or `[N, 6]` with `progress`."""

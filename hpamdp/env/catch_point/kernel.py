@@ -44,6 +44,7 @@ def _act(floats: Any, integers: Any, row: Any, action: Any, given: Any, settings
 def advance(
     floats: Any,
     integers: Any,
+    option: Any,
     discrete: Any,
     parameters: Any,
     places: Any,
@@ -53,11 +54,12 @@ def advance(
     mode: Any,
     observations: Any,
     outcomes: Any,
+    entries: Any,
     flags: Any,
     rewards: Any,
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
+    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
     if invalid >= 0:
         return invalid
     for row in range(len(mask)):

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
-from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_env import Action, CounterEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.goal import kernel, rendering, rules
@@ -126,9 +126,7 @@ class GoalEnv(CounterEnv[GoalState]):
         """Return the states in which episodes begin."""
         return rules.start(episode, rng)
 
-    def act(
-        self, state: GoalState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
-    ) -> tuple[GoalState, Tensor]:
+    def act(self, state: GoalState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[GoalState, Tensor]:
         """Return the states after one action, and the rewards `[N]`."""
 
         def numbers(ticks: Tensor, rows: Tensor) -> Tensor:
@@ -136,7 +134,7 @@ class GoalEnv(CounterEnv[GoalState]):
 
         after, _ = rules.act(
             state,
-            self._aim(discrete, parameters),
+            self._aim(action.discrete, action.parameters),
             ~is_idle,
             numbers,
             noise=self.options.noise,

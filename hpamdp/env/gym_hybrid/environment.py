@@ -12,6 +12,7 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor
 
+from hpamdp.env.counter_env import Action
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
@@ -88,11 +89,10 @@ class _VehicleEnv(PointEnv[VehicleState]):
         """Return states with vehicle and target anywhere in the field, at rest."""
         return rules.start(episode, rng)
 
-    def act(
-        self, state: VehicleState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
-    ) -> tuple[VehicleState, Tensor]:
+    def act(self, state: VehicleState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[VehicleState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
-        return rules.act(state, discrete, parameters.squeeze(-1), slides=self.slides, max_steps=self.max_steps)
+        parameter = action.parameters.squeeze(-1)
+        return rules.act(state, action.discrete, parameter, slides=self.slides, max_steps=self.max_steps)
 
     def observe(self, state: VehicleState) -> Tensor:
         """Return the observations `[N, 10]`."""

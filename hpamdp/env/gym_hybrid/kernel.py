@@ -196,6 +196,7 @@ def _store(lanes: Any, numbers: Any, first: Any, width: Any, floats: Any, intege
 def advance(
     floats: Any,
     integers: Any,
+    option: Any,
     discrete: Any,
     parameters: Any,
     places: Any,
@@ -205,18 +206,19 @@ def advance(
     mode: Any,
     observations: Any,
     outcomes: Any,
+    entries: Any,
     flags: Any,
     rewards: Any,
 ) -> int:
     """Act or restart in every row, in place; see `hpamdp.env.kernel_rows`."""
-    invalid = kernels.invalid_row(discrete, parameters, places, integers, mode)
+    invalid = kernels.invalid_row(option, discrete, parameters, places, integers, settings, mode)
     if invalid >= 0:
         return invalid
     max_steps, slides = int32(min(settings[kernels.MAX_STEPS], _MOST_STEPS)), settings[SLIDES] != 0.0
     latest = _F(max(settings[kernels.MAX_STEPS] - 1.0, 1.0))
     lanes, numbers = np.zeros(_NUM_FLOATS * _LANES, np.float32), np.zeros(_NUM_INTEGERS * _LANES, np.int32)
     seen = np.empty(_OBSERVATION_DIM * _LANES, np.float32)
-    entries = observations.reshape(len(observations), -1)
+    numbers_seen = observations.reshape(len(observations), -1)
     for first in range(0, len(mask), _LANES):
         width = min(_LANES, len(mask) - first)
         _load(lanes, numbers, first, width, floats, integers, discrete, parameters, bounds, mask, mode)
@@ -243,7 +245,7 @@ def advance(
             else:  # nothing has changed
                 begin = first * _OBSERVATION_DIM
                 for place in range(width * _OBSERVATION_DIM):
-                    entries[reading, unsigned(begin + place)] = entries[reading - 1, unsigned(begin + place)]
+                    numbers_seen[reading, unsigned(begin + place)] = numbers_seen[reading - 1, unsigned(begin + place)]
             for j in range(width):
                 outcome = numbers[_OUTCOME * _LANES + j]
                 kernels.report(outcome, len(rules.OUTCOMES), unsigned(first + j), outcomes[reading], flags[reading])

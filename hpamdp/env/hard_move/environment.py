@@ -13,6 +13,7 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env import point_agent
+from hpamdp.env.counter_env import Action
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.hard_move import kernel, rules
@@ -127,11 +128,9 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         """Return states with agent and target anywhere in the square."""
         return rules.start(episode, rng)
 
-    def act(
-        self, state: HardMoveState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
-    ) -> tuple[HardMoveState, Tensor]:
+    def act(self, state: HardMoveState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[HardMoveState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
-        return rules.act(state, discrete, parameters.squeeze(-1), self._motions)
+        return rules.act(state, action.discrete, action.parameters.squeeze(-1), self._motions)
 
     def observe(self, state: HardMoveState) -> Tensor:
         """Return the observations `[N, 4]`."""

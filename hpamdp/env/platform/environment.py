@@ -15,7 +15,7 @@ from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from hpamdp.env import counter_rng
-from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_env import Action, CounterEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.platform import kernel, rendering, rules
@@ -84,14 +84,12 @@ class PlatformEnv(CounterEnv[PlatformState]):
         """Return the states at the beginning of the course; nothing about them is random."""
         return rules.start(episode)
 
-    def act(
-        self, state: PlatformState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
-    ) -> tuple[PlatformState, Tensor]:
+    def act(self, state: PlatformState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[PlatformState, Tensor]:
         """Return the states after one action, and the distances covered as shares of the course, `[N]`."""
         # Rows that do not move simulate a run, which is shorter than a jump.
-        simulated = torch.where(is_idle, rules.RUN, discrete)
+        simulated = torch.where(is_idle, rules.RUN, action.discrete)
         normal = partial(counter_rng.normal, rng)
-        after = rules.act(state, simulated, parameters.squeeze(-1), normal, self.options.noise)
+        after = rules.act(state, simulated, action.parameters.squeeze(-1), normal, self.options.noise)
         return after, (after.x - state.x) / rules.END
 
     def observe(self, state: PlatformState) -> Tensor:

@@ -8,11 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from pydantic import PositiveInt
-from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp import keys
-from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.counter_env import Action, CounterEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rooms import rendering, rules
@@ -52,7 +50,6 @@ class RoomsEnv(CounterEnv[RoomsState]):
     parameter_dims = (1, 1, 1, 1)
     parameter_low = (0.0,) * 4
     parameter_high = (1.0,) * 4
-    _option: Tensor
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
@@ -73,11 +70,10 @@ class RoomsEnv(CounterEnv[RoomsState]):
         """Return states with the agent anywhere in the first room."""
         return rules.start(episode, rng)
 
-    def act(
-        self, state: RoomsState, discrete: Tensor, parameters: Tensor, rng: RngKey, is_idle: Tensor
-    ) -> tuple[RoomsState, Tensor]:
+    def act(self, state: RoomsState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[RoomsState, Tensor]:
         """Return the states after one move and the rewards `[N]`."""
-        return rules.act(state, self._option, discrete, parameters.squeeze(-1))
+        assert action.option is not None
+        return rules.act(state, action.option, action.discrete, action.parameters.squeeze(-1))
 
     def observe(self, state: RoomsState) -> Tensor:
         """Return the observations `[N, 24]`."""
@@ -96,17 +92,3 @@ class RoomsEnv(CounterEnv[RoomsState]):
         """Return a picture of the rooms and the way so far, uint8 `[480, 480, 3]`."""
         path = [(int(state.x), int(state.y)) for state in track]
         return rendering.draw(path, int(track[-1].outcome))
-
-    def _make_specs(self, low: Tensor, high: Tensor) -> None:
-        super()._make_specs(low, high)
-        self.action_spec = self.make_action_spec(low, high, has_option=True)
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.check_action(tensordict)
-        option = tensordict.get(keys.OPTION)
-        is_known = (option >= 0) & (option < len(self.option_names))
-        if not is_known.all():
-            row = int((~is_known).nonzero()[0])
-            raise ValueError(f"step: environment {row} got option={option[row].item()} (allowed 0 to 1)")
-        self._option = option
-        return super()._step(tensordict)

@@ -10,7 +10,6 @@ import torch
 
 from hpamdp import __version__
 from hpamdp.env.boatdock import harbour, physics, planner
-from hpamdp.env.boatdock.episode import MAX_PRESSES, Rules
 from hpamdp.env.boatdock.play import episodes
 from hpamdp.env.boatdock.reference import (
     BEST_PERSON,
@@ -19,7 +18,7 @@ from hpamdp.env.boatdock.reference import (
     HUMAN_SUCCESS_BY_BLOCK,
     OFFSET_EDGES,
 )
-from hpamdp.env.boatdock.task import Boats
+from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, Rules
 from hpamdp.env.play_page import EpisodeError
 
 BLOCK, NUM_BLOCKS = 60, 6  # as people had them

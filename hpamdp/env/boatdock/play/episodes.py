@@ -18,8 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
 from hpamdp.env.boatdock import harbour, physics
-from hpamdp.env.boatdock.episode import MAX_PRESSES
 from hpamdp.env.boatdock.play.replay import HELD, Press, Replay, replay, settle
+from hpamdp.env.boatdock.task import MAX_PRESSES
 from hpamdp.env.play_page import EpisodeError
 from hpamdp.files import read_regular
 from hpamdp.json_lines import left_out, lines_of, read_json

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from hpamdp.env.boatdock import physics
-from hpamdp.env.boatdock.episode import MAX_PRESSES
 from hpamdp.env.boatdock.harbour import DIRECTIONS
+from hpamdp.env.boatdock.task import MAX_PRESSES
 
 DOWN, UP, BLUR = "down", "up", "blur"
 # A press that is not over yet.
