@@ -612,7 +612,7 @@ def test_actions_lie_in_their_bounds():
 def test_more_elites_than_samples_are_refused():
     with pytest.raises(ValueError, match="num_elites=20: must be at most num_samples=16"):
         make(num_elites=20)
-    with pytest.raises(ValueError, match="num_elites=12, but must be at most greedy_samples=8"):
+    with pytest.raises(ValueError, match="num_elites=12: must be at most greedy_samples=8"):
         make(num_elites=12, greedy_samples=8)
 
 

@@ -1,39 +1,39 @@
 """HyAR: TD3 or DDPG in a learned latent space of discrete actions and their parameters.
 
 An embedding table and a conditional VAE turn a discrete action and its parameters into one continuous latent action
-(e, z), which is what the actor gives and the critics judge.
+(e, z). The actor gives latent actions, and the critics value them.
 
 Source: Li, Tang, Zheng, Hao, Li, Wang, Meng and Wang, *HyAR: Addressing Discrete-Continuous Action Reinforcement
 Learning via Hybrid Action Representation*, 2022, arXiv 2109.05490: equations 2 to 6 and algorithm 1; TD3: Fujimoto, van
 Hoof and Meger 2018, arXiv 1802.09477; DDPG: Lillicrap et al. 2016, arXiv 1509.02971.
 
 In the published form (`discrete="nearest"`) the actor gives e and z, and e stands for the discrete action with the
-nearest embedding. The actor only follows the gradient of Q, so it stays with a discrete action whose neighbours in the
+nearest embedding. The actor only follows the gradient of Q. So it stays with a discrete action whose neighbours in the
 latent space are worse, even where others farther away are better. `discrete="greedy"` takes an exact maximum over the
-discrete actions instead: the actor gives a z for each of them, and the one whose own embedding and z have the highest Q
-is taken, in the policy as in the targets. It costs a pass of the critics for each discrete action.
+discrete actions instead, in the policy as in the targets: the actor gives a z for each of them, and the embedding and z
+with the highest Q are taken. It costs a pass of the critics for each discrete action.
 
 Differs from the source:
 - discrete actions may take different numbers of parameters, which lie side by side; the encoder sees only the chosen
   action's own, and the decoder is trained on those alone;
-- the change of the state is predicted in units of its standard deviation over the warm-up data, so that the scale of no
-  entry dominates the reconstruction loss;
-- the random actions of the warm-up and of epsilon-greedy exploration have no latent action of their own: they are
-  encoded when they are sampled from the replay buffer, as the representation-shift correction does for outdated ones;
+- the change of the state is predicted in units of its standard deviation over the warm-up data, so that no entry
+  dominates the reconstruction loss by its scale;
+- random actions have no latent action of their own: they are encoded when they are sampled from the replay buffer, as
+  the representation-shift correction does for outdated ones;
 - the correction compares the error of a stored action with a running mean of the codec's error, over its last hundred
   or so updates, instead of the error of the last update;
-- with `parameter_tolerance` the correction asks whether z still decodes to the executed parameters, which are stored,
-  instead of whether the change of the state that it predicts is the one that followed. Where changes are hard to
+- with `parameter_tolerance` the correction asks whether z still decodes to the executed parameters, which are stored.
+  The source asks whether the change of the state that z predicts is the one that followed. Where changes are hard to
   predict, the two hardly agree: see `experiments/domains`;
-- with `layer_norm` the critics' layers are normalised, which bounds what they promise of latent actions far from all
-  that were tried (Ball et al. 2023, arXiv 2302.02948);
-- with `greedy_samples` the greedy policy also values variations of z and takes the best of them all;
-- with `search_samples` the actor is also drawn to the best of random latent actions, the more the better they are than
-  its own by the critics, and `preactivation_penalty` keeps it from the bounds; both as in P-DQN;
-- tanh bounds the actor's output; the published code multiplies the gradient by the range that is left (inverting
-  gradients) besides, and clips its norm at 10;
+- with `layer_norm` the critics' layers are normalised, which bounds the values of latent actions far from all that were
+  tried (Ball et al. 2023, arXiv 2302.02948);
+- with `greedy_samples` the greedy policy also values variations of z and takes the best of them;
+- with `search_samples` the actor is also drawn to the best of random latent actions, weighted by their gain in value,
+  and `preactivation_penalty` keeps it from the bounds; both as in P-DQN;
+- tanh bounds the actor's output; the published code also multiplies the gradient by the range that is left (inverting
+  gradients), and clips its norm at 10;
 - exploration is by random actions, ever fewer, and by Gaussian noise of a constant scale; in the published code it is
-  by Gaussian noise alone, whose scale falls from 1 to .1.
+  by Gaussian noise alone, whose scale falls from 1 to 0.1.
 
 TorchRL's TD3Loss would fit the latent actor and critics, but an update takes 1.5 times as long with it (8.0 instead of
 5.3 ms of CPU time, batches of 256), because it runs the networks as functional calls under vmap.

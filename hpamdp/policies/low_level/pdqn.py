@@ -12,22 +12,22 @@ Andrychowicz et al. 2017, arXiv 1707.01495, appendix A. Towards the best of rand
 *Greedy Actor-Critic*, arXiv 1810.09103.
 
 Differs from the source:
-- one learner with uniform replay and target networks, which move at a rate each, as in Bester et al., instead of
-  asynchronous learners;
-- with `greedy_samples` the greedy policy also values variations of x(s) and takes the best of them all: the critics
-  often know better parameters than those that the actor's gradient has led to. It makes no difference in training;
-- with `search_samples` the actor is also drawn to the best of uniformly random parameters of each discrete action, the
-  more the better they are by the critics than its own. A gradient alone stays on the hill that it began on;
+- one learner with uniform replay and target networks replaces asynchronous learners; each target network moves at its
+  own rate, as in Bester et al.;
+- with `greedy_samples` the greedy policy also values variations of x(s) and takes the best of them. The critics often
+  know better parameters than the actor's gradient has found. Training stays the same;
+- with `search_samples` the actor is also drawn to the best of uniformly random parameters of each discrete action. The
+  weight is their gain in value. A gradient alone stays on the hill that it began on;
 - with `layer_norm` the critics' layers are normalised (Ball et al. 2023, arXiv 2302.02948);
-- where only the chosen action's value matters, only its pass is computed; passes share what they have in common;
+- where only the chosen action's value matters, only its pass is computed; passes share their common terms;
 - networks start as PyTorch's, not as Kaiming et al. proposed;
-- by default, that is with `pdqn.yaml`: twin critics, whose minimum is Q everywhere (in the targets, in the actor's loss
-  and in the choice of the action), target smoothing, a delayed actor, parameters squashed by tanh, one learning rate
-  and one target rate for both networks, gradients of any length, Gaussian noise on the parameters besides
-  epsilon-random actions. `pdqn_published.yaml` has the settings of Bester et al. instead.
+- the defaults are those of TD3: twin critics, whose minimum is Q everywhere, target smoothing and a delayed actor. They
+  add parameters squashed by tanh, one learning rate and one target rate for both networks, gradients of any length, and
+  Gaussian noise on the parameters besides epsilon-random actions. `pdqn_published.yaml` has the settings of Bester et
+  al. instead.
 
-TorchRL's DQNLoss does not fit: its value network sees the observation alone, whereas Q and its target here also take
-the parameters, which come from a network with a target and a loss of its own.
+TorchRL's DQNLoss does not fit: its value network sees the observation alone. Here Q and its target also take the
+parameters, which come from a network with a target and a loss of its own.
 """
 
 from __future__ import annotations

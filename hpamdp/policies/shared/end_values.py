@@ -1,11 +1,11 @@
-"""What the last state of a plan is worth, for learners that plan a few steps ahead in a model.
+"""The value of the last state of a plan, for learners that plan a few steps ahead in a model.
 
-A plan counts what its own steps earn. Where options end inside episodes, that is too little: another option may earn
-what this one leads to. So networks learn from the stored steps what states are worth, as model-free learners do.
+A plan counts the rewards of its own steps. If options end inside episodes, that is too little: the rewards may come
+under the next option. So networks learn the values of states from the stored steps, as model-free learners do.
 
 Sources: Lowrey et al. 2019, *Plan Online, Learn Offline*, arXiv 1811.01848: plans that end in a learned value;
 Kostrikov, Nair and Levine 2021, *Offline Reinforcement Learning with Implicit Q-Learning*, arXiv 2110.06169, equation
-5: the expectile, which gives little weight to what the worse ones of the stored actions led to.
+5: the expectile, which gives little weight to the returns of the worse stored actions.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ class EndValueOptions(Settings):
 class EndValues(nn.Module):
     """Two values of a state: `of_own`, if this learner acts there, and `forward`, if a plan ends there.
 
-    A network of its own learns the latter: the value under the option that holds after the step, which is another one
-    where this learner's option has ended. So a policy's copy in another process needs neither the selector nor the
-    other learners. Where observations do not tell whether the option ends, it is the mean of both cases. A plan of
-    several steps runs on past the end of its option.
+    Each value has its own network. The latter is the value under the option that holds after the step, which is another
+    option if this learner's has ended. So a policy's copy in another process needs neither the selector nor the other
+    learners. If observations do not tell whether the option ends, it is the mean of both cases. A plan of several steps
+    goes on past the end of its option.
 
     Args:
         observation_dim: of the states.

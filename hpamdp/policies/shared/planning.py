@@ -1,4 +1,4 @@
-"""What planners in a learned model share: a step's prediction, its share of a return, and the weights of the elites."""
+"""Planning in a learned model: predictions of a step, returns of plans, and a search over sequences of actions."""
 
 from __future__ import annotations
 

@@ -1,28 +1,28 @@
 """DLPA: model predictive control over discrete actions and their parameters, in a learned model.
 
-A transition, two reward and a termination predictor are trained on windows of consecutive real steps. Every action is
-the first one of the best action sequence that a sampling-based planner finds in them.
+A transition predictor, two reward predictors and a termination predictor are trained on windows of consecutive real
+steps. Every action is the first one of the best action sequence that a sampling-based planner finds in them.
 
 Source: Zhang, Fu, Miao and Konidaris, *Model-based Reinforcement Learning for Parameterized Action Spaces*, 2024, arXiv
 2404.03037, section 4: the three forms of the model, the H-step loss, the two reward predictors and the planner, which
 extends model predictive path integral control (Williams et al. 2015, arXiv 1509.01149) to parameterised actions.
 
 Differs from the source:
-- the transition predictor's target is the change of the state in units of its standard deviation over all stored steps,
-  and it is trained only on steps that do not terminate: a plan never continues after one that does;
+- the transition predictor's target is the change of the state in units of its standard deviation over all stored steps.
+  It is trained only on steps that do not terminate, because a plan never continues after one that does;
 - rewards are not squashed, and both reward predictors are used: a plan's return weights them by the predicted
-  probability of termination, and what follows by the probability that the episode continues;
+  probability of termination, and later rewards by the probability that the episode continues;
 - reward and termination have an ensemble of networks; a plan's return is the ensemble's mean minus `pessimism` standard
   deviations;
-- every plan starts from scratch, not from the previous one, which would have to be stored with the environments' data;
-  with the true model of this project's benchmark, a warm start adds .002 to .005 of the best possible score at 5
-  iterations, .006 to .01 at 3;
+- every plan starts from scratch. To start from the previous plan, it would have to be stored with the environments'
+  data. With the true model of this project's benchmark, such a warm start adds 0.002 to 0.005 of the best possible
+  score at 5 iterations, and 0.006 to 0.01 at 3;
 - exploring actions are sampled from the plan's final distribution, a fraction of them uniformly;
-- with `end_values` a plan also counts what its last state is worth (`policies.shared.end_values`).
+- with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`).
 
 TorchRL's SliceSampler (`fragmented`, padded) does not fit: it samples trajectories instead of steps uniformly, and none
-of its windows starts in the last `horizon - 1` steps of a longer trajectory, so that the model learns most terminations
-from predicted states only; on this project's benchmark the score after 8,000 steps was .77 with it and 2.71 without.
+of its windows starts in the last `horizon - 1` steps of a longer trajectory. So the model learns most terminations from
+predicted states only. On this project's benchmark the score after 8,000 steps was 0.77 with it and 2.71 without.
 """
 
 from __future__ import annotations

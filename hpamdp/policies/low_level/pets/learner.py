@@ -2,7 +2,7 @@
 
 Members predict the next state, the reward and the end of an episode. A plan tries every sequence of discrete actions,
 each with Gaussians of its own for their parameters. To explore, an environment follows the plans of a single member
-until its episode ends; a greedy plan takes the mean of all members' returns. Meant for few steps: some hundreds.
+until its episode ends; a greedy plan takes the mean of all members' returns. It is meant for a few hundred steps.
 
 Sources: Chua, Calandra, McAllister and Levine 2018, *Deep Reinforcement Learning in a Handful of Trials using
 Probabilistic Dynamics Models*, arXiv 1805.12114: the ensemble, the probabilistic members, and a member for each
@@ -11,25 +11,25 @@ termination of parameterised actions: Zhang et al. 2024, arXiv 2404.03037. Symme
 2006.16908.
 
 Differs from the sources:
-- the model has two stages: a small network predicts the change of the state in a step that does not terminate, and a
-  larger one, which sees where the step would lead by that prediction, whether it terminates and what it earns. An
-  end, such as at a wall or in a target, is a matter of where a step leads;
-- where the problem declares its geometry, states are turned until the discrete action points along +x before the
-  networks see them, with the lengths of all vectors among the inputs; of other declared symmetries, the mapped steps
-  are learned from as well (`augment`);
-- where states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
-  (`linear_part`): some hundred steps tell networks alone little of such a problem;
-- nor does an environment follow a single member there. Exploring plans are those of the mean of all members' returns
-  plus their standard deviation (`posterior_sampling`, `optimism`): all members are sure that what has never earned
-  anything never will, and agree best on actions that hardly do anything;
-- with `epsilon` a share of the exploring actions is random, for rewards that members which never met them agree not to
-  expect;
-- entries of the state whose changes depend linearly on those of others, such as a target's offset on one's own place,
-  are not predicted but derived from them;
+- the model has two stages. A small network predicts the change of the state in a step that does not terminate. A larger
+  network sees where the step would lead by that prediction, and predicts termination and reward: an end, such as at a
+  wall or in a target, depends on where a step leads;
+- if the problem declares its geometry, states are turned until the discrete action points along +x before the networks
+  see them, and the lengths of all vectors are among the inputs. For other declared symmetries, the model also learns
+  from the mapped steps (`augment`);
+- if states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
+  (`linear_part`), because a few hundred steps teach networks alone little of such a problem;
+- if states are not turned, exploring plans maximise the mean of all members' returns plus their standard deviation
+  (`posterior_sampling`, `optimism`). Single members all predict that actions without a reward so far will never have
+  one, and agree best on actions that hardly do anything;
+- `epsilon` makes some exploratory actions random. If no ensemble member has seen a reward, all of them predict none,
+  and planning alone never finds it;
+- some entries of the state change linearly with others, such as a target's offset with the agent's own place. They are
+  derived from these instead of predicted;
 - members share the data and differ in their initial weights and their minibatches; there is no bootstrap;
-- weight decay falls as steps come in, as the weight of a prior does;
-- the parameters of each sequence of discrete actions are searched by themselves (`policies.shared.planning`);
-- with `end_values` a plan also counts what its last state is worth (`policies.shared.end_values`).
+- weight decay falls with the number of steps, as the weight of a prior does;
+- each sequence of discrete actions has its own search for parameters (`policies.shared.planning`);
+- with `end_values` a plan also counts the value of its last state (`policies.shared.end_values`).
 """
 
 from __future__ import annotations
