@@ -1,4 +1,4 @@
-"""How all figures look: colours, style, labels at the ends of lines."""
+"""The style of all figures: colours, fonts, and labels at the ends of lines."""
 
 from __future__ import annotations
 

@@ -19,10 +19,10 @@ EVALUATION = "eval/"
 
 
 def read_rows(path: Path) -> list[dict[str, float]]:
-    """Read the rows of a `metrics.csv`, each with the columns it has a number for.
+    """Read the rows of a `metrics.csv`, each with the columns that have a number.
 
-    A last line without its end was cut off while it was written, and is left out; cells that hold no number too.
-    A missing file has no rows. A file of another kind has none either, and a warning names the file.
+    A last line without its end was cut off during writing and is left out. A missing file has no rows. A file of
+    another kind has none either, and a warning names the file.
     """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     lines = text[: text.rfind("\n") + 1].splitlines()
@@ -43,13 +43,13 @@ def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:
 
 
 class MetricsFile:
-    """A csv file with one row a log, complete on disk after every row, whose columns may grow.
+    """A csv file with one row for each log, complete on disk after every row. New columns may join.
 
     Args:
-        path: the file. It stays as it is until the first row; what an earlier run left there is then kept as
+        path: the file. It does not change before the first row. A file of an earlier run is then kept as
             `<name>.previous`.
-        resume_from: the metrics file of the run that is resumed, which may be `path` itself; its rows come first.
-        up_to_frames: leave out the resumed rows from the first one past this many frames on, and the row of the stop.
+        resume_from: the metrics file of the run that is resumed, which may be `path` itself. Its rows come first.
+        up_to_frames: resumed rows past this many frames are left out, and so is the row of the stop.
     """
 
     def __init__(self, path: Path, resume_from: Path | None = None, up_to_frames: float = math.inf) -> None:
@@ -75,7 +75,7 @@ class MetricsFile:
                 self._writer(file).writerow(row)
 
     def rows(self) -> list[dict[str, float]]:
-        """Return all rows so far, each with the columns it has a number for."""
+        """Return all rows so far, each with the columns that have a number."""
         return read_rows(self.path) if self._resumed is None else list(self._resumed)
 
     def _keep_previous(self) -> None:

@@ -20,13 +20,13 @@ from hpamdp.messages import first_line, reason_of
 def write_csv(tables: Mapping[str, TensorDict], folder: Path, *, axes: Sequence[str] | None = None) -> None:
     """Write each table to `<name>.csv` in a new folder.
 
-    Floats are written in as few digits as give them back exactly, NaN as an empty field, booleans as 0 and 1.
+    Floats have as many digits as a reader needs to restore them exactly. NaN is an empty field, booleans are 0 and 1.
 
     Args:
         tables: by name, each `[N]` with columns `[N]` or `[N, K]`.
         folder: must not exist yet.
-        axes: the names of the K parts of a column `[N, K]`, which becomes the columns `<column>_<axis>`; None: numbers
-            from 0.
+        axes: the names of the K parts of a column `[N, K]`, which becomes the columns `<column>_<axis>`. If None,
+            numbers from 0.
 
     Raises:
         DataError: the folder exists or cannot be written.

@@ -1,7 +1,7 @@
-"""Memory-mapped files of a tensordict, read as numbers and nothing else; `hpamdp.data.export` writes them.
+"""Read memory-mapped files of a tensordict as numbers only; `hpamdp.data.export` writes them.
 
-`TensorDict.load_memmap` alone would unpickle objects, build a class that a file names, and follow links. A file that is
-too short would crash the interpreter. So every file is checked before any is mapped.
+`TensorDict.load_memmap` alone unpickles objects, builds a class that a file names, and follows links. A file that is
+too short crashes the interpreter. So `load` checks every file before it maps any.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ class _Rule(NamedTuple):
     Attributes:
         entry: the entry's name.
         holds: where the entry keeps the rule, bool, of the entry's shape or `[N]`.
-        allowed: the allowed values in words, or one text for each number of a row.
+        allowed: the allowed values in words; for entries of several numbers, possibly one text each.
     """
 
     entry: _Key

@@ -27,7 +27,7 @@ def check_choices(rows: Mapping[str, Tensor], specs: PAMDPSpecs) -> None:
 
 
 def check_stored_rows(rows: TensorDictBase, specs: PAMDPSpecs, may_be_nan: frozenset[str] = frozenset()) -> None:
-    """Refuse stored rows with numbers that are not finite and with choices that do not exist.
+    """Refuse stored rows with numbers that are not finite or with choices that do not exist.
 
     Raises:
         ValueError: the message names the column.

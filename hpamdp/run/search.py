@@ -24,8 +24,8 @@ _TRIED_AGAIN = "tried_again"
 def go_on(config: DictConfig) -> int | None:
     """Set up Hydra's Optuna sweeper to continue a search; return the number of its first job.
 
-    The search repeats the trials that were stopped or failed, and then proposes new ones until `n_trials` are complete.
-    Without a storage, and with another sweeper, the first job has number 0.
+    The search first repeats trials that were stopped or failed. Then it proposes new ones until `n_trials` are
+    complete. Without a storage, or with another sweeper, the first job has number 0.
 
     Args:
         config: the sweep's config, with its `hydra` part, which is changed.

@@ -26,7 +26,7 @@ from hpamdp.env.boatdock.task import MAX_PRESSES, ObservationForm, RewardForm
 from hpamdp.messages import reason_of
 from hpamdp.specs import PAMDPSpecs
 
-_FORMAT = 1  # to be raised whenever the transitions of the same file change
+_FORMAT = 1  # raise it if the transitions of the same file change
 
 
 def slices(length: int) -> SliceSampler:
@@ -45,19 +45,19 @@ def whole_episodes() -> SliceSampler:
 class HumanExperienceReplay(BaseDatasetExperienceReplay):
     """The recorded presses, sampled by press, slice or episode, in the keys and observations of BoatDockEnv.
 
-    The rows are those of `hpamdp.data.human.transitions`, which says what is filled in where the recording is silent.
-    Their memory-mapped files are made at first use and shared by all processes that ask for the same rows.
+    `hpamdp.data.human.transitions` gives the rows, and explains what it fills in. The first use makes memory-mapped
+    files, which all processes share that ask for the same rows.
 
     Args:
         batch_size: rows in a sample.
-        path: the released file; None: `released_file.default_path`.
-        root: folder of the memory-mapped files; None: the user's cache.
+        path: the released file. If None, `released_file.default_path`.
+        root: folder of the memory-mapped files. If None, the user's cache.
         complete, successes, best_people, controller: which episodes, as in `hpamdp.data.human.episodes.select`.
         reward, observation, has_choice: as in `hpamdp.data.human.transitions.transitions`.
-        sampler: a TorchRL sampler; None: presses at random. `slices(length)` and `whole_episodes()` keep successive
+        sampler: a TorchRL sampler. If None, presses at random. `slices(length)` and `whole_episodes()` keep successive
             presses together.
         transform: a TorchRL transform, applied to every sample.
-        checksum: the SHA-256 that the file must have; None: any.
+        checksum: the SHA-256 that the file must have. If None, any.
         options: further arguments of TorchRL's TensorDictReplayBuffer.
 
     Raises:
@@ -130,7 +130,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         return self.root / self._name
 
     def _checked_rows(self, reward: RewardForm, observation: ObservationForm, has_choice: bool) -> TensorDict:
-        """Return the rows of the files, checked, because the files may be somebody else's."""
+        """Return the checked rows of the files, which may be somebody else's."""
         controller = "choose" if has_choice else "random"
         env = BoatDockEnv(1, controller=controller, reward=reward, observation=observation)
         try:

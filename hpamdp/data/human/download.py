@@ -15,14 +15,14 @@ from hpamdp.messages import reason_of
 
 
 def download(url: str, target: Path | None = None, *, checksum: str = SHA256) -> Path:
-    """Fetch the file and return its path; a file that is there already is checked and kept.
+    """Fetch the file and return its path; an existing file is checked and kept.
 
-    The download appears at the target once it is whole and its checksum is right; otherwise nothing is left behind. A
-    broken download is not resumed: the next call starts again (the file has 4 MB).
+    The download appears at the target once it is whole and its checksum is right. Otherwise nothing is left behind. The
+    next call does not resume a broken download but starts again (the file has 4 MB).
 
     Args:
         url: of any kind that pooch fetches, such as `https://…` or `doi:…/<file>`.
-        target: the file to make; None: `released_file.default_path`.
+        target: the file to make. If None, `released_file.default_path`.
         checksum: the SHA-256 that the file must have.
 
     Raises:

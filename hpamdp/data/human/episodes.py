@@ -16,7 +16,7 @@ def score(data: HumanData) -> Tensor:
 
 
 def scores_by_person(data: HumanData) -> Tensor:
-    """Return the mean score of each person `[P]`, P - 1 being the highest number in `person`; NaN without episodes."""
+    """Return the mean score of each person from 0 to the highest number in `person`, `[P]`; NaN without episodes."""
     person = data.episodes["person"]
     return torch.bincount(person, score(data)) / torch.bincount(person)
 
@@ -43,9 +43,9 @@ def select(
     Args:
         complete: only episodes whose log misses no press.
         successes: only episodes that ended in the dock.
-        best_people: only episodes of this many people, those of the highest mean score over all their episodes in
-            `data`; None: of all.
-        controller: only episodes with the `congruent` or the `incongruent` controller; None: with either.
+        best_people: only episodes of this many people, those with the highest mean score over all their episodes in
+            `data`. If None, of all.
+        controller: only episodes with the `congruent` or the `incongruent` controller. If None, with either.
 
     Raises:
         DataError: a condition is out of range, or no episode meets them all.

@@ -1,9 +1,9 @@
 """A bounded reader of the part of MATLAB's level 5 MAT format that the recording uses.
 
 SciPy's reader is not used because a damaged file can break it: cells nested 30,000 deep crash the interpreter, and a
-cell array whose header claims 2^30 entries takes 8 GB. Here every length is checked against the bytes that are there,
-and an array is opened only when its contents are asked for. Numeric arrays, cells and structs are read, compressed or
-not, in little-endian order. Source: MathWorks, *MAT-File Format*, "Level 5 MAT-File Format".
+cell array whose header claims 2^30 entries takes 8 GB. This reader checks every length against the bytes of the file,
+and opens an array only when its contents are needed. It reads numeric arrays, cells and structs, compressed or not, in
+little-endian order. Source: MathWorks, *MAT-File Format*, "Level 5 MAT-File Format".
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def read_variable(data: bytes, name: str) -> MatArray:
 
 
 def some(names: Sequence[str]) -> str:
-    """Return the names for a message, shortened where they are too many or too long."""
+    """Return the names for a message, shortened if they are too many or too long."""
     return ", ".join(repr(name[:20]) for name in names[:20]) + ", …" * (len(names) > 20)
 
 

@@ -1,7 +1,10 @@
 """Episodes that were played in a page (`hpamdp play`), read into the tables of the recording of 40 people.
 
-What differs from that recording: every press is logged, so all episodes are complete; a press that was interrupted has
-the time until then; `person` numbers the players in the order in which they appear; `tank` is the fuel in whole frames.
+Differences from that recording:
+- every press is logged, so all episodes are complete;
+- an interrupted press has its duration until the interruption;
+- `person` numbers the players in their order in the file;
+- `tank` is the fuel in whole frames.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ def read(path: Path | str, *, practice: bool = False) -> HumanData:
     """Read a file of played episodes; leave out lines that hold no episode, with a warning.
 
     Args:
-        path: of `hpamdp play`, or downloaded from its page.
+        path: the file that `hpamdp play` wrote, or that its page downloaded.
         practice: whether the episodes of practice count, too.
 
     Raises:

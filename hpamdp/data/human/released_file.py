@@ -65,7 +65,7 @@ class HumanData(NamedTuple):
 
 
 def default_path() -> Path:
-    """Return where the file is expected: the path in the environment variable, else a path in the user's cache."""
+    """Return the expected path of the file: the one in the environment variable, else one in the user's cache."""
     path = os.environ.get(PATH_VARIABLE)
     return Path(path) if path else user_cache_path("hpamdp") / FILE_NAME
 
@@ -74,8 +74,8 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
     """Read the released file, or another of the same schema.
 
     Args:
-        path: the file; None: `default_path`.
-        checksum: the SHA-256 that the file must have; None: any, as long as the contents are consistent.
+        path: the file. If None, `default_path`.
+        checksum: the SHA-256 that the file must have. If None, any, as long as the contents are consistent.
         one_frame: whether to move every position so that all harbours have the environment's centre, (640, 512);
             half the people saw theirs at (672, 504).
 

@@ -1,16 +1,16 @@
 """Recorded presses converted to rest-to-rest presses, the only ones that the environment has.
 
-A learner that imitates the presses as they were recorded learns presses that are too short, for two reasons. A press
-that begins while the boat still glides ends the glide, so a recorded press often moved its boat less far than the same
-press does in the environment. And presses that overlapped another are missing from the log, among them most of those
-that ended their episodes: four of five final presses in the log are too short to have done so, or aimed past the dock.
+A learner that imitates the recorded presses learns presses that are too short, for two reasons. First, a press that
+begins during a glide ends the glide. So a recorded press often moved its boat less far than the same press does in the
+environment. Second, the log misses presses that overlapped another, and most presses that ended their episodes are
+among them. Four of five final presses in the log are too short to have ended their episodes, or aimed past the dock.
 
 A rest-to-rest press starts from rest and lasts until the boat has come to rest again:
 - A press gets the duration that takes the boat, from rest to rest, to where the next press began.
 - Presses that moved the boat by less than `TAP` are left out.
-- Final presses are left out where, by our physics, they would not have ended their episode as it did.
+- Final presses are left out if, by our physics, they would not have ended their episode as recorded.
 
-Where the final press is left out, the last remaining press leads to where the final one began, and the episode is
+If the final press is left out, the last remaining press leads to the start of the final one. The episode is then
 truncated, not terminated.
 """
 
@@ -30,7 +30,7 @@ _CENTRE = torch.tensor(harbour.CENTRE, dtype=torch.float32)
 def to_rest_to_rest(data: HumanData) -> HumanData:
     """Return the recording with rest-to-rest presses.
 
-    Each episode's `tank` is what these presses leave of a full one.
+    Each episode's `tank` is a full one less these presses.
 
     Args:
         data: read with `one_frame=True`.

@@ -1,4 +1,4 @@
-"""What people achieved: scores, shares of outcomes and choices, and how far they stayed below the best plan."""
+"""People's results: scores, fractions of outcomes and choices, and the distance to the best plan."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
 
-# The congruent controller counts as the better one where the goal's bearing is less than this many degrees off the
-# nearest of its directions.
+# The congruent controller counts as the better one if the goal's bearing is less than this many degrees off the nearest
+# of its directions.
 _CONGRUENT_IS_BETTER_BELOW = 30.0
 
 
@@ -62,7 +62,7 @@ def offset_bins(data: HumanData) -> Tensor:
 
 
 def choice_curve(data: HumanData, mask: Tensor | None = None) -> np.ndarray:
-    """Return the share of congruent choices in each bin of `offset_bins`, `[6]`; NaN where there is no episode."""
+    """Return the fraction of congruent choices in each bin of `offset_bins`, `[6]`; NaN without episodes."""
     if mask is None:
         mask = torch.ones(len(data.episodes), dtype=torch.bool)
     bins = offset_bins(data)[mask]
@@ -80,10 +80,10 @@ def best_scores(data: HumanData) -> Tensor:
 
 
 def optimality_gaps(data: HumanData, best: Tensor) -> dict[str, Tensor]:
-    """Return by how much each episode's score stayed below the best possible one, each `[E]`.
+    """Return how far each episode's score is below the best possible score, each `[E]`.
 
-    `gap` is the distance to the best plan with the better controller: the sum of `choice_gap`, lost by choosing the
-    worse controller, and `press_gap`, lost with the one that was chosen.
+    `gap` is the distance to the best plan with the better controller. It is the sum of `choice_gap`, lost by choosing
+    the worse controller, and `press_gap`, lost with the chosen controller.
 
     Args:
         data: the recording.

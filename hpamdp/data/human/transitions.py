@@ -1,13 +1,14 @@
 """The recorded presses as BoatDockEnv would have returned them: the same keys, observations and rewards.
 
 What the recording does not hold is filled in:
-- The fuel before a press is a full tank less the logged presses. That is too much where presses are missing from the
-  log (`complete` marks the episodes where none is). After the final press it is the recorded tank.
+- The fuel before a press is a full tank less the logged presses. That is too much if presses are missing from the log;
+  `complete` marks the episodes in which none is missing. After the final press the fuel is the recorded tank.
 - The observed velocity is the one at which the previous logged press was released.
-- A final press that docked or was too fast ends on the dock's circle: where its course meets the circle or, if it does
-  not, at the point of the circle nearest to where the press began. Other final presses end where our physics puts them.
-  In any case the state is terminal, so nothing bootstraps from it, and only the progress reward depends on it.
-- Where not even the first press was logged, the first observation shows the boat already on its way.
+- A final press that docked or was too fast ends where its course meets the dock's circle. If they do not meet, it ends
+  at the point of the circle that is nearest to the start of the press. Our physics gives the ends of other final
+  presses. All these states are terminal, so no value bootstraps from them, and only the progress reward depends on
+  them.
+- If the first press was not logged, the first observation shows the boat already on its way.
 
 Episodes without a logged press give no transition.
 """
@@ -75,9 +76,8 @@ def transitions(
 def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: ObservationForm = "scaled") -> TensorDict:
     """Return each recorded episode as one decision for a selector, `[E]`: the first observation, the boat, the return.
 
-    The return is what the environment would have paid for the episode as it ended: its outcome and its `tank` were
-    recorded, whatever the log of its presses misses. Every episode is terminated; those without a logged press are
-    there, too.
+    The return is the environment's return for the recorded outcome and `tank`, even if the log of presses is not
+    complete. Every episode is terminated. Episodes without a logged press are included.
 
     At the root: `option` `[E]`. Under `next`: `decision_observation` and `observation` `[E, 16]` (14 with `pixels`),
     `option_return`, `option_steps` (the logged presses, at least 1), `is_decision`, `done`, `terminated` and
@@ -143,7 +143,7 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
 
 
 def _check(data: HumanData, reward: str, observation: str) -> None:
-    """Check what `transitions` and `decisions` are given."""
+    """Check the arguments of `transitions` and `decisions`."""
     _check_one_of("reward", reward, _REWARDS)
     _check_one_of("observation", observation, _OBSERVATIONS)
     if not (data.episodes["centre"] == torch.tensor(harbour.CENTRE, dtype=torch.float32)).all():
@@ -194,7 +194,7 @@ def _states(presses: TensorDict, episodes: TensorDict, has_choice: bool) -> tupl
         outcome=torch.full_like(num_presses, physics.SAILING),
         episode=torch.zeros_like(num_presses),
     )
-    # Where the final press was left out (`to_rest_to_rest`) the episode is truncated: its last state bootstraps.
+    # If `to_rest_to_rest` left out the final press, the episode is truncated, and values bootstrap from its last state.
     number = presses["episode"]
     is_last = torch.cat([number[1:] != number[:-1], torch.ones_like(is_final[:1])])
     outcome_if_not_final = torch.where(is_last, physics.TIME_LIMIT, physics.SAILING)
@@ -249,7 +249,7 @@ def _final_position(
 
 
 def _read(state: BoatState, rules: Rules) -> TensorDict:
-    """Return what the environment would show of these boats, without noise."""
+    """Return the environment's entries for these boats, without noise."""
     done = (state.outcome != physics.SAILING).unsqueeze(-1)
     truncated = (state.outcome == physics.TIME_LIMIT).unsqueeze(-1)
     reading = {

@@ -1,4 +1,4 @@
-"""Our physics against the recording: do single presses end as recorded, and do first presses go as far?"""
+"""Compare our physics with the recording: the outcomes of single presses, and the distances of first presses."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Fit(NamedTuple):
         likely_glide, likely_speed: the constants of the largest likelihood, as (value, low, high).
         agreeing_glide, agreeing_speed: the constants that predict most outcomes right, as (value, low, high).
         glides, speeds: the grid, `[G]` and `[S]`.
-        agreement: share of outcomes predicted right on the grid, `[G, S]`.
+        agreement: fraction of outcomes predicted right on the grid, `[G, S]`.
     """
 
     likely_glide: tuple[float, float, float]
@@ -84,7 +84,7 @@ def single_presses(data: HumanData) -> Singles:
 
 
 def agreement(singles: Singles) -> float:
-    """Return the share of single presses with the recorded outcome: docked, too fast, or dock not reached."""
+    """Return the fraction of single presses with the recorded outcome: docked, too fast, or dock not reached."""
     return (_reached(singles.outcome) == _reached(singles.predicted)).double().mean().item()
 
 

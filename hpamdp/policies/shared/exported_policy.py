@@ -3,11 +3,12 @@
 A layer is `{"in": n, "out": m, "weight": ..., "bias": ...}`: y = Wx + b, the weight row by row, both as base64 of
 little-endian float32. Forms of a selector or learner, by their `kind`:
 
-- `hybrid_actor`: `encoder`, layers each followed by ReLU; on them `discrete`, whose largest output is the discrete
-  action, and `parameters`, clipped to [-1, 1] and mapped linearly to the bounds `low` and `high`;
+- `hybrid_actor`: `encoder`, layers each followed by ReLU, and two heads on it. The largest output of `discrete` is the
+  discrete action. The outputs of `parameters` are clipped to [-1, 1] and mapped linearly to the bounds `low` and
+  `high`;
 - `ensemble`: `members`, each a list of layers with ReLU between them; the largest mean output is the option;
-- `polynomial`: the monomials of the observation's entries `inputs`, with a constant 1 after them: each of `factors`
-  lists which of these to multiply; the option has the largest product with its row of `coefficients`.
+- `polynomial`: monomials of the observation's entries `inputs`, with a constant 1 after them. Each of `factors` lists
+  the entries to multiply. The option is the one whose row of `coefficients` has the largest product with the monomials.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where batches come from: the environments of a run, stepped in this process or in others."""
+"""The contract of collections, which step a run's environments, in this process or in others, and give batches."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ class Collection:
     def state(self) -> dict[str, Any]:
         """Return the state of the collection for a checkpoint.
 
-        `env`: the environments' `env_state`, first dimension `num_envs`. Where it holds their episodes, also `root`,
-        the tensordict `[num_envs]` from which the next step is made, as a nested dictionary.
+        `env` is the environments' `env_state`, first dimension `num_envs`. If that holds their episodes, `root` is the
+        tensordict `[num_envs]` from which the next step is made, as a nested dictionary.
         """
         raise NotImplementedError
 

@@ -60,7 +60,7 @@ class RayCollection(WorkerCollection):
                 [remote.make_env],
                 policy_factory=[remote.make_policy],
                 frames_per_batch=shard.num_envs * self._config.run.steps_per_batch,
-                total_frames=sys.maxsize,  # it has no sign for endless
+                total_frames=sys.maxsize,  # RayCollector cannot collect without an end
                 device="cpu",
                 remote_configs={"num_cpus": 1},
                 collector_class=ShardCollector,

@@ -1,8 +1,8 @@
 """Collection in the learner's own process.
 
-TorchRL resets all environments when a collector is built and offers no way to continue from a state: its
-`Collector.state_dict` holds the policy and the environment's modules. So a collector's root, the tensordict from which
-it makes the next step, is saved and replaced here.
+TorchRL resets all environments when a collector is built, and its `Collector.state_dict` holds only the policy and the
+environment's modules. So this module saves and restores a collector's root, the tensordict from which it makes the next
+step.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class SingleCollection(Collection):
             auto_register_policy_transforms=False,
         )
         if selector is not None and pending is not None:
-            selector.pending.copy_(pending)  # TorchRL has just tried the policy: those were no decisions
+            selector.pending.copy_(pending)  # TorchRL has just tried the policy; these were no decisions
         self._batches = iter(self._collector)
         self._is_idle = True
 
@@ -48,8 +48,8 @@ class SingleCollection(Collection):
     def state(self) -> dict[str, Any]:
         """Return the environments' state and the root of the next step.
 
-        After an error in the middle of a batch, when TorchRL has closed its collector, there are no episodes to go on
-        with; what else the environments' state holds, such as the scale of observations, is returned.
+        An error in the middle of a batch closes TorchRL's collector, so there are no episodes to continue. Then only
+        the rest of the environments' state is returned, such as the scale of observations.
         """
         if not self._is_idle:
             return {"env": {} if self.env.keeps_episodes else self.env.env_state()}

@@ -1,4 +1,4 @@
-"""What a worker process builds: its shard of the run's environments, and a copy of the policy."""
+"""The parts that a worker process builds: its shard of the run's environments, and a copy of the policy."""
 
 from __future__ import annotations
 
@@ -201,9 +201,9 @@ class RemoteShard:
 
 
 def _end_with_parent() -> None:
-    """End this process when the run's own is killed, be it in the middle of a step.
+    """End this process when the run's own process is killed, also in the middle of a step.
 
-    By itself TorchRL's worker notices that only when it waits for the next command. Ray ends its actors itself.
+    TorchRL's worker would notice that only at its next command. Ray ends its actors itself.
     """
     parent = multiprocessing.parent_process()
     if parent is None:
