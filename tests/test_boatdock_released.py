@@ -120,7 +120,7 @@ def test_a_restored_state_continues_as_the_original():
 @pytest.mark.parametrize(
     ("bad", "complaint"),
     [
-        (action([0, 3], [0.0, 0.0]), r"environment 1 got key=3 \(allowed 0 to 2\), durations="),
+        (action([0, 3], [0.0, 0.0]), r"environment 1 got key=3 \(allowed 0 to 2\)"),
         (action([0, 1], [0.0, math.nan]), "environment 1 got key=1 .*nan"),
         (action([[0], [1]], torch.zeros(2, 3)), "shape"),
         (action([0.5, 1.0], [0.0, 0.0]), "must be integer"),

@@ -2,7 +2,7 @@
 
 Source: the code released with *A Benchmark for Hierarchical Parameterized Action Markov Decision Process*. It is kept
 to put the paper's table in context; `experiments/released` shows why returns here do not measure skill. It shares
-nothing with `BoatDockEnv` but the framework's contract.
+none of its rules with `BoatDockEnv`.
 Differs from the source: many boats at once; layouts come from counters instead of NumPy's global generator; `scaled`
 observations and a new layout for each episode are possible.
 """
@@ -17,16 +17,15 @@ import torch
 from pydantic import PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Categorical, Composite, Unbounded
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
-from hpamdp.env.actions import check_action_values
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.boatdock_released import rules as released
 from hpamdp.env.boatdock_released.rules import ReleasedState
-from hpamdp.env.facts import ProblemFacts
-from hpamdp.env.state_columns import restored, where
+from hpamdp.env.counter_env import Action, CounterEnv
+from hpamdp.env.counter_rng import RngKey
+from hpamdp.env.state_columns import check_range, where
 from hpamdp.settings import Settings
 
 
@@ -56,7 +55,7 @@ class ReleasedBoatDockOptions(Settings):
     """Steps after which an episode is truncated; released: 999."""
 
 
-class ReleasedBoatDockEnv(PAMDPEnv):
+class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
     """Dock boats by the rules of the released code in `num_envs` environments at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`, the key, in {0, 1, 2}; `("action", "parameters")` float32
@@ -86,9 +85,13 @@ class ReleasedBoatDockEnv(PAMDPEnv):
     """
 
     Options = ReleasedBoatDockOptions
+    options: ReleasedBoatDockOptions
+    outcomes = released.OUTCOMES
     parameter_dims = (1, 1, 1)
-    result_keys = (keys.OUTCOME,)
-    _state: ReleasedState
+    parameter_low = (-1.0,) * 3
+    parameter_high = (1.0,) * 3
+    start_keys = frozenset({"start", "goal", "keymap"})
+    action_names = ("key", "durations")
 
     def __init__(
         self,
@@ -101,27 +104,21 @@ class ReleasedBoatDockEnv(PAMDPEnv):
         first_env: int = 0,
         **settings: Any,
     ) -> None:
-        self.options = ReleasedBoatDockOptions.of(options, settings)
         if dtype not in ("float32", "float64"):
             raise ValueError(f"ReleasedBoatDockEnv: {dtype=}, but must be float32 or float64")
-        if num_envs < 1:
-            raise ValueError(f"ReleasedBoatDockEnv: {num_envs=}, but must be at least 1")
-        super().__init__(device=device, batch_size=[num_envs])
-        self.num_envs = num_envs
-        self.max_steps = self.options.max_steps
-        self.is_scaled = self.options.observation == "scaled"
-        self.float_type: torch.dtype = getattr(torch, dtype)
-        self._directions = torch.tensor(
-            released.DIRECTIONS[self.options.controller], dtype=self.float_type, device=self.device
-        )
-        self._environment = torch.arange(first_env, first_env + num_envs, dtype=torch.int32, device=self.device)
-        self._make_specs()
-        self._set_seed(seed)
+        self.float_type = getattr(torch, dtype)
+        super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
 
-    @classmethod
-    def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem."""
-        return ProblemFacts(title=cls.__name__)
+    def _prepare(self) -> None:
+        self._is_congruent = self.options.controller == "congruent"
+        self._is_scaled = self.options.observation == "scaled"
+        self.observation_names = released.SCALED_NAMES if self._is_scaled else released.OBSERVATION_NAMES
+        directions = released.DIRECTIONS[self.options.controller]
+        self._directions = torch.tensor(directions, dtype=self.float_type, device=self.device)
+
+    def seed_evaluation(self, seed: int) -> None:
+        """Seed the key maps of an evaluation, whose layouts are those of `fixed_episodes`."""
+        PAMDPEnv.seed_evaluation(self, seed)
 
     def fixed_episodes(self, seed: int) -> TensorDict:
         """Return layouts to `reset` with, one for each boat, from another stream than those of training."""
@@ -153,150 +150,84 @@ class ReleasedBoatDockEnv(PAMDPEnv):
             for code in (released.WALL, released.OUT_OF_FUEL, released.TIME_LIMIT)
         }
 
-    def env_state(self) -> dict[str, Tensor]:
-        """Return the columns of the state, `[N]` each."""
-        return self._state._asdict()
-
-    def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Continue from an `env_state`; an empty one starts new episodes.
+    def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
+        """Refuse key maps, counters and outcomes that do not exist.
 
         Raises:
-            ValueError: they are not the columns of a state of this many environments.
+            ValueError: a number is invalid.
         """
-        if not columns:
-            self._reset()
-            return
-        self._state = restored(columns, self._state, "ReleasedBoatDockEnv")
+        super().check_env_state(columns)
+        check_range(columns, {"keymap": (released.NO_KEYMAP, 2)})
 
-    def _make_specs(self) -> None:
-        n = self.num_envs
-        device = self.device
-        dtype = self.float_type
-        names = released.SCALED_NAMES if self.is_scaled else released.OBSERVATION_NAMES
-        self.observation_spec = Composite(
-            observation=Unbounded(shape=(n, len(names)), device=device, dtype=dtype),
-            outcome=Categorical(len(released.OUTCOMES), shape=(n,), device=device),
-            shape=(n,),
-        )
-        bound = torch.ones(len(self.parameter_dims), dtype=torch.float32)
-        self.action_spec = self.make_action_spec(-bound, bound)
-        self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=dtype)
-        self.done_spec = self.make_done_spec()
-
-    def _set_seed(self, seed: int | None) -> None:
-        self._seed = counter_rng.seed_tensor(0 if seed is None else seed, self.device)
-        integer_zeros = torch.zeros_like(self._environment)
+    def start(self, episode: Tensor, rng: RngKey) -> ReleasedState:
+        """Return boats that have no layout yet."""
+        integer_zeros = torch.zeros_like(episode)
         zeros = integer_zeros.to(self.float_type)
-        self._state = ReleasedState(
-            start_x=zeros,
-            start_y=zeros,
-            goal_x=zeros,
-            goal_y=zeros,
-            x=zeros,
-            y=zeros,
-            velocity_x=zeros,
-            velocity_y=zeros,
-            fuel=zeros,
-            keymap=integer_zeros
-            + (self.options.keymap if self.options.controller == "incongruent" else released.NO_KEYMAP),
-            steps=integer_zeros,
-            outcome=integer_zeros,
-            episode=integer_zeros - 1,
+        keymap = released.NO_KEYMAP if self._is_congruent else self.options.keymap
+        columns = dict.fromkeys(ReleasedState._fields[:9], zeros)
+        return ReleasedState(
+            **columns, keymap=integer_zeros + keymap, steps=integer_zeros, outcome=integer_zeros, episode=episode
         )
 
-    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
-        mask = self.reset_mask(tensordict)
-        given = {} if tensordict is None else self._given_layout(tensordict)
-        before = self._state
-        episode = before.episode + 1
+    def _restart(self, state: ReleasedState, mask: Tensor) -> ReleasedState:
+        """Return the states with new episodes in the rows of `mask` `[N]`; they keep more than elsewhere."""
+        episode = state.episode + 1
         rng = counter_rng.rng_key(self._seed, counter_rng.TRAINING, self._environment, episode)
-        layout = given or self._sampled_layout(rng, mask)
-        if "keymap" in layout:
-            keymap = layout["keymap"]
-        else:
-            sampled = (counter_rng.uniform(rng, released.INDEX_KEYMAP) < 0.5).to(torch.int32)
-            keymap = torch.where(before.keymap == 0, sampled, before.keymap)
-        fresh = before._replace(**layout)
-        fresh = fresh._replace(
-            x=fresh.start_x,
-            y=fresh.start_y,
+        points = torch.stack(state[:4], -1)
+        is_due = mask & (state.episode < 0) if self.options.frozen_layouts else mask
+        if is_due.any():
+            due = rng._replace(bits=rng.bits[is_due])
+            points[is_due] = released.sample_layouts(due, self.options.test_mode).to(points)
+        start_x, start_y, goal_x, goal_y = points.unbind(-1)
+        sampled = (counter_rng.uniform(rng, released.INDEX_KEYMAP) < 0.5).to(torch.int32)
+        fresh = state._replace(
+            start_x=start_x,
+            start_y=start_y,
+            goal_x=goal_x,
+            goal_y=goal_y,
+            x=start_x,
+            y=start_y,
             # As released, the velocity stays that of the previous episode's last press.
-            fuel=torch.full_like(before.fuel, released.TANK),
-            keymap=keymap,
-            steps=torch.zeros_like(before.steps),
-            outcome=torch.full_like(before.outcome, released.SAILING),
+            fuel=torch.full_like(state.fuel, released.TANK),
+            keymap=torch.where(state.keymap == 0, sampled, state.keymap),
+            steps=torch.zeros_like(state.steps),
+            outcome=torch.full_like(state.outcome, released.SAILING),
             episode=episode,
         )
-        self._state = where(mask, fresh, before)
-        return self._read()
+        return where(mask, fresh, state)
 
-    def _sampled_layout(self, rng: counter_rng.RngKey, mask: Tensor) -> dict[str, Tensor]:
-        """Return the layout columns of the state, with new layouts in those rows of `mask` `[N]` that need one."""
-        is_due = mask & (self._state.episode < 0) if self.options.frozen_layouts else mask
-        state = self._state
-        points = torch.stack([state.start_x, state.start_y, state.goal_x, state.goal_y], -1)
-        if is_due.any():
-            points[is_due] = released.sample_layouts(rng._replace(bits=rng.bits[is_due]), self.options.test_mode).to(
-                points
-            )
-        start_x, start_y, goal_x, goal_y = points.unbind(-1)
-        return {"start_x": start_x, "start_y": start_y, "goal_x": goal_x, "goal_y": goal_y}
+    def act(self, state: ReleasedState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[ReleasedState, Tensor]:
+        """Return the states after one press, and the rewards `[N]`."""
+        direction = self._directions[state.keymap.clamp(min=0).long(), action.discrete]
+        return released.press(state, direction, action.parameters.squeeze(-1), self.max_steps)
 
-    def _given_layout(self, given: TensorDictBase) -> dict[str, Tensor]:
-        """Check a user's layout and return the columns of the state that it sets; empty without a layout."""
-        if not {"start", "goal", "keymap"} & set(given.keys()):
-            return {}
-        low = torch.tensor(released.LOW, device=self.device, dtype=torch.float32)
+    def observe(self, state: ReleasedState) -> Tensor:
+        """Return the observations, `[N, 15]`, or `[N, 17]` if scaled."""
+        return released.observe(state, self._is_congruent, self._is_scaled)
+
+    def start_columns(self, given: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """Check a layout and return the columns of the state that it sets."""
+        num, low = self.num_envs, np.array(released.LOW, np.float32)
         points = {}
         for name in ("start", "goal"):
-            point = given.get(name, None)
-            if point is None or point.shape != (self.num_envs, 2):
+            point = given.get(name)
+            if point is None or point.shape != (num, 2):
                 shape = None if point is None else list(point.shape)
-                raise ValueError(f"reset: {name} has shape {shape}, but must be [{self.num_envs}, 2] (screen px)")
-            points[name] = point.to(self.device, self.float_type)
+                raise ValueError(f"reset: {name} has shape {shape}, but must be [{num}, 2] (screen px)")
+            points[name] = point.astype(np.float64 if self.float_type == torch.float64 else np.float32)
             if not ((points[name] >= low) & (points[name] < low + released.SIZE)).all():
                 bounds = [f"[{corner}, {corner + released.SIZE}]" for corner in released.LOW]
                 raise ValueError(f"reset: a {name} lies outside x in {bounds[0]}, y in {bounds[1]} (screen px)")
-        if not ((points["start"] - points["goal"]).norm(dim=-1) >= 1.0).all():
+        if not (np.linalg.norm(points["start"] - points["goal"], axis=-1) >= 1.0).all():
             raise ValueError("reset: a start lies within 1 px of its goal")
-        start_x, start_y = points["start"].unbind(-1)
-        goal_x, goal_y = points["goal"].unbind(-1)
+        (start_x, start_y), (goal_x, goal_y) = points["start"].T, points["goal"].T
         columns = {"start_x": start_x, "start_y": start_y, "goal_x": goal_x, "goal_y": goal_y}
-        keymap = given.get("keymap", None)
+        columns |= {"x": start_x, "y": start_y}
+        keymap = given.get("keymap")
         if keymap is None:
             return columns
-        if self.options.controller == "congruent":
+        if self._is_congruent:
             raise ValueError("reset: keymap is given, but the congruent boat has none")
-        if keymap.shape != (self.num_envs,) or not ((keymap == 0) | (keymap == 1)).all():
-            raise ValueError(f"reset: keymap must be 0 or 1 in shape [{self.num_envs}]")
-        return {**columns, "keymap": keymap.to(self.device, torch.int32)}
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.check_action(tensordict)
-        key = tensordict.get(keys.DISCRETE)
-        durations = tensordict.get(keys.PARAMETERS)
-        check_action_values(key, durations, self.parameter_dims, names=("key", "durations"))
-        key = key.long()
-        duration = durations.gather(-1, key.unsqueeze(-1)).squeeze(-1).to(torch.float32).clamp(-1.0, 1.0)
-        before = self._state
-        is_over = before.outcome != released.SAILING
-        mask = tensordict.get("_step", None)
-        if mask is not None:
-            is_over = is_over | ~mask.reshape(self.num_envs)
-        direction = self._directions[before.keymap.clamp(min=0).long(), key]
-        after, reward = released.press(before, direction, duration, self.max_steps)
-        self._state = where(is_over, before, after)
-        return self._read().set(keys.REWARD, torch.where(is_over, 0.0, reward).unsqueeze(-1))
-
-    def _read(self) -> TensorDict:
-        outcome = self._state.outcome.long()
-        done = (outcome != released.SAILING).unsqueeze(-1)
-        truncated = (outcome == released.TIME_LIMIT).unsqueeze(-1)
-        leaves = {
-            keys.OBSERVATION: released.observe(self._state, self.options.controller == "congruent", self.is_scaled),
-            keys.OUTCOME: outcome,
-            keys.DONE: done,
-            keys.TERMINATED: done & ~truncated,
-            keys.TRUNCATED: truncated,
-        }
-        return TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        if keymap.shape != (num,) or not ((keymap == 0) | (keymap == 1)).all():
+            raise ValueError(f"reset: keymap must be 0 or 1 in shape [{num}]")
+        return {**columns, "keymap": keymap.astype(np.int32)}
