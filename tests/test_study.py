@@ -24,7 +24,7 @@ from hpamdp.analysis.study import (
 
 EXPERIMENTS = Path(__file__).resolve().parent.parent / "experiments"
 CONFIG = (
-    "low: {{twin_q: {twin_q}, multipass: {multipass}}}\n"
+    "low: {{twin: {twin}, multipass: {multipass}}}\n"
     "env: {{controller: congruent, reward: {reward}}}\n"
     "eval: {{stop_score: {stop_score}}}\n"
 )
@@ -54,7 +54,7 @@ def leave_run(folder, low="hppo", seed=0, scores=(-0.9, 1.5, 2.5), high="none", 
     summary |= {"frames": 200, "wall_s": 2.04, "cpu_s": 1.0}
     (folder / "summary.json").write_text(json.dumps(summary))
     (folder / "config.yaml").write_text(
-        CONFIG.format(**{"twin_q": "true", "multipass": "true", "reward": "paper", "stop_score": "null"} | config)
+        CONFIG.format(**{"twin": "true", "multipass": "true", "reward": "paper", "stop_score": "null"} | config)
     )
     lines = ["frames,wall_s,loss,eval/score,eval/success", "50,0.5,1.0,,"]
     lines += [f"{100 * i},{i},,{score},{0.1 * i}" for i, score in enumerate(scores)]
@@ -207,8 +207,8 @@ def test_a_curve_goes_as_far_as_all_seeds_do():
 
 
 def test_the_learners_study_names_published_forms_and_rewards_and_when_people_were_reached(tmp_path):
-    leave_run(tmp_path / "a", low="pdqn", twin_q="false", scores=(0.0, 2.0, 1.0))
-    leave_run(tmp_path / "b", low="pdqn", twin_q="false", multipass="false", reward="sparse", scores=(0.0, 1.9))
+    leave_run(tmp_path / "a", low="pdqn", twin="false", scores=(0.0, 2.0, 1.0))
+    leave_run(tmp_path / "b", low="pdqn", twin="false", multipass="false", reward="sparse", scores=(0.0, 1.9))
     leave_run(tmp_path / "c", low="pdqn")
     results, curves = study("learners").gather(finished([tmp_path]))
     assert [(row["low"], row["reward"], row["presses_to_human"]) for row in results] == [
@@ -232,7 +232,7 @@ def test_the_table_keeps_runs_that_ended_at_peoples_score_apart_from_full_length
 
 
 def test_few_steps_keeps_runs_that_were_left_running_apart(tmp_path):
-    learner = dict(augment="auto", num_members=5, posterior_sampling="auto", updates_per_frame=10.0, horizon=2)
+    learner = dict(augment="auto", num_members=5, posterior_sampling="auto", updates_per_step=10.0, horizon=2)
     config = {"low": learner, "env": {"reward": "paper"}}
     runs = []
     for name, frames in (("short", 384), ("long", 2000)):

@@ -92,7 +92,7 @@ def learner(run: Run) -> str:
         name = "patd3"
     elif name == "pdqn_published" and low["multipass"]:
         name = "mpdqn_published"
-    elif name == "hyar" and low["rl"] == "ddpg":
+    elif name == "hyar" and not low["twin"]:
         name = "hyar_ddpg"
     return f"{name}{AUGMENTED}" if low.get("augment", False) is True else name
 

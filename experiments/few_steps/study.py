@@ -35,12 +35,12 @@ SETTINGS = {
     ("False", "shaped"): "told nothing of symmetry",
 }
 # What an ablation changes, its values otherwise, and what that means.
-ABLATED = {"num_members": (5,), "posterior_sampling": ("auto", True), "updates_per_frame": (10.0,), "horizon": (2,)}
+ABLATED = {"num_members": (5,), "posterior_sampling": ("auto", True), "updates_per_step": (10.0,), "horizon": (2,)}
 VARIANTS = {
     "": "as above",
     "posterior_sampling=False": "explores by the mean of the members",
     "num_members=1": "one member",
-    "updates_per_frame=3.0": "3 updates for each press, not 10",
+    "updates_per_step=3.0": "3 updates for each press, not 10",
     "horizon=1": "plans of one press",
     "horizon=3": "plans of three presses",
 }

@@ -78,7 +78,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
 def _name(run: Run) -> str:
     """Return the learner's name; P-DQN's published forms have names of their own."""
     low = run.config["low"]
-    if run.summary["low"] != "pdqn" or low["twin_q"]:
+    if run.summary["low"] != "pdqn" or low["twin"]:
         return run.summary["low"]
     return "pdqn as MP-DQN" if low["multipass"] else "pdqn as P-DQN"
 

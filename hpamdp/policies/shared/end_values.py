@@ -62,7 +62,7 @@ class EndValues(nn.Module):
         self.target_own = copy.deepcopy(self.own).requires_grad_(False)
 
     def forward(self, state: Tensor) -> Tensor:
-        """Return what states `[*B, observation_dim]` are worth at the end of a plan, `[*B]`."""
+        """Return the values `[*B]` of states `[*B, observation_dim]` at the end of a plan."""
         value: Tensor = self.end(state).squeeze(-1)
         return value
 

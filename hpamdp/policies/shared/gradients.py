@@ -23,7 +23,7 @@ Gradients = Callable[..., tuple[dict[str, Tensor], tuple[Tensor | None, ...]]]
 
 
 class Descent:
-    """Takes steps of optimizers down the gradients of losses: as they are, compiled, or with products in bfloat16."""
+    """Take steps of optimizers down the gradients of losses: plain, compiled, or with matrix products in bfloat16."""
 
     def __init__(self) -> None:
         self._gradients_of: Gradients = gradients_of
@@ -34,7 +34,7 @@ class Descent:
         self._gradients_of = compiled(device, any_size=any_size)
 
     def lower_precision(self) -> None:
-        """Have matrix products in bfloat16; parameters and what sums over many terms stay in float32."""
+        """Compute matrix products in bfloat16; parameters and sums over many terms stay in float32."""
         self.precision = torch.bfloat16
 
     def step(
@@ -52,7 +52,7 @@ class Descent:
             optimizer: of the parameters to learn.
             loss_of: maps the inputs to the loss and to scalars to log.
             inputs: tensors, tensors by name, or None.
-            max_grad_norm: largest norm of the gradient; None: no limit.
+            max_grad_norm: largest norm of the gradient; if None, there is no limit.
         """
         groups = optimizer.param_groups
         parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
@@ -70,7 +70,7 @@ def expectile_loss(excess: Tensor, expectile: float) -> Tensor:
 
     Args:
         excess: of the targets over the predictions, `[B]`.
-        expectile: of the targets, from .5, their mean, towards 1, the largest.
+        expectile: of the targets, from 0.5, their mean, towards 1, the largest.
     """
     return (torch.where(excess > 0.0, expectile, 1.0 - expectile).float() * excess.square()).mean()
 
@@ -89,10 +89,10 @@ def gradients_of(
 
 
 def _is_to_be_checked(guards: Sequence[GuardFilterEntry]) -> list[bool]:
-    """Return which of the conditions that compiled code was made under to check at every call.
+    """Return which conditions of compiled code to check at every call.
 
-    Not that functions, modules and classes are still those of their names, and that no module got a hook or a method of
-    its own: nothing here does that in the middle of a run, and it is two thirds of what there is to check.
+    The checks left out are two thirds of all: that functions, modules and classes are still those of their names, and
+    that no module got a hook or a method of its own. Nothing here does that in the middle of a run.
     """
     never_changes = ("EMPTY_NN_MODULE_HOOKS_DICT", "NOT_PRESENT_IN_GENERIC_DICT")
     return [not guard.is_global and guard.guard_type not in never_changes for guard in guards]
@@ -101,12 +101,12 @@ def _is_to_be_checked(guards: Sequence[GuardFilterEntry]) -> list[bool]:
 def compiled(device: torch.device, *, any_size: bool) -> Gradients:
     """Return `gradients_of` compiled at its first call for each loss, in a few seconds of CPU time.
 
-    What was compiled is kept on disk by PyTorch (`TORCHINDUCTOR_CACHE_DIR`), so that the same losses compile faster in
-    later runs. Compiled code draws other random numbers from the same seed, and sums in another order.
+    PyTorch keeps compiled code on disk (`TORCHINDUCTOR_CACHE_DIR`), so that the same losses compile faster in later
+    runs. Compiled code draws other random numbers from the same seed, and sums in another order.
 
     Args:
         device: of the parameters.
-        any_size: whether the inputs of a loss are not of the same size at every call.
+        any_size: true if the inputs of a loss change in size from call to call.
 
     Raises:
         ValueError: there is no C++ compiler, or this PyTorch cannot compile gradients.

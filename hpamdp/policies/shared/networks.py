@@ -1,4 +1,4 @@
-"""Networks that several learners share, and sampling from their output."""
+"""Networks that several learners share, and what bounds their output."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torch.nn import functional as F
 
 from hpamdp.specs import PAMDPSpecs
 
-# What parameters start with: the problem's own convention, where it has one, or whatever the network begins with.
+# Initial parameters: the problem's own convention, if it has one (`domain`), or the network's initial output (`none`).
 InitialParameters = Literal["domain", "none"]
 
-# Past the first a squashed parameter hardly moves any more, so none starts there; none is drawn past the second.
+# Squashed parameters start within the first bound, past which they hardly move, and are drawn to none past the second.
 _LARGEST_INITIAL = 0.99
 _LARGEST_DRAWN_TO = 0.97
 
@@ -49,17 +49,17 @@ class EnsembleLinear(nn.Module):
 class EnsembleMLP(nn.Module):
     """`num_members` independent ReLU networks on the same input `[B, in]`, output `[E, B, out]`.
 
-    Two members of 128 x 128 units take 1.2 ms of CPU time for forward and backward on a batch of 256, and .46 ms on 64;
-    `torch.func.stack_module_state` under vmap and TorchRL's vmapped parameters take 1.6 and .83 ms.
+    Two members of 128 x 128 units take 1.2 ms of CPU time for forward and backward on a batch of 256, and 0.46 ms on
+    64; `torch.func.stack_module_state` under vmap and TorchRL's vmapped parameters take 1.6 and 0.83 ms.
 
     Args:
         num_members: E.
         in_dim: entries of the input.
         hidden_dims: widths of the hidden layers.
         out_dim: entries of the output.
-        layer_norm: whether the hidden layers are normalised before ReLU, which bounds the output however far the input
-            is from what was learned from (Ball et al. 2023, *Efficient Online Reinforcement Learning with Offline
-            Data*, arXiv 2302.02948, section 4.2).
+        layer_norm: normalise the hidden layers before ReLU. This bounds the output for inputs far from the training
+            data (Ball et al. 2023, *Efficient Online Reinforcement Learning with Offline Data*, arXiv 2302.02948,
+            section 4.2).
     """
 
     def __init__(
@@ -98,7 +98,7 @@ def before_tanh(output: Tensor) -> Tensor:
 
 
 def unsquashed(unit: Tensor, largest: float = _LARGEST_DRAWN_TO) -> Tensor:
-    """Return what tanh maps to values in [-1, 1], none of which counts as nearer to a bound than `largest`."""
+    """Return the inverse tanh, after clamping to [-largest, largest]."""
     return unit.clamp(-largest, largest).atanh()
 
 
@@ -126,10 +126,10 @@ def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
 
 
 class VectorProducts(nn.Module):
-    """Puts behind an observation the scalar and the cross product of every two of its vectors in the plane.
+    """Append to an observation the scalar and the cross product of every two of its vectors in the plane.
 
-    How far a heading misses a target is a sum of such products. Without them a network has to learn to multiply, and
-    learns it roughly.
+    The distance by which a heading misses a target is a sum of such products. Without them a network has to learn to
+    multiply, and learns it only roughly.
 
     Args:
         specs: of the problem, whose geometry says which entries are vectors.
@@ -194,7 +194,7 @@ class InvertingGradients(torch.autograd.Function):
 
 
 class InitialLayer(nn.Module):
-    """A problem's initial parameters as a frozen linear layer, to add to what a network says of the parameters.
+    """A problem's initial parameters as a frozen linear layer, whose output is added to a network's parameters.
 
     Source: the code of Bester, James and Konidaris 2019, arXiv 1905.04388 (`action_parameters_passthrough_layer`).
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import Field, NonNegativeInt, PositiveInt, model_validator
+from pydantic import NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -42,7 +42,7 @@ class ReplayOptions(BufferOptions):
 
     warmup_steps: NonNegativeInt = 5000
     """Random steps of a learner before its first update."""
-    updates_per_step: Annotated[float, Field(gt=0.0)] = 0.25
+    updates_per_step: PositiveFloat = 0.25
     """Updates for each step that the learner collects."""
     augment: Literal["auto"] | bool = False
     """Map each sampled transition by a random symmetry that the problem declares. `auto` does so if there is any."""

@@ -28,10 +28,10 @@ predicted states only. On this project's benchmark the score after 8,000 steps w
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
@@ -73,7 +73,7 @@ class DLPAOptions(PlannerOptions):
     """Capacity of the replay buffer, in steps; the oldest steps are overwritten."""
     batch_size: PositiveInt = 256
     """Windows in an update."""
-    updates_per_step: Annotated[float, Field(gt=0.0)] = 1.0
+    updates_per_step: PositiveFloat = 1.0
     """Updates for each step that the learner collects; the first ones make up for the warm-up."""
 
 

@@ -35,10 +35,10 @@ Differs from the sources:
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar
+from typing import Any, ClassVar
 
 import torch
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import NonNegativeFloat, PositiveFloat, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
@@ -64,7 +64,7 @@ class PETSOptions(PETSPolicyOptions):
     """Weight of the change's error in the loss; those of termination and rewards are 1."""
     warmup_steps: PositiveInt = 64
     """Random steps of a learner before its first update; there are more until two rewards differ."""
-    updates_per_step: Annotated[float, Field(gt=0.0)] = 10.0
+    updates_per_step: PositiveFloat = 10.0
     """Updates for each step that the learner collects; the first ones make up for the warm-up."""
     batch_size: PositiveInt = 64
     """Steps in a member's minibatch."""

@@ -114,9 +114,10 @@ class PETSPolicy(PlanningPolicy):
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the expected returns `[N]` of the plans from observations `[N, *]`, with what a mask allows.
 
-        Greedily that is by the mean of all members, and `caution`; exploring by posterior sampling, by a random member
-        for each observation, or else by the mean and `optimism`, so that what members disagree on is tried. Before
-        the policy plans, the value assumes the only known reward at every step; while exploring, it is infinite.
+        A greedy policy uses the mean of all members, and `caution`. An exploring policy uses a random member for each
+        observation (posterior sampling), or else the mean and `optimism`, so that it tries what members disagree on.
+        Before the policy plans, the greedy value assumes the only known reward at every step; the exploring value is
+        infinite.
         """
         num = len(observation)
         if not bool(self.is_trained):
@@ -191,6 +192,10 @@ class PETSPolicy(PlanningPolicy):
         return joined_found if is_mean else Found(*(part.flatten(0, 1) for part in joined_found))
 
     def _returns(self, state: Tensor, is_mean: bool) -> Returns:
+        """Return a function from sequences to their predicted returns, from states `[E, N, observation_dim]`.
+
+        The returns are one for each member and state, or with `is_mean` those of all members together.
+        """
         num_members, num_states = state.shape[:2]
 
         def for_members(part: Tensor) -> Tensor:
@@ -223,15 +228,15 @@ class PETSPolicy(PlanningPolicy):
         return returns
 
     def _end_value_of_joined(self, rows: Tensor) -> Tensor:
-        """Return what states `[E, observation_dim, N, Q, S]` are worth at the end of a plan, `[E, N, Q, S]`."""
+        """Return the values `[E, N, Q, S]` of states `[E, observation_dim, N, Q, S]` at the end of a plan."""
         assert self.end_value is not None
         value: Tensor = self.end_value(rows.movedim(1, -1))
         return value
 
     def _returns_of_single_members(self, state: Tensor) -> Returns:
-        """Return what maps sequences to the returns that a single member expects, from states `[N, observation_dim]`.
+        """Return a function from sequences to the returns that a single member predicts, from states `[N, *]`.
 
-        Each member serves as many of the states.
+        Each member predicts for an equal number of the states.
         """
         num_members, num_states = self.model.num_members, len(state)
         num_places = -(-num_states // num_members)
