@@ -4,7 +4,8 @@ import textwrap
 
 import pytest
 import torch
-from conftest import choices, make_config
+import yaml
+from conftest import CONF, choices, make_config
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -12,6 +13,7 @@ from toy_bandits import CPU, SPECS, constant, due, play
 from toy_options import Stepper, Toll
 
 from hpamdp import keys
+from hpamdp.config import load_class
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.env.decisions import with_decisions
@@ -256,3 +258,11 @@ def test_exploring_choices_are_uniform_for_uniform_option_frames_and_greedy_ones
             assert (agent.selector(td.clone())["option"] == agent.selector.choose(td)["option"]).all()
         agent.learn(batch)
     assert not agent.selector.is_uniform
+
+
+@pytest.mark.parametrize("name", [name for name in choices("high") if name != "none"])
+def test_a_selector_needs_no_settings_and_refuses_unknown_ones(name):
+    cls = load_class(yaml.safe_load((CONF / "high" / f"{name}.yaml").read_text())["_target_"])
+    assert cls(SPECS).specs is SPECS
+    with pytest.raises((ValueError, TypeError), match="banana"):
+        cls(SPECS, banana=1)
