@@ -17,11 +17,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from toy_steps import SPECS, sample
 
 from hpamdp.config import ConfigError
-from hpamdp.policies.low_level.hyar import LATENT
+from hpamdp.env.catch_point.environment import CatchPointEnv
+from hpamdp.policies.low_level.dlpa.learner import DLPA
+from hpamdp.policies.low_level.hyar import LATENT, HyAR
 from hpamdp.policies.low_level.paddpg import SCORES
+from hpamdp.policies.low_level.pdqn import PDQN
+from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.shared.gradients import gradients_of
 from hpamdp.policies.shared.replay import ReplayLearner, ReplayOptions
 from hpamdp.run.assemble import assemble
+from hpamdp.specs import PAMDPSpecs
 
 # Neither draws random numbers in a loss: compiled code draws others.
 MAKE = {
@@ -59,6 +64,18 @@ def batch_for(name: str) -> dict[str, Tensor]:
         latent = torch.rand(64, MAKE[name]().critics.net.layers[0].weight.shape[1] - SPECS.observation_dim) * 2 - 1
         batch[LATENT] = torch.where(torch.arange(64).unsqueeze(-1) % 2 == 0, latent, torch.nan)
     return batch
+
+
+@pytest.mark.parametrize("cls", [PDQN, HyAR, DLPA, PETS])
+def test_a_learner_takes_its_options_as_a_whole_or_single_settings(cls):
+    changed = cls.Options(gamma=0.5)
+    assert cls(SPECS).options == cls.Options() != changed
+    assert cls(SPECS, options=changed).options == cls(SPECS, gamma=0.5).options == changed
+
+
+def test_augment_auto_maps_samples_only_where_the_problem_declares_symmetries():
+    assert PDQN(SPECS, augment="auto").symmetry is None
+    assert PDQN(PAMDPSpecs.from_env(CatchPointEnv(1)), augment="auto").symmetry is not None
 
 
 def test_a_step_is_that_of_plain_adam_however_the_gradient_lies_in_memory():

@@ -270,7 +270,7 @@ class LatentCritics(nn.Module):
         return self.net(rows.flatten(0, 1), num_members).reshape(-1, batch_size, num_latents)
 
 
-def best_of_tried(critics: LatentCritics, state: Tensor, tried: Tensor) -> tuple[Tensor, Tensor]:
+def best_of_proposals(critics: LatentCritics, state: Tensor, tried: Tensor) -> tuple[Tensor, Tensor]:
     """Return the best of T latent actions for each of P proposals, by the lowest of the critics' values, and its value.
 
     Args:
@@ -344,7 +344,7 @@ class HyARPolicy(TensorDictModuleBase):
         """Return the best of each proposal `[B, P, embedding_dim + latent_dim]` and its variations, and its value."""
 
         def best_of(some_states: Tensor, some_proposals: Tensor) -> tuple[Tensor, Tensor]:
-            return best_of_tried(self.critics, some_states, with_variations(some_proposals, self.variations))
+            return best_of_proposals(self.critics, some_states, with_variations(some_proposals, self.variations))
 
         num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * (1 + len(self.variations))))
         best, values = in_pieces(best_of, num_rows, state, proposals)
@@ -484,7 +484,7 @@ class HyAR(ReplayLearner):
                 e = self.codec.embeddings[discrete]
             z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device, dtype=torch.float32) - 1.0
             num_rows = max(1, _MAX_TRIED // (shape[1] * shape[2]))
-            found, best = in_pieces(partial(best_of_tried, self.critics), num_rows, state, torch.cat([e, z], -1))
+            found, best = in_pieces(partial(best_of_proposals, self.critics), num_rows, state, torch.cat([e, z], -1))
             gain = (best - self.critics(state, proposals).amin(0)).clamp(min=0.0)
             gain = gain * allowed if self.actor.proposes_each and allowed is not None else gain
         return gain, (raw - unsquashed(self.actor.given(found))).square().sum(-1)

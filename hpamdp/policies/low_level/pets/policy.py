@@ -40,7 +40,7 @@ class PETSPolicyOptions(SequenceSearchOptions, ParameterNoiseOptions, PETSModelO
     """Let exploring environments follow the plans of one member each until their episode ends; else of all members.
 
     So environments try what members disagree on. `auto` does if the problem declares a geometry that makes its discrete
-    actions alike; elsewhere a single member knows too little for its plans to lead anywhere.
+    actions alike. Elsewhere a single member knows too little for its plans to lead anywhere.
     """
     optimism: NonNegativeFloat = 1.0
     """Without posterior sampling: standard deviations of the members' returns that exploring plans add to the mean."""
