@@ -14,7 +14,7 @@ import torch
 
 from hpamdp.data.errors import DataError
 from hpamdp.data.human.matfile import MatArray, some
-from hpamdp.env.boatdock import harbour, physics
+from hpamdp.env.boatdock import harbour, physics, task
 
 SPEED_UNIT = 10.0  # px/s of the column `velocity`
 _DIRECTION_UNIT = 10.0
@@ -188,7 +188,7 @@ def _press_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
     duration = actions.sum(1)
     yield "a press does not have exactly one key", (actions != 0).sum(1) == 1
     yield "a press does not take between 0 and 2 s", (duration > 0) & (duration <= physics.MAX_DURATION)
-    speed = np.where(actions > 0, 10 * actions**2 - 2 / 3 * actions**3, 0.0)
+    speed = np.where(actions > 0, task.speed(actions) / SPEED_UNIT, 0.0)
     speed_error = np.abs(fields["velocity"] - speed).max(1)
     yield "a press's velocity does not follow from its time", speed_error < _EXACT
     elapsed = np.cumsum(duration)

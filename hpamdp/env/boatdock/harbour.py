@@ -12,7 +12,9 @@ from hpamdp.env import counter_rng
 from hpamdp.env.boatdock.task import (
     CENTRE,
     CONGRUENT,
+    CONTROLLER_DEGREES,
     CONTROLLERS,
+    FAILURE_REWARD,
     INCONGRUENT,
     INDEX_ANGLE,
     INDEX_CONTROLLER,
@@ -23,18 +25,15 @@ from hpamdp.env.boatdock.task import (
     NOT_CHOSEN,
     NUM_KEYS,
     SUCCESS,
+    SUCCESS_REWARD,
     TANK,
     Rules,
+    unit_directions,
 )
 
 _COS30 = math.sqrt(3.0) / 2.0
-_CONGRUENT_KEYS = ((-_COS30, 0.5), (0.0, -1.0), (_COS30, 0.5))
 # Directions by row and key. Rows: incongruent with key map 1, incongruent with key map 2, congruent.
-DIRECTIONS = (
-    ((_COS30, -0.5), (-_COS30, -0.5), (0.0, 1.0)),
-    ((0.0, 1.0), (_COS30, -0.5), (-_COS30, -0.5)),
-    _CONGRUENT_KEYS,
-)
+DIRECTIONS = tuple(unit_directions(CONTROLLER_DEGREES[name]) for name in ("incongruent1", "incongruent2", "congruent"))
 
 
 def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
@@ -45,7 +44,7 @@ def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, 
         keymap: 1 or 2, `[*B]`; only the incongruent controller depends on it.
         key: 0, 1 or 2, `[*B]`.
     """
-    # Arithmetic instead of a table, because a gather keeps the compiled step from being vectorised. The incongruent
+    # Arithmetic instead of the table, because a gather keeps the compiled step from being vectorised. The incongruent
     # boat's directions are the opposite of the congruent ones, in another order of keys.
     reordered = torch.where(keymap == 1, torch.where(key == 0, 0, 3 - key), torch.where(key == 2, 2, 1 - key))
     congruent = controller == CONGRUENT
@@ -143,7 +142,12 @@ def bearing_offset(layout: Layout) -> Tensor:
 
 def score(outcome: Tensor, fuel: Tensor) -> Tensor:
     """Return the score of finished episodes `[*B]`: 5 x the fuel left (fraction of a tank) on success, else -1."""
-    return torch.where(outcome == SUCCESS, 5.0 * fuel, -1.0)
+    return score_of(outcome == SUCCESS, fuel)
+
+
+def score_of(is_success: Tensor, fuel: Tensor) -> Tensor:
+    """Return the score `[*B]` of episodes that succeed or fail with this fraction of fuel left."""
+    return torch.where(is_success, SUCCESS_REWARD * fuel, FAILURE_REWARD)
 
 
 def fuel_fraction(seconds: Tensor) -> Tensor:

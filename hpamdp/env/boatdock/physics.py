@@ -32,6 +32,7 @@ from hpamdp.env.boatdock.task import (
     TANK,
     TIME_LIMIT,
     TOO_FAST,
+    speed,
 )
 
 
@@ -43,11 +44,6 @@ class Press(NamedTuple):
     fuel: Tensor
     speed: Tensor
     outcome: Tensor
-
-
-def speed(duration: Tensor) -> Tensor:
-    """Return the speed (px/s) after pressing for `duration` seconds from rest."""
-    return duration * duration * (100.0 - (20.0 / 3.0) * duration)
 
 
 def pressed_distance(duration: Tensor) -> Tensor:

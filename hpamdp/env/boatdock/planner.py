@@ -26,7 +26,16 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from hpamdp.env.boatdock.harbour import CONGRUENT, CONTROLLERS, INCONGRUENT, NUM_KEYS, Layout, direction, fuel_fraction
+from hpamdp.env.boatdock.harbour import (
+    CONGRUENT,
+    CONTROLLERS,
+    INCONGRUENT,
+    NUM_KEYS,
+    Layout,
+    direction,
+    fuel_fraction,
+    score_of,
+)
 from hpamdp.env.boatdock.physics import (
     DOCK_RADIUS,
     HARBOUR_RADIUS,
@@ -247,7 +256,7 @@ def best_plan(
         keys=torch.where(is_press, keys, 0).gather(1, order),
         durations=torch.where(is_press, durations, 0.0).gather(1, order),
         num_presses=is_press.sum(1),
-        score=torch.where(is_solved, 5.0 * fuel_fraction(fuel_left), -1.0),
+        score=score_of(is_solved, fuel_fraction(fuel_left)),
     )
 
 
@@ -378,7 +387,7 @@ def _plans_with_boats(
                 keys=torch.where(is_press, keys, 0),
                 durations=torch.where(is_press, durations, 0.0),
                 num_presses=is_press.sum(1),
-                score=torch.where(is_solved, 5.0 * fuel_fraction(left), -1.0),
+                score=score_of(is_solved, fuel_fraction(left)),
             )
         )
     return OptionPlans(*(torch.stack(fields, 1) for fields in zip(*plans, strict=True)))

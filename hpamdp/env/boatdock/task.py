@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -14,6 +15,12 @@ GLIDE = 0.95  # length and duration of the glide, as multiples of those of the p
 DOCKING_SPEED = 74.0  # px/s, the highest speed of arrival that docks
 TANK = 6.0  # seconds of pressing in a full tank
 MAX_DURATION = 2.0  # seconds
+
+
+def speed(duration: Any) -> Any:
+    """Return the speed (px/s) after pressing for `duration` seconds from rest: a number, an array or a tensor."""
+    return duration * duration * (100.0 - (20.0 / 3.0) * duration)
+
 
 SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(6)
 OUTCOMES = ("sailing", "success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit")
@@ -47,7 +54,7 @@ INDEX_KEYMAP = 3 * LAYOUT_TRIES + 2
 MAX_PRESSES = 25
 SUCCESS_REWARD, FAILURE_REWARD = 5.0, -1.0
 # The scaled observation divides by these, so that entries lie in about [-1, 1].
-SPEED_SCALE = MAX_DURATION**2 * (100.0 - 20.0 / 3.0 * MAX_DURATION)  # px/s, at the end of the longest press
+SPEED_SCALE = speed(MAX_DURATION)  # px/s
 
 RewardForm = Literal["paper", "sparse"]
 ObservationForm = Literal["scaled", "pixels"]
@@ -85,6 +92,12 @@ SLIP, SLIPPED_KEY = 0, 1
 MOTOR, SENSOR = 1, 2
 
 
+def unit_directions(degrees: Sequence[float]) -> tuple[tuple[float, float], ...]:
+    """Return unit directions (x, y), rounded so that a right angle has exact ones."""
+    angles = [math.radians(each) for each in degrees]
+    return tuple((round(math.cos(angle), 15) + 0.0, round(math.sin(angle), 15) + 0.0) for angle in angles)
+
+
 class Boats(NamedTuple):
     """Boats to choose from, in place of people's two: their names, and the degrees in which each key pushes."""
 
@@ -93,11 +106,8 @@ class Boats(NamedTuple):
 
     @property
     def directions(self) -> tuple[tuple[tuple[float, float], ...], ...]:
-        """The unit directions (x, y) of each boat's keys; rounded, so that a right angle has exact ones."""
-        return tuple(
-            tuple((round(math.cos(math.radians(d)), 12), round(math.sin(math.radians(d)), 12)) for d in keys)
-            for keys in self.degrees
-        )
+        """The unit directions (x, y) of each boat's keys."""
+        return tuple(unit_directions(each) for each in self.degrees)
 
 
 class Rules(NamedTuple):
