@@ -8,9 +8,9 @@ from typing import Any
 
 import yaml
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.yaml_files import check_size
 from hpamdp.files import read_regular
-from hpamdp.yaml_files import check_size
 
 # Files of a run that others read.
 CHECKPOINT_NAME = "checkpoint.zip"

@@ -43,6 +43,10 @@ Widths = Annotated[tuple[PositiveInt, ...], Strict(False)]
 Indices = Annotated[tuple[NonNegativeInt, ...], Strict(False)]
 
 
+class SettingError(ValueError):
+    """Raised by a constructor to refuse a setting; users see the message as one line, not as a traceback."""
+
+
 class Settings(BaseModel):
     """Settings of a class: frozen, flat, without unknown names, infinite numbers or silent conversions."""
 

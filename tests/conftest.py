@@ -19,10 +19,12 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hpamdp.cli import main
-from hpamdp.config import Config, read
+from hpamdp.config.compose import read
+from hpamdp.config.schema import Config
 from hpamdp.data.human import released_file
 from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour
+from hpamdp.run.assemble import choose_selector
 
 # Tests that are started in the background or under nohup inherit ignored signals, and so would what they start.
 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU):
@@ -58,7 +60,7 @@ def _composed(*overrides: str) -> DictConfig:
 
 def make_config(overrides: Sequence[str]) -> Config:
     """Return the checked config of a command line."""
-    return read(compose_config(overrides))
+    return choose_selector(read(compose_config(overrides)))
 
 
 def choices(group: str) -> list[str]:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from conftest import choices, compose_config, make_config
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.play import _agent, own_agents
 from hpamdp.run.players import load_player

@@ -10,7 +10,8 @@ from test_grid import SHORT, SMALL
 from toy_options import Crossing
 
 from hpamdp import keys
-from hpamdp.config import Config, ConfigError
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.env.rooms.environment import RoomsEnv

@@ -10,7 +10,7 @@ from conftest import compose_config
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.config import read
+from hpamdp.config.compose import read
 from hpamdp.env import counter_rng
 from hpamdp.env.boatdock import episode, harbour, physics, planner, rendering
 from hpamdp.env.boatdock.environment import BoatDockEnv

@@ -12,7 +12,7 @@ import torch
 from conftest import compose_config, make_config
 from test_grid import SHORT
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.state_checks import example_steps

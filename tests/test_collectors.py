@@ -19,7 +19,7 @@ import torch
 from conftest import CONF, OF_EACH_KIND, TRAINED, compose_config, make_config
 
 from hpamdp import keys
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.run import checkpoint

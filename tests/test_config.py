@@ -1,20 +1,23 @@
 """The config: what is accepted, and that whatever is wrong ends in one line that says so."""
 
-import re
 from typing import Annotated, Literal
 
 import pytest
 import torch
+import yaml
 from conftest import CONF, choices, compose_config, make_config
+from hpamdp.config.UNKNOWN_schema import schema
 from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
-from hpamdp import config as config_module
-from hpamdp.config import GROUPS, ConfigError, component, load_class, options_model, read
+from hpamdp.config.components import GROUPS, component, defaults_of, load_class, options_model
+from hpamdp.config.compose import plain, read
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import read_saved
 from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.low_level.random import Random
+from hpamdp.run import compatibility
 from hpamdp.run.train import run
-from hpamdp.saved_config import read_saved
 
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
 
@@ -51,13 +54,13 @@ SAMPLE = {"_target_": f"{__name__}.Sample", "size": 3, "rate": 0.5, "form": "pla
 def mistake_in(**options: object) -> str:
     node = {name: value for name, value in (SAMPLE | options).items() if value != "absent"}
     with pytest.raises(ConfigError) as raised:
-        component("low", "sample", OmegaConf.create(node)).build(specs=None)
+        component("low", "sample", plain(OmegaConf.create(node), "low")).build(specs=None)
     assert "\n" not in str(raised.value)
     return str(raised.value)
 
 
 def test_build_passes_the_options_and_what_of_the_context_is_asked_for():
-    node = OmegaConf.create(SAMPLE | {"budget": {"num_envs": 1}})
+    node = {**SAMPLE, "budget": {"num_envs": 1}}
     built = component("low", "sample", node).build(specs="specs", device="not asked for")
     assert built.specs == "specs"
     assert built.options["size"] == 3 and built.options["widths"] == [4, 4] and built.options["label"] == "a"
@@ -89,7 +92,7 @@ def test_an_integer_is_a_float_and_a_list_a_tuple():
         ("depth", "deep", 'low.depth="deep": must be a valid integer'),
         ("label", 1.5, "low.label=1.5: must be a valid string or must be a valid integer"),
         ("is_on", 1, "low.is_on=1: must be a valid boolean"),
-        ("specs", 1, "low.specs: no such option of Sample"),
+        ("specs", 1, "low.specs: no such setting of Sample"),
         ("widths", [13], "low: widths: 13 is unlucky (Sample, conf/low/sample.yaml)"),
         ("rate", "${nowhere}", "rate: Interpolation key 'nowhere' not found"),
         ("rate", "???", "rate: Missing mandatory value"),
@@ -106,10 +109,10 @@ def test_a_wrong_option_is_named_with_what_is_allowed(option, value, complaint):
 def test_an_unknown_option_gets_the_likely_one_first_and_then_all():
     line = mistake_in(siz=3)
     assert line.startswith(
-        "low.siz: no such option of Sample (conf/low/sample.yaml); did you mean size? It has bounds, depth, "
+        "low.siz: no such setting of Sample (conf/low/sample.yaml); did you mean size? It has bounds, depth, "
     )
     assert mistake_in(xyz=3).startswith(
-        "low.xyz: no such option of Sample (conf/low/sample.yaml); it has bounds, depth, "
+        "low.xyz: no such setting of Sample (conf/low/sample.yaml); it has bounds, depth, "
     )
 
 
@@ -134,12 +137,12 @@ def test_all_problems_come_in_one_line():
         ("data", "hpamdp.run.loggers.CSVLogger", "data=none: CSVLogger is no Demonstrations (hpamdp.data.demonstrat"),
         ("data", "hpamdp.data.demonstrations.Demonstrations", "data=none: Demonstrations is abstract; choose one of "),
         ("env", "hpamdp.env.base.PAMDPEnv", "env=boatdock: PAMDPEnv is abstract; choose one of its subclasses, which"),
+        ("env", "hpamdp.env.choice.OptionChoiceEnv", "OptionChoiceEnv: has an argument that no yaml file can hold: U"),
         (
-            "env",
-            "hpamdp.env.option_choice.OptionChoiceEnv",
-            "OptionChoiceEnv: has an argument that no yaml file can hold: U",
+            "high",
+            "torch.nn.Module",
+            "high=auto: Module is no Selector (hpamdp.policies.base); derive it from Selector ",
         ),
-        ("high", "torch.nn.Module", "high=ucb: Module is no Selector (hpamdp.policies.base); derive it from Selector "),
         ("low", "hpamdp.policies.shared.replay.ReplayLearner", "low=hyar: ReplayLearner is abstract; choose one of "),
     ],
 )
@@ -161,9 +164,7 @@ class NotToBeSet(Random):
 def test_an_argument_with_the_name_of_a_value_of_the_run_is_refused_in_one_line():
     cfg = compose_config(["low=random"])
     cfg.low._target_ = f"{__name__}.NotToBeSet"
-    with pytest.raises(
-        ConfigError, match=r"low=random: NotToBeSet has an argument freeze, but low.freeze is a value of"
-    ):
+    with pytest.raises(ConfigError, match=r"low=random: NotToBeSet has a setting freeze, but low.freeze is a value of"):
         read(cfg)
 
 
@@ -186,7 +187,7 @@ def test_a_missing_recipe_or_folder_is_refused_in_one_line(words, complaint):
 
 
 def test_a_recipe_of_another_problem_can_be_chosen():
-    assert make_config(["low=pdqn", "high=ucb", "recipe=goal_pdqn"]).low.options["reward_scale"] == 0.02
+    assert make_config(["low=pdqn", "high=ucb", "recipe=goal_pdqn"]).low.settings["reward_scale"] == 0.02
 
 
 def test_a_bug_in_a_constructor_is_no_mistake_of_the_users():
@@ -205,7 +206,7 @@ def test_a_module_that_lacks_what_it_imports_is_no_mistake_of_the_users(tmp_path
 def test_only_the_selector_and_the_data_can_be_none():
     for group in ("high", "data"):
         assert component(group, "none", {"_target_": None}).build(specs=None) is None
-    with pytest.raises(ConfigError, match=r"high\.option: no such option of none"):
+    with pytest.raises(ConfigError, match=r"high\.option: no such setting of none"):
         component("high", "none", {"_target_": None, "option": 1})
     with pytest.raises(ConfigError, match=r"low\._target_"):
         component("low", "none", {"_target_": None})
@@ -217,8 +218,8 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
     n = choices(group).index(name)
     cfg = compose_config([f"{each}={choices(each)[n % len(choices(each))]}" for each in GROUPS])
     chosen = getattr(read(cfg), group)
-    in_yaml = set(cfg[group]) - {"_target_", "budget", "checkpoint", "freeze"}
-    assert chosen.name == name and set(chosen.options) == in_yaml
+    in_yaml = set(cfg[group]) - {"_target_", "budget", "checkpoint", "freeze", "per_option", "grouping"}
+    assert chosen.name == name and set(chosen.settings) == in_yaml
     if chosen.cls is not None:
         assert in_yaml == options_model(chosen.cls, GROUPS[group]).model_fields.keys()
     assert ("budget" in cfg[group]) == (group == "low")
@@ -269,7 +270,7 @@ def test_a_saved_config_has_names_instead_of_modules_and_is_read_back_the_same(w
 )
 def test_a_number_of_steps_goes_with_options_that_end_after_steps_alone(words, complaint):
     with pytest.raises(ConfigError) as error:
-        make_config(words)
+        compatibility.check(make_config(words))
     assert str(error.value) == complaint
 
 
@@ -282,8 +283,8 @@ def test_a_name_of_a_saved_config_that_is_nowhere_is_told_in_one_line():
 
 def test_one_run_checks_its_config_once(tmp_path, monkeypatch):
     checked = []
-    known = config_module.component
-    monkeypatch.setattr(config_module, "component", lambda *given: checked.append(given[0]) or known(*given))
+    known = schema.component
+    monkeypatch.setattr(schema, "component", lambda *given: checked.append(given[0]) or known(*given))
     words = ["low=random", "num_envs=4", "eval.layouts=4", "total_frames=64", "eval.every=0"]
     assert run(compose_config(words), tmp_path, words) == 0
     assert sorted(checked) == sorted(GROUPS)
@@ -298,33 +299,28 @@ def test_an_experiment_sets_groups_and_values(tmp_path, monkeypatch):
     assert compose_config([f"hydra.searchpath=[{tmp_path}]", "experiment=study", "seed=8"]).seed == 8
 
 
-def values_without_comment(text: str) -> list[str]:
-    """Return the keys of a yaml whose value no comment explains: above it, or above the values just before it."""
-    missing = []
-    is_explained = False
-    for line in text.splitlines():
-        key = re.match(r"\s*(\w+):", line)
-        if not line.strip():
-            is_explained = False
-        elif line.lstrip().startswith("#"):
-            is_explained = True
-        elif key and not is_explained and not line.rstrip().endswith(":"):
-            missing.append(key.group(1))
-    return missing
-
-
-def test_a_value_without_a_comment_is_found():
-    assert values_without_comment("# What it is.\n_target_: a.B\n\nlr: 1\n") == ["lr"]
-    assert values_without_comment("# Rates.\nlr: 1\ntau: 2\n\n# More.\nother: 3\n") == []
-
-
 @pytest.mark.parametrize("file", sorted(CONF.rglob("*.yaml")), ids=lambda file: file.relative_to(CONF).as_posix())
-def test_every_value_of_a_yaml_is_explained_by_a_comment(file):
-    text = file.read_text()
-    assert text.startswith("#"), f"{file} does not say what it is"
-    # The values of these are explained where they are defined.
-    if file.relative_to(CONF).parts[0] not in ("experiment", "recipe"):
-        assert not values_without_comment(text.partition("\nhydra:")[0].partition("\ndefaults:")[2] or text)
+def test_every_yaml_says_what_it_is(file):
+    assert file.read_text().startswith("#")
+
+
+@pytest.mark.parametrize(("group", "name"), FILES)
+def test_a_yaml_holds_only_what_differs_from_its_class(group, name):
+    given = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())
+    given.pop("budget", None)
+    target = given.pop("_target_")
+    if target is not None:
+        defaults = defaults_of(options_model(load_class(target), GROUPS[group]))
+        assert given.keys() <= defaults.keys()
+        assert not [setting for setting, value in given.items() if value == defaults[setting]]
+
+
+@pytest.mark.parametrize(("group", "name"), FILES)
+def test_every_setting_has_its_meaning_in_the_model(group, name):
+    target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())["_target_"]
+    if target is not None:
+        fields = options_model(load_class(target), GROUPS[group]).model_fields
+        assert not [setting for setting, field in fields.items() if not field.description]
 
 
 def test_every_group_has_a_folder():
@@ -333,17 +329,17 @@ def test_every_group_has_a_folder():
 
 def test_a_learner_gets_what_it_needs_on_a_problem_and_the_command_line_has_the_last_word():
     config = make_config(["env=platform", "high=none", "low=dlpa"])
-    assert (config.low.options["horizon"], config.run.total_frames) == (6, 10000)
+    assert (config.low.settings["horizon"], config.run.total_frames) == (6, 10000)
     config = make_config(["env=platform", "high=none", "low=dlpa", "low.horizon=3", "total_frames=64"])
-    assert (config.low.options["horizon"], config.run.total_frames) == (3, 64)
-    assert make_config(["low=dlpa"]).low.options["horizon"] != 6
+    assert (config.low.settings["horizon"], config.run.total_frames) == (3, 64)
+    assert make_config(["low=dlpa"]).low.settings["horizon"] != 6
 
 
 def test_a_selector_gets_what_it_needs_on_a_problem():
-    assert make_config(["high=ucb"]).high.options["exploration"] == 4.0
-    assert make_config(["high=ucb", "high.exploration=1.0"]).high.options["exploration"] == 1.0
-    assert make_config(["env=rooms", "high=ucb"]).high.options["exploration"] == UCB.Options().exploration
-    assert make_config(["env=rooms", "high=fixed", "recipe/high=boatdock_fixed"]).high.options["option"] == "congruent"
+    assert make_config(["high=ucb"]).high.settings["exploration"] == 4.0
+    assert make_config(["high=ucb", "high.exploration=1.0"]).high.settings["exploration"] == 1.0
+    assert make_config(["env=rooms", "high=ucb"]).high.settings["exploration"] == UCB.Options().exploration
+    assert make_config(["env=rooms", "high=fixed", "recipe/high=boatdock_fixed"]).high.settings["option"] == "congruent"
 
 
 @pytest.mark.parametrize(("group", "folder"), [("low", "recipe"), ("high", "recipe/high")])

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from tensordict import TensorDict
 
 from hpamdp import keys
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.data import export, memmap, minari
 from hpamdp.data.demonstrations import TRAJECTORY, Demonstrations, with_option_sums
 from hpamdp.data.errors import DataError

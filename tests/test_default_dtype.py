@@ -112,7 +112,7 @@ def test_a_learner_learns_the_same_with_float64_as_the_default_dtype(name):
 
 
 def test_a_run_works_with_float64_as_the_default_dtype(tmp_path):
-    words = ["env=platform", "+env.options=default", "high=ucb", "low=hppo"]
+    words = ["env=platform", "+env.grouping=default", "high=ucb", "low=hppo"]
     words += ["low.minibatch_size=16", "num_envs=4", "steps_per_batch=8", "total_frames=64"]
     with default_dtype(torch.float64):
         assert run(compose_config([*words, "eval.layouts=4", "eval.every=0"]), tmp_path) == 0

@@ -6,7 +6,7 @@ import shutil
 import pytest
 from conftest import compose_config
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.files import remove_link, replacing
 from hpamdp.metrics_file import MetricsFile
 from hpamdp.run import play

@@ -7,7 +7,7 @@ import torch
 from conftest import compose_config, make_config
 from test_grid import SHORT
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.policies.base import have_stepped
 from hpamdp.run.assemble import assemble
 from hpamdp.run.train import run

@@ -14,7 +14,7 @@ import wandb
 from conftest import compose_config
 from test_metrics import without_login  # noqa: F401  (a fixture)
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.folder import locked, moved_aside

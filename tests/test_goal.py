@@ -20,7 +20,7 @@ from torchrl.envs.utils import check_env_specs
 
 import hpamdp
 from hpamdp import keys
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env import counter_rng
 from hpamdp.env.goal import rules
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv

@@ -9,7 +9,7 @@ import torch
 from conftest import CONF, OF_EACH_KIND, TRAINED, choices, compose_config, make_config
 from tensordict import TensorDict
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.run import checkpoint

@@ -14,7 +14,8 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 from toy_environments import ALL, FORMS, Toy, native_action
 
-from hpamdp.config import ConfigError, component
+from hpamdp.config.components import component
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.gymnasium.environment import GymnasiumEnv

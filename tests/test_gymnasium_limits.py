@@ -12,7 +12,7 @@ from conftest import compose_config
 from gymnasium_players import step
 from toy_environments import OldToy, Toy
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.run.train import run

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from gymnasium_players import make, step
 from torchrl.envs.utils import check_env_specs
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace

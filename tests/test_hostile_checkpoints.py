@@ -16,7 +16,7 @@ from conftest import TRAINED, compose_config, forked, make_config
 from test_grid import SHORT
 from torchrl.data import ReplayBuffer
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.single import SingleCollection

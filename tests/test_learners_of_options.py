@@ -8,12 +8,12 @@ from test_assemble import QUICK_CRITIC, make, train
 from test_grid import SHORT, SMALL
 
 from hpamdp import keys
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import read_saved
 from hpamdp.policies.low_level.hppo import HPPO
 from hpamdp.policies.low_level.paddpg import PADDPG
-from hpamdp.saved_config import read_saved
 
-WORDS = [*SMALL, "env=platform", "+env.options=default", *QUICK_CRITIC, "low=hppo", *SHORT["hppo"]]
+WORDS = [*SMALL, "env=platform", "+env.grouping=default", *QUICK_CRITIC, "low=hppo", *SHORT["hppo"]]
 PER_OPTION = "+low.per_option={jump: {name: paddpg, hidden_dims: [16], warmup_steps: 10, batch_size: 16}}"
 
 
@@ -36,7 +36,7 @@ def test_the_other_options_keep_the_learner_of_the_run():
 
 
 def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_of_the_run():
-    words = ["env=goal", "high=ucb", "low=pdqn", "+env.options=default", "total_frames=1234"]
+    words = ["env=goal", "high=ucb", "low=pdqn", "+env.grouping=default", "total_frames=1234"]
     own = "+low.per_option={shoot: {name: hppo, clip: 0.3}, kick: qpamdp, dribble: pdqn}"
     config = make_config([*words, own])
     recipe = make_config(["env=goal", "high=none", "low=qpamdp"]).low.options
@@ -56,7 +56,7 @@ def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_
             ["+low.per_option={jump: {lr: 3}}"],
             'low.per_option.jump={"lr": 3}: must be the name of a learner, or its name',
         ),
-        (["+low.per_option={jump: {name: random, lr: 3}}"], "low.lr: no such option of Random (conf/low/random.yaml)"),
+        (["+low.per_option={jump: {name: random, lr: 3}}"], "low.lr: no such setting of Random (conf/low/random.yaml)"),
         (
             ["+low.per_option={jump: ../low/random}"],
             'low.per_option.jump="../low/random": must be the name of a learner',

@@ -8,7 +8,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from toy_bandits import SPECS, against_sign, by_sign, constant, due, ended, play
 
 from hpamdp import keys
-from hpamdp.config import ConfigError, component
+from hpamdp.config.components import component
+from hpamdp.config.errors import ConfigError
 from hpamdp.policies.high_level.lin_thompson import LinThompson
 from hpamdp.policies.high_level.linucb import LinUCB
 from hpamdp.policies.shared.linear_bandit import ContextFeatures, LinearBandit, LinearBanditOptions

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.data.human.demonstrations import HumanDemonstrations
 from hpamdp.data.human.released_file import read
 from hpamdp.data.human.rest_to_rest import TAP, to_rest_to_rest

@@ -1,4 +1,4 @@
-"""Options that are sets of a problem's discrete actions: `env.options`."""
+"""Options that are sets of a problem's discrete actions: `env.grouping`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from test_assemble import QUICK_CRITIC, make, train
 from test_grid import SHORT, SMALL
 
 from hpamdp import keys
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import read_saved
 from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import make_env
-from hpamdp.saved_config import read_saved
 from hpamdp.specs import PAMDPSpecs
 
 CPU = torch.device("cpu")
@@ -34,7 +34,7 @@ def options_of(*words: str) -> dict[str, list[int]]:
     "actions", ["{carry: [0], shoot: [1, 2]}", "{carry: [kick_to], shoot: [shoot_left, 2]}", "default"]
 )
 def test_options_name_the_actions_of_a_problem_by_number_or_name(actions):
-    assert options_of("env=goal", "high=uniform", f"+env.options={actions}") == {"carry": [0], "shoot": [1, 2]}
+    assert options_of("env=goal", "high=uniform", f"+env.grouping={actions}") == {"carry": [0], "shoot": [1, 2]}
 
 
 def test_problems_suggest_options():
@@ -52,22 +52,22 @@ def test_problems_suggest_options():
     ("words", "complaint"),
     [
         (
-            ["env=goal", "+env.options={carry: [kick]}"],
-            "env.options: GoalEnv has no discrete action kick; it has 0 to 2 or kick_to, shoot_left, shoot_right (env=",
+            ["env=goal", "+env.grouping={carry: [kick]}"],
+            "env.grouping: GoalEnv has no discrete action kick; it has 0 to 2 or kick_to, shoot_left, shoot_right (",
         ),
         (
-            ["env=platform", "+env.options={run: [3]}"],
-            "env.options: PlatformEnv has no discrete action 3; it has 0 to 2 or",
+            ["env=platform", "+env.grouping={run: [3]}"],
+            "env.grouping: PlatformEnv has no discrete action 3; it has 0 to 2 or",
         ),
-        (["env=platform", "+env.options={run: []}"], "env.options: option run allows no action; name at least one"),
-        (["env=platform", "+env.options={}"], "env.options: name at least one option"),
-        (["env=rooms", "+env.options={up: [0]}"], "env.options: RoomsEnv has options of its own: skates, boots"),
-        (["env=catch_point", "+env.options=default"], "env.options=default: env=catch_point suggests none; name the"),
+        (["env=platform", "+env.grouping={run: []}"], "env.grouping: option run allows no action; name at least one"),
+        (["env=platform", "+env.grouping={}"], "env.grouping: name at least one option"),
+        (["env=rooms", "+env.grouping={up: [0]}"], "env.grouping: RoomsEnv has options of its own: skates, boots"),
+        (["env=catch_point", "+env.grouping=default"], "env.grouping=default: env=catch_point suggests none; name the"),
         (
-            ["env=hard_move", "low=planner", "+env.options=default"],
-            "env.options: low=planner knows nothing of them; use",
+            ["env=hard_move", "low=planner", "+env.grouping=default"],
+            "env.grouping: low=planner knows nothing of them; use",
         ),
-        (["env=platform", "+env.options=3"], "env.options=3: must"),
+        (["env=platform", "+env.grouping=3"], "env.grouping=3: must"),
     ],
 )
 def test_options_that_cannot_be_are_told_in_one_line(words, complaint):
@@ -90,14 +90,14 @@ def test_an_action_that_the_option_does_not_allow_is_refused():
 
 
 def test_options_of_actions_are_saved_with_the_config():
-    config = make_config(["env=platform", "high=uniform", "low=random", "+env.options={a: [0], b: [leap]}"])
-    assert config.run.env.options == {"a": [0], "b": ["leap"]}
+    config = make_config(["env=platform", "high=uniform", "low=random", "+env.grouping={a: [0], b: [leap]}"])
+    assert config.run.env.grouping == {"a": [0], "b": ["leap"]}
     assert read_saved(config.to_dict()) == config
 
 
 @pytest.mark.parametrize("sharing", ["per_option", "shared"])
 def test_a_problem_without_a_choice_trains_with_options_that_end_inside_episodes(sharing, tmp_path):
-    words = [*SMALL, "env=platform", "+env.options=default", *QUICK_CRITIC, "low=pdqn", *SHORT["pdqn"]]
+    words = [*SMALL, "env=platform", "+env.grouping=default", *QUICK_CRITIC, "low=pdqn", *SHORT["pdqn"]]
     ends = ["agent.termination=steps", "agent.option_length=2", f"agent.sharing={sharing}"]
     parts = train(make_config([*words, *ends]), tmp_path / "run")
     batch = parts.env.rollout(30, parts.policy, break_when_any_done=False)
@@ -109,12 +109,12 @@ def test_a_problem_without_a_choice_trains_with_options_that_end_inside_episodes
 
 
 def test_a_selector_learns_over_frozen_learners_of_options_of_actions(tmp_path):
-    words = [*SMALL, "env=platform", "+env.options=default", "high=ucb", "low=random", "low.freeze=true"]
+    words = [*SMALL, "env=platform", "+env.grouping=default", "high=ucb", "low=random", "low.freeze=true"]
     parts = train(make_config([*words, "total_frames=32"]), tmp_path / "run")
     assert parts.agent.selector.statistics.counts.sum() > 0
 
 
 def test_the_random_agent_takes_the_actions_of_its_options(tmp_path):
-    parts = make(make_config([*SMALL, "env=platform", "+env.options=default", "high=ucb", "low=random"]), tmp_path)
+    parts = make(make_config([*SMALL, "env=platform", "+env.grouping=default", "high=ucb", "low=random"]), tmp_path)
     batch = parts.env.rollout(20, random_agent(parts.agent.specs, CPU).policy, break_when_any_done=False)
     assert (batch[keys.DISCRETE][batch[keys.OPTION] == 0] == 0).all() and (batch[keys.DISCRETE] > 0).any()

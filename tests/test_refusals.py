@@ -10,9 +10,11 @@ from conftest import compose_config
 from omegaconf import DictConfig, OmegaConf
 
 from hpamdp import memory
-from hpamdp.config import GROUPS, ConfigError, read
-from hpamdp.run import assemble as assemble_module
-from hpamdp.run.assemble import assemble
+from hpamdp.config.components import GROUPS
+from hpamdp.config.compose import read
+from hpamdp.config.errors import ConfigError
+from hpamdp.run import capacity
+from hpamdp.run.assemble import assemble, choose_selector
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.resume import check_saved_options
 from hpamdp.run.train import run
@@ -50,11 +52,11 @@ REFUSED = [
     ("high=epsilon_greedy high.epsilon_scale=1e300", "high.epsilon_scale=1e+300: must lie between "),
     ("total_frames=100000000000000000000", "total_frames=100000000000000000000: must lie between "),
     (PLATFORM + "env.max_steps=1000000000000000000000", "env.max_steps=1000000000000000000000: must lie between "),
-    (PLATFORM + "env.noise=1e9", "env.noise=1000000000.0: must be less than or equal to 100 (PlatformEnv"),
-    ("env=goal high=none low=random env.noise=11", "env.noise=11: must be less than or equal to 5 (GoalEnv"),
-    ("env.motor_noise=1e9", "motor_noise=1000000000.0: must lie between 0 and 10"),
-    ("env.motor_noise=[0,11]", "motor_noise=11.0: must lie between 0 and 10"),
-    ("env.sensor_noise=1e9", "env.sensor_noise=1000000000.0: must be less than or equal to 1000"),
+    (PLATFORM + "env.noise=1e9", "env: PlatformEnv: noise=1000000000.0, but must lie between 0 and 100"),
+    ("env=goal high=none low=random env.noise=11", "env: GoalEnv: noise=11.0, but must lie between 0 and 5"),
+    ("env.motor_noise=1e9", "env: BoatDockEnv: motor_noise=1000000000.0, but must lie between 0 and 10"),
+    ("env.motor_noise=[0,11]", "env: BoatDockEnv: motor_noise=11.0, but must lie between 0 and 10"),
+    ("env.sensor_noise=1e9", "env: BoatDockEnv: sensor_noise=1000000000.0, but must lie between 0 and 1000"),
     # Values that contradict one another.
     ("high=value low=dlpa", "high=value: low=dlpa has no value to compare without low.end_values=true"),
     ("high=value low=random", "high=value: low=random has no value to compare; use another low or another high"),
@@ -63,7 +65,7 @@ REFUSED = [
     ("low=pdqn low.n_step=5", "low.n_step=5: must be at most steps_per_batch=4, as sums of rewards end with a batch"),
     ("low=qpamdp low.sigma_final=5", "low: sigma_final=5.0: must be at most sigma=0.1"),
     ("low=dlpa low.horizon=10000000", "low: horizon=10000000, num_iterations=5, num_samples=256: a plan would try"),
-    ("low=hppo low.epochs=100000", "low: epochs=100000: must be at most 1000"),
+    ("low=hppo low.epochs=100000", "low.epochs=100000: must be less than or equal to 1000"),
     ("low.updates_per_step=1e9", "low: updates_per_step=1000000000.0: must be at most 1000"),
     ("low=qpamdp low.features=[]", "low: features=[]: name some of the observation's entries 0 to 15; null: all"),
     ("low=qpamdp low.features=[0,16]", "low: features=[0, 16]: name some of the observation's entries 0 to 15"),
@@ -87,28 +89,28 @@ REFUSED = [
     ("low._target_=hpamdp.policies.low_level.random.Random", " more like this"),
     ("low._target_=collections.OrderedDict", "low=hyar: OrderedDict is no Learner (hpamdp.policies.base)"),
     ("agent=null", "agent=null: must be a mapping (conf/config.yaml)"),
-    ("env.motor_noise=[1]", "motor_noise=[1.0]: must be one number or two (BoatDockEnv"),
+    ("env.motor_noise=[1]", "env: BoatDockEnv: motor_noise=[1.0], but must be one number or two (BoatDockEnv"),
     # Boats.
     (
         "env.boats=[congruent,sideways]",
-        "boats=['congruent', 'sideways']: no controller sideways; controllers has "
+        "env: BoatDockEnv: boats=['congruent', 'sideways'], but there is no controller sideways; controllers has "
         "congruent, incongruent1, incongruent2 (BoatDockEnv, conf/env/boatdock.yaml)",
     ),
-    ("env.boats=[congruent,congruent]", "must be different controllers"),
+    ("env.boats=[congruent,congruent]", "but must be one or more different controllers"),
     ("env.boats=[congruent]", "boats=['congruent']: nothing to choose; name more, or use controller=congruent"),
     ("env.boats=congruent", 'env.boats="congruent": must be a list (BoatDockEnv'),
-    ("env.controllers.sideways=[0,180]", "controllers.sideways=[0.0, 180.0]: must be 3 directions in degrees"),
+    ("env.controllers.sideways=[0,180]", "controllers.sideways=[0.0, 180.0], but must be 3 directions in degrees"),
     ("env.controllers.sideways=[0,180,.inf]", "env.controllers.sideways.2=Infinity: must be a finite number"),
-    ("env.controllers.congruent=[0,120,240]", "congruent is [150.0, 270.0, 30.0]; take another name"),
-    ("env.controllers.random=[0,120,240]", "random cannot name a controller; take another name"),
+    ("env.controllers.congruent=[0,120,240]", "but congruent has [150.0, 270.0, 30.0]; take another name"),
+    ("env.controllers.random=[0,120,240]", "but random is no name for a controller; take another one"),
     ("env.boats=[congruent,incongruent1] env.keymap=2", "keymap=2: the controllers in boats="),
     (
         "env.boats=[congruent,incongruent1] env.controller=incongruent high=none",
-        "controller=incongruent: must be one of choose, congruent, incongruent1, random",
+        "controller='incongruent', but must be one of choose, congruent, incongruent1, random",
     ),
-    ("env.boats=[congruent,incongruent1] env.motor_noise=[0,0,1]", "motor_noise=[0.0, 0.0, 1.0]: must be one "),
+    ("env.boats=[congruent,incongruent1] env.motor_noise=[0,0,1]", "motor_noise=[0.0, 0.0, 1.0], but must be one "),
     ("env.boats=[congruent,incongruent1] high=human", "boats, so what they chose says nothing here; leave it out"),
-    ("env.switch_cost=7", "switch_cost=7: must be less than or equal to 6"),
+    ("env.switch_cost=7", "switch_cost=7.0, but must lie between 0 and 6 seconds of fuel"),
     ("env.switch_cost=0.2 env.controller=random high=none", "switch_cost=0.2: controller=random never changes boats"),
     ("env.switch_cost=0.2 high=oracle low=planner", "low=planner: its plans on env=boatdock change options, but"),
     ("env.switch_cost=0.2 high=human", "switch_cost=0.2: people kept one of their two boats, so what they chose "),
@@ -154,7 +156,7 @@ def config_of(words: str) -> DictConfig:
 @pytest.mark.parametrize(("words", "line"), REFUSED, ids=[words for words, _ in REFUSED])
 def test_what_no_run_can_have_is_refused_in_one_line(words, line, tmp_path):
     with pytest.raises(ConfigError) as raised:
-        assemble(read(config_of(words)), tmp_path)
+        assemble(choose_selector(read(config_of(words))), tmp_path)
     assert line in str(raised.value) and "\n" not in str(raised.value)
 
 
@@ -169,7 +171,7 @@ def test_a_project_name_that_wandb_refuses_is_reported_in_one_line(tmp_path):
 def test_the_estimate_of_memory_counts_all_parts_together(monkeypatch, tmp_path):
     config = read(config_of("low.buffer_size=1000000 low.warmup_steps=32"))
     assemble(config, tmp_path)
-    monkeypatch.setattr(assemble_module, "total_memory", lambda device: 100_000_000)
+    monkeypatch.setattr(capacity, "total_memory", lambda device: 100_000_000)
     line = r"^low.buffer_size=1000000: the run takes at least 0\.3 GB of memory, and there are 0\.1 GB$"
     with pytest.raises(ConfigError, match=line):
         assemble(config, tmp_path)
@@ -209,8 +211,11 @@ def saved(tmp_path_factory):
     [
         ("low.clip=-1", "low.clip=-1: resume takes the agent from "),
         ("low=hyar", "low=hyar: resume takes the agent from "),
-        ("env.nose=1", "env.nose: no such option of PlatformEnv (conf/env/platform.yaml); did you mean noise? It has "),
-        ("env.noise=-1", "env.noise=-1: must be greater than or equal to 0 (PlatformEnv"),
+        (
+            "env.nose=1",
+            "env.nose: no such setting of PlatformEnv (conf/env/platform.yaml); did you mean noise? It has ",
+        ),
+        ("env.noise=-1", "env: PlatformEnv: noise=-1.0, but must lie between 0 and 100"),
         ("data=human", "data=human: low=hppo learns from its own steps only"),
         ("total_frames=16", "total_frames=16: the run that is continued has 32 already; set more, or leave it out"),
     ],

@@ -20,7 +20,7 @@ from conftest import CONF, compose_config, forked
 from test_grid import SHORT
 
 from hpamdp import cli, keys
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.messages import LenientStream, warn
 from hpamdp.policies.low_level.pdqn import PDQN

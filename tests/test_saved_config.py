@@ -1,4 +1,4 @@
-"""A saved config is read back as it was, and nothing in it runs: `hpamdp.saved_config`, and every way in."""
+"""A saved config is read back as it was, and nothing in it runs: `hpamdp.config.saved`, and every way in."""
 
 import importlib.util
 import json
@@ -14,13 +14,15 @@ import yaml
 from conftest import OWN, choices, compose_config, make_config
 from test_grid import SHORT, SHORT_SELECTORS, SMALL
 
-from hpamdp.config import GROUPS, Config, ConfigError
+from hpamdp.config.components import GROUPS
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import needs_trust, read_saved
+from hpamdp.config.schema import Config
 from hpamdp.messages import one_line
 from hpamdp.run.checkpoint import progress_of
 from hpamdp.run.play import _permissions
 from hpamdp.run.resume import check_saved_options
 from hpamdp.run.train import run
-from hpamdp.saved_config import needs_trust, read_saved
 
 TINY = ["num_envs=2", "steps_per_batch=2", "total_frames=8", "eval.layouts=2", "eval.every=0", "film=false"]
 TOY = ["env=gymnasium", "env.entry_point=toy_environments:Toy", "env.kwargs={length:4}", "env.max_steps=6"]
@@ -252,8 +254,8 @@ def test_files_and_servers_that_a_file_names_are_not_reached_unasked():
         values[group][name] = value
         with pytest.raises(ConfigError, match=rf"^{group}\.{name}=\"{value}\": set by .*trust=true"):
             read_saved(values)
-        assert getattr(read_saved(values, trust=True), group).options[name] == value
-        assert getattr(read_saved(values, {f"{group}.{name}": value}), group).options[name] == value
+        assert getattr(read_saved(values, trust=True), group).settings[name] == value
+        assert getattr(read_saved(values, {f"{group}.{name}": value}), group).settings[name] == value
 
 
 def test_text_of_a_saved_config_stays_text(of_toy, monkeypatch, tmp_path, command):
@@ -267,7 +269,7 @@ def test_text_of_a_saved_config_stays_text(of_toy, monkeypatch, tmp_path, comman
         values["logger"]["name"] = text
         values["env"]["options"] = {text: [text]}
         config = read_saved(values)
-        assert config.logger.options["name"] == text and config.run.env.options == {text: [text]}
+        assert config.logger.settings["name"] == text and config.run.env.grouping == {text: [text]}
         assert read_saved(saved(config)) == config
 
 

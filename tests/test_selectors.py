@@ -13,7 +13,7 @@ from toy_bandits import CPU, SPECS, constant, due, play
 from toy_options import Stepper, Toll
 
 from hpamdp import keys
-from hpamdp.config import load_class
+from hpamdp.config.components import load_class
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 from hpamdp.env.decisions import with_decisions
@@ -242,9 +242,9 @@ def test_the_random_agent_has_no_selector_where_there_are_no_options():
 @pytest.mark.parametrize(
     "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
 )
-def test_exploring_choices_are_uniform_for_uniform_option_frames_and_greedy_ones_never(high, tmp_path):
+def test_exploring_choices_are_uniform_for_uniform_option_steps_and_greedy_ones_never(high, tmp_path):
     low = "hppo" if high == "value" else "random"
-    words = [f"high={high}", f"low={low}", "num_envs=400", "eval.layouts=4", "agent.uniform_option_frames=800"]
+    words = [f"high={high}", f"low={low}", "num_envs=400", "eval.layouts=4", "agent.uniform_option_steps=800"]
     words += ["high.warmup_decisions=0"] if high == "meta_critic" else []
     parts = assemble(make_config(words), tmp_path)
     torch.manual_seed(0)

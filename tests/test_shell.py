@@ -17,12 +17,12 @@ from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
 
 from hpamdp import cli
+from hpamdp.config.yaml_files import CheckedYamlFiles, check_before_hydra_reads
 from hpamdp.files import replacing
 from hpamdp.messages import say
 from hpamdp.run import train
 from hpamdp.search_path import put_working_directory_last
 from hpamdp.shell import _for_hydra, path_setting, setting
-from hpamdp.yaml_files import CheckedYamlFiles, check_before_hydra_reads
 
 FOLDERS = [
     "sweep",
@@ -241,7 +241,7 @@ def test_no_file_of_the_working_directory_takes_the_place_of_a_package(hostile, 
     done = subprocess.run(
         [sys.executable, *start, "low.nothing=1"], cwd=hostile, env=environment, capture_output=True, text=True
     )
-    assert done.stderr.startswith("low.nothing: no such option of ") and done.returncode == 2, done.stderr
+    assert done.stderr.startswith("low.nothing: no such setting of ") and done.returncode == 2, done.stderr
 
 
 @pytest.mark.slow

@@ -16,7 +16,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from hpamdp import cli
-from hpamdp.config import ConfigError, component, read
+from hpamdp.config.components import component
+from hpamdp.config.compose import read
+from hpamdp.config.errors import ConfigError
 from hpamdp.messages import warn
 from hpamdp.run import train
 

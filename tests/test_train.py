@@ -12,7 +12,7 @@ import torch
 from conftest import compose_config, make_config
 from PIL import Image
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.boatdock.reference import human_normalised

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from toy_steps import SPECS, sample
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.catch_point.environment import CatchPointEnv
 from hpamdp.policies.low_level.dlpa.learner import DLPA
 from hpamdp.policies.low_level.hyar import LATENT, HyAR
@@ -218,7 +218,7 @@ SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4"]
             "compile_updates=true: low=qpamdp: its updates cannot be compiled",
         ),
         (
-            ["env=platform", "+env.options=default", "high=meta_critic", "low=pdqn", "agent.termination=steps",
+            ["env=platform", "+env.grouping=default", "high=meta_critic", "low=pdqn", "agent.termination=steps",
              "agent.option_length=3", "compile_updates=true"],
             "compile_updates=true: goes with agent.termination=episode only, not with steps",
         ),

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from hpamdp import keys
 from hpamdp.analysis.study import Rows, groups, read_csv, write_tables
-from hpamdp.config import conf_dir, read
+from hpamdp.config.compose import conf_dir, read
 from hpamdp.run.assemble import acting, assemble, make_env
 
 HERE = Path(__file__).resolve().parent

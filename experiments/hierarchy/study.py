@@ -61,7 +61,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
             "high": run.summary["high"],
             "low": run.summary["low"],
             "total": run.config["total_frames"],
-            "uniform_option_frames": run.config["agent"].get("uniform_option_frames", 0),
+            "uniform_option_steps": run.config["agent"].get("uniform_option_steps", 0),
             "seed": run.summary["seed"],
         }
         figures = {column: round(run.summary[key], 4) for column, key in COLUMNS.items()}
@@ -98,7 +98,7 @@ def table(results: Rows) -> str:
         "| oracle's | weighted | regret | gain | success | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    cases = sorted(groups(results, "low", "total", "uniform_option_frames", "high").items(), key=_order)
+    cases = sorted(groups(results, "low", "total", "uniform_option_steps", "high").items(), key=_order)
     for place, ((low, total, uniform, high), runs) in enumerate(cases, start=1):
         above = ""
         if place < len(cases) and cases[place][0][:3] == (low, total, uniform):
@@ -126,7 +126,7 @@ def of_the_map(rows: Rows) -> Rows:
     for (low,), of_learner in groups(rows, "low").items():
         lengths = Counter(row["total"] for row in of_learner)
         commonest[low], _ = lengths.most_common(1)[0]
-    return [row for row in rows if row["total"] == commonest[row["low"]] and row["uniform_option_frames"] == 0]
+    return [row for row in rows if row["total"] == commonest[row["low"]] and row["uniform_option_steps"] == 0]
 
 
 def draw_map(results: Rows, path: Path) -> None:

@@ -15,7 +15,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from torchrl.collectors import Collector
 
-from hpamdp.config import conf_dir, read
+from hpamdp.config.compose import conf_dir, read
 from hpamdp.run.assemble import Parts, assemble
 
 HERE = Path(__file__).resolve().parent

@@ -20,7 +20,8 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.config import Config, read
+from hpamdp.config.compose import read
+from hpamdp.config.schema import Config
 from hpamdp.env.rooms import rules
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.policies.agent import HierarchicalAgent
@@ -69,7 +70,7 @@ SELECTORS = {
 # Replay learners: small networks and fast targets, for a problem of 104 cells.
 REPLAY = [
     "total_frames=200000",
-    "agent.uniform_option_frames=120000",
+    "agent.uniform_option_steps=120000",
     "low.hidden_dims=[64,64]",
 ]
 # Plans of one step: what their last state is worth says the rest, and tells lengths of steps apart more clearly.
@@ -86,14 +87,14 @@ LEARNERS = {
     # Small batches, for many updates of a policy that must go through the rooms before it finds a reward.
     "hppo": [
         "total_frames=160000",
-        "agent.uniform_option_frames=80000",
+        "agent.uniform_option_steps=80000",
         "num_envs=64",
         "steps_per_batch=16",
         "low.minibatch_size=256",
     ],
     "pdqn": [
         *REPLAY,
-        "agent.uniform_option_frames=100000",
+        "agent.uniform_option_steps=100000",
         "low.warmup_steps=2000",
         "low.updates_per_step=0.05",
         "low.actor_tau=0.05",
@@ -134,7 +135,7 @@ LEARNERS = {
     ],
     "dlpa": [
         "total_frames=100000",
-        "agent.uniform_option_frames=60000",
+        "agent.uniform_option_steps=60000",
         "low.hidden_dims=[64,64]",
         "low.warmup_steps=15000",
         "low.updates_per_step=0.1",
@@ -143,7 +144,7 @@ LEARNERS = {
     # As of PADDPG, and more of them for models that learn from few arrivals.
     "pets": [
         "total_frames=140000",
-        "agent.uniform_option_frames=110000",
+        "agent.uniform_option_steps=110000",
         "num_envs=64",
         "steps_per_batch=4",
         "low.warmup_steps=40000",
@@ -156,7 +157,7 @@ LEARNERS = {
     # All entries, two in a feature: with the one-hot vectors this makes a value for each cell. Episodes are options.
     "qpamdp": [
         "total_frames=800000",
-        "agent.uniform_option_frames=400000",
+        "agent.uniform_option_steps=400000",
         "num_envs=64",
         "steps_per_batch=16",
         "low.features=null",

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from hpamdp.analysis.study import Rows, Run, difference, finished, groups, read_csv, spread, write_tables
-from hpamdp.config import conf_dir
+from hpamdp.config.compose import conf_dir
 from hpamdp.env.boatdock.reference import HUMAN
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_agent, make_env, make_evaluation
@@ -62,7 +62,7 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
     agent = make_agent(config, PAMDPSpecs.from_env(env), device)
     checkpoint.load(source, agent, device, with_training=False)
     high, low = run.summary["high"], run.summary["low"]
-    options = config.env.options
+    options = config.env.settings
     trained_with = [f"{noise} {options[noise]:g}" for noise in LEVELS if options[noise]]
     name = {
         "agent": low if high == "none" else f"{high} x {low}",

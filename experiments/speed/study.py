@@ -25,7 +25,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.collectors import Collector
 
 from hpamdp.analysis.study import Rows, read_csv, write_tables
-from hpamdp.config import conf_dir, read
+from hpamdp.config.compose import conf_dir, read
 from hpamdp.policies.base import Learner
 from hpamdp.run.assemble import Parts, assemble
 

@@ -270,7 +270,7 @@ class HierarchicalAgent(nn.Module):
         is_shared: whether the single learner observes the option. Its own specs then count the one-hot option as part
             of the observation.
         is_frozen: whether the learners stay as they are.
-        uniform_option_frames: number of steps at the beginning with uniform exploring choices; of decisions, if the
+        uniform_option_steps: number of steps at the beginning with uniform exploring choices; of decisions, if the
             learners are frozen. The selector learns from them.
         selector_ends_options: whether the selector decides where options end.
 
@@ -289,7 +289,7 @@ class HierarchicalAgent(nn.Module):
         specs: PAMDPSpecs,
         is_shared: bool = False,
         is_frozen: bool = False,
-        uniform_option_frames: int = 0,
+        uniform_option_steps: int = 0,
         selector_ends_options: bool = False,
     ) -> None:
         super().__init__()
@@ -298,7 +298,7 @@ class HierarchicalAgent(nn.Module):
         self.specs = specs
         self.is_shared = is_shared
         self.is_frozen = is_frozen
-        self.uniform_option_frames = uniform_option_frames
+        self.uniform_option_steps = uniform_option_steps
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self._set_is_uniform()
         self.router = OptionRouter(learners, specs, is_shared)
@@ -443,7 +443,7 @@ class HierarchicalAgent(nn.Module):
 
     def _set_is_uniform(self) -> None:
         if self.selector is not None:
-            self.selector.is_uniform.fill_(self.frames < self.uniform_option_frames)
+            self.selector.is_uniform.fill_(self.frames < self.uniform_option_steps)
 
     def _set_pending(self, selector: Selector, batch: TensorDictBase) -> None:
         last = batch[..., -1]

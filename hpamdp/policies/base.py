@@ -198,7 +198,7 @@ class Selector(Level, TensorDictModuleBase):
             options must last as long as their episodes; others are refused.
         modes: what the selector can learn from: its own choices (`train`), or a data set of other choices (`offline`).
             A data set lacks keys that a selector adds to `out_keys`, so such a selector usually has `train` alone.
-        is_uniform: bool scalar, a buffer that the agent sets. It is true for the first `agent.uniform_option_frames`
+        is_uniform: bool scalar, a buffer that the agent sets. It is true for the first `agent.uniform_option_steps`
             steps of a run. Exploring choices then come from `choose_uniformly`, so that every learner gets data.
         pending: how many decisions for each option have not yet reached `learn`, int64 `[num_options]`. The agent sets
             this buffer after every batch. A selector that needs the number within a batch adds its own choices.
@@ -479,3 +479,10 @@ class Learner(Level, nn.Module):
         one step is not enough.
         """
         return {}
+
+    def num_updates(self, steps: int) -> int:
+        """Return about how many gradient steps the learner takes in this many steps of its own.
+
+        `compile_updates=auto` compiles the updates of learners that take many. Override it if they can be compiled.
+        """
+        return 0

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, warn

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from hpamdp.config import Config, ConfigError
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import upgraded
+from hpamdp.config.schema import Config
 from hpamdp.run import checkpoint
 from hpamdp.run_files import SUMMARY_NAME, saved_config, saved_summary
-from hpamdp.saved_config import in_todays_form
 
 # Settings that change neither the training nor the score.
 _BOOKKEEPING = (
@@ -67,7 +68,7 @@ def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     """Return in words where two configs differ, except in bookkeeping; empty if they agree."""
     # Through yaml, as the saved config.
-    here, there = _flat(yaml.safe_load(wanted.to_yaml())), _flat(in_todays_form(saved) if saved else {})
+    here, there = _flat(yaml.safe_load(wanted.to_yaml())), _flat(upgraded(saved) if saved else {})
     keys = [key for key in {**here, **there} if here.get(key) != there.get(key)]
     keys = [key for key in keys if key.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING]
     if not keys:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.run_files import (
     CHECKPOINT_NAME,
@@ -33,8 +33,6 @@ from hpamdp.run_files import (
 )
 from hpamdp.shell import path_setting
 
-# The value of `resume` that continues the run in its own folder, or starts it there.
-AUTO = "auto"
 # Each of these marks the folder as that of a run.
 _MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME)
 _OTHERS = (

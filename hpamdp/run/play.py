@@ -14,7 +14,10 @@ from typing import Any
 
 import torch
 
-from hpamdp.config import Config, ConfigError, compose_words, package_dir, read
+from hpamdp.config.compose import compose_words, package_dir, read
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import choices_of
+from hpamdp.config.schema import Config
 from hpamdp.env.play_page import EpisodeError, PlayPage
 from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, reason_of, say, warn
@@ -24,7 +27,6 @@ from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
 from hpamdp.run.players import Player, load_player, split_words, whole_number
 from hpamdp.run.resume import saved_choices
 from hpamdp.run_files import POLICY_NAME, saved_summary
-from hpamdp.saved_config import choices_of
 
 _DESCRIPTION = """\
 Play a problem yourself, beside agents.
@@ -145,7 +147,7 @@ def _agent(path: Path, player: Player) -> dict[str, Any] | None:
     name = path.name if path.is_dir() else path.parent.name
     title = config.low.name if config.high.cls is None else f"{config.high.name} + {config.low.name}"
     score: Any = saved_summary(path if path.is_dir() else path.parent).get("score")
-    options = json.loads(json.dumps(dict(config.env.options)))
+    options = json.loads(json.dumps(dict(config.env.settings)))
     return {
         "name": name,
         "title": title,

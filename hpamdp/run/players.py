@@ -10,10 +10,12 @@ from pathlib import Path
 
 import torch
 
-from hpamdp.config import Config, ConfigError, choosing, compose_words, read
+from hpamdp.config.compose import choosing, compose_words, read
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import Config
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import check_choice, make_agent, make_env, make_evaluation
+from hpamdp.run.assemble import check_built, choose_selector, make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.resume import check_saved_options, resolve, saved_choices
 from hpamdp.specs import PAMDPSpecs
@@ -72,7 +74,7 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     torch.manual_seed(config.run.seed)
     device = config.run.resolve_device()
     env = make_env(config, 1, device, config.run.seed)
-    check_choice(config, env)
+    check_built(config, env)
     agent = make_agent(config, PAMDPSpecs.from_env(env), device)
     if source is not None:
         check_saved_options(config, env)
@@ -83,7 +85,7 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
 
 def _config(path: str | None, settings: list[str]) -> tuple[Config, Path | None]:
     if path is None:
-        return read(compose_words(settings)), None
+        return choose_selector(read(compose_words(settings)), settings), None
     chosen = saved_choices(path, "checkpoint", settings)
     given = {word.partition("=")[0] for word in settings}
     words = [choosing(group, name) for group, name in chosen.items() if group not in given]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.analysis import figures, film
-from hpamdp.config import Config
+from hpamdp.config.schema import Config
 from hpamdp.files import replacing
 from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
 from hpamdp.policies.random_agent import random_agent

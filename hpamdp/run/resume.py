@@ -10,12 +10,15 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from hpamdp.config import GROUPS, RECIPE, Config, ConfigError, chosen_names, plain, read
+from hpamdp.config.components import GROUPS
+from hpamdp.config.compose import RECIPE, chosen_names, plain, read
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import choices_of, read_saved, upgraded
+from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.messages import warn
-from hpamdp.run import checkpoint
-from hpamdp.run.assemble import make_env
-from hpamdp.saved_config import choices_of, in_todays_form, read_saved
+from hpamdp.run import checkpoint, compatibility
+from hpamdp.run.assemble import choose_selector, make_env
 from hpamdp.shell import setting
 
 # Parts of the config that make the agent what it is.
@@ -38,7 +41,8 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
     Raises:
         ConfigError: a wrong value, no such checkpoint, or a word that would change the saved agent.
     """
-    config = read(cfg)
+    config = choose_selector(read(cfg), overrides)
+    compatibility.check_rules(config, (compatibility.saved_runs_are_named,))
     where = "resume" if config.run.resume is not None else "checkpoint"
     source = config.run.resume or config.run.checkpoint
     if source is None:
@@ -100,7 +104,7 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
     if source is None:
         return
     progress = checkpoint.progress_of(checkpoint.find(source, where))
-    saved, now_env = in_todays_form(progress["config"]), config.to_dict()
+    saved, now_env = upgraded(progress["config"]), config.to_dict()
     if (saved["choices"]["env"], saved["env"]) == (now_env["choices"]["env"], now_env["env"]):
         return
     before, now = _option_names(progress, where, source), env.option_names if env.has_choice else ()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.messages import first_line
 from hpamdp.run.folder import locked
 

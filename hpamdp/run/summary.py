@@ -8,7 +8,7 @@ from importlib.metadata import version
 from typing import Any
 
 from hpamdp import __version__
-from hpamdp.config import Config
+from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
 
 _PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "hydra-core", "numpy")

@@ -17,14 +17,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, open_dict, read_write
 
-from hpamdp.config import ConfigError, job_overrides
+from hpamdp.config.compose import job_overrides
+from hpamdp.config.errors import ConfigError
 from hpamdp.files import remove_link, replacing
 from hpamdp.messages import one_line, reason_of, say, warn
 from hpamdp.run.folder import check_no_link, is_about_folder, locked
@@ -65,7 +65,7 @@ class SweepDir(Callback):
             sys.exit(0)
         hydra = GlobalHydra.instance().hydra
         assert hydra is not None
-        hydra.config_loader = JobConfigs(hydra.config_loader.get_search_path(), first_job)
+        _compose_jobs_without_folders(hydra.config_loader, first_job)
 
 
 def _check_output_subdir(config: DictConfig) -> None:
@@ -76,29 +76,30 @@ def _check_output_subdir(config: DictConfig) -> None:
         sys.exit(_MISTAKE)
 
 
-class JobConfigs(ConfigLoaderImpl):
-    """Composes the configs of jobs so that Hydra makes no folder for them.
+def _compose_jobs_without_folders(loader: ConfigLoader, first_job: int) -> None:
+    """Have Hydra compose the configs of jobs so that it makes no folder for them.
 
     Hydra ends the whole sweep if it cannot make the folder of one job. `run_job` makes it instead.
 
     Args:
-        search_path: where the yaml files are.
+        loader: composes the configs.
         first_job: number of the first job; not 0 if a search is continued.
     """
+    # Launchers send the loader to other processes, hence a function that can be pickled.
+    loader.load_sweep_config = functools.partial(_job_config, loader, first_job)  # type: ignore[method-assign]
 
-    def __init__(self, search_path: ConfigSearchPath, first_job: int) -> None:
-        super().__init__(search_path)
-        self._first_job = first_job
 
-    def load_sweep_config(self, master_config: DictConfig, sweep_overrides: list[str]) -> DictConfig:
-        """Return a job's config, with the folder below the sweep's as `hydra.sweep.job_subdir`."""
-        config = super().load_sweep_config(master_config, sweep_overrides)
-        with open_dict(config.hydra.sweep):
-            config.hydra.sweep.job_subdir = config.hydra.sweep._get_node("subdir")._value()
-            config.hydra.sweep.first_job = self._first_job
-        config.hydra.sweep.subdir = "."
-        config.hydra.output_subdir = None
-        return config
+def _job_config(
+    loader: ConfigLoader, first_job: int, master_config: DictConfig, sweep_overrides: list[str]
+) -> DictConfig:
+    """Return a job's config, with the folder below the sweep's as `hydra.sweep.job_subdir`."""
+    config = type(loader).load_sweep_config(loader, master_config, sweep_overrides)
+    with open_dict(config.hydra.sweep):
+        config.hydra.sweep.job_subdir = config.hydra.sweep._get_node("subdir")._value()
+        config.hydra.sweep.first_job = first_job
+    config.hydra.sweep.subdir = "."
+    config.hydra.output_subdir = None
+    return config
 
 
 def _job_folder() -> Path:

@@ -15,12 +15,15 @@ from tensordict import TensorDictBase
 from tqdm import tqdm
 
 from hpamdp import keys
-from hpamdp.config import Config, ConfigError
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import needs_trust
+from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import Parts, assemble, memory_errors_explained
+from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import Collection, CollectionError
 from hpamdp.run.folder import check_no_link, check_no_training, check_unused, mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
@@ -28,7 +31,6 @@ from hpamdp.run.resume import check_saved_options, resolve
 from hpamdp.run.state_checks import example_steps
 from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_explained, signals_ignored, stop_on_signals
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME, TENSORBOARD_NAME, WANDB_NAME
-from hpamdp.saved_config import needs_trust
 from hpamdp.shell import path_setting, program
 
 _UPDATES_A_TURN = 50  # with mode=offline, between two checks of what is due

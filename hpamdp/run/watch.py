@@ -9,7 +9,7 @@ from pathlib import Path
 from torch import Tensor
 
 from hpamdp.analysis import film
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.messages import reason_of, say
 from hpamdp.run.players import load_player, split_words, whole_number
 

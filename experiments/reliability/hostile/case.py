@@ -14,7 +14,7 @@ from pathlib import Path
 
 import torch
 
-from hpamdp.config import ConfigError
+from hpamdp.config.errors import ConfigError
 from hpamdp.data.errors import DataError
 from hpamdp.env.base import ProblemError
 

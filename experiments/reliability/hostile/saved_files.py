@@ -17,7 +17,7 @@ from typing import Any
 import command_line
 import torch
 
-from hpamdp.config import compose_words
+from hpamdp.config.compose import compose_words
 from hpamdp.run import train
 
 from .case import ACCEPTED, HARM, SILENT, TRACEBACK, Case

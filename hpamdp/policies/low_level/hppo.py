@@ -283,6 +283,10 @@ class HPPO(OnPolicy, Learner):
         """Return the actor, unless it is to sample: see `hpamdp.policies.shared.exported_policy`."""
         return None if self.policy.samples_when_greedy else exported_actor(self.policy.actor, self.specs)
 
+    def num_updates(self, steps: int) -> int:
+        """Return the passes over this many steps, in minibatches."""
+        return self.options.epochs * steps // self.options.minibatch_size
+
     def steps_to_update(self) -> dict[str, int]:
         """Return the size of a minibatch."""
         return {"minibatch_size": self.options.minibatch_size}

@@ -186,6 +186,10 @@ class ReplayLearner(Learner):
             needed["updates_per_step"] = first_multiple(self.options.updates_per_step)
         return needed
 
+    def num_updates(self, steps: int) -> int:
+        """Return the updates for this many steps, the warm-up included."""
+        return int(self.options.updates_per_step * max(0, steps - self.options.warmup_steps))
+
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""
         rows = self.transitions(batch)[mask]

@@ -9,7 +9,7 @@ from typing import Any
 
 from torchrl.collectors import MultiSyncCollector
 
-from hpamdp.config import Config
+from hpamdp.config.schema import Config
 from hpamdp.messages import warn
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.limits import full_shared_memory

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NoReturn
 
 from torchrl.collectors.distributed import RayCollector
 
-from hpamdp.config import Config
+from hpamdp.config.schema import Config
 from hpamdp.messages import first_line, one_line, warn
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import CollectionError

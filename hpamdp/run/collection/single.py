@@ -13,7 +13,7 @@ from typing import Any
 from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 
-from hpamdp.config import Config
+from hpamdp.config.schema import Config
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection, checked_state
 

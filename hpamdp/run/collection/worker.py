@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
-from hpamdp.config import Config
+from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.messages import one_line
 from hpamdp.policies.agent import HierarchicalAgent

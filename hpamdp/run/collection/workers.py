@@ -16,7 +16,7 @@ from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
-from hpamdp.config import Config
+from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.run.assemble import Parts
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state

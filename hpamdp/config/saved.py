@@ -8,24 +8,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hpamdp.config import (
-    GROUPS,
-    RUN_ENTRIES,
-    TARGET,
-    Config,
-    ConfigError,
-    MissingChoiceError,
-    RunConfig,
-    as_json,
-    check,
-    choosing,
-    compose,
-    is_name,
-    names_of,
-    plain_groups,
-)
+from hpamdp.config.components import GROUPS, RUN_ENTRIES, TARGET
+from hpamdp.config.compose import check, choosing, compose, is_name, names_of, plain_groups
+from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json
+from hpamdp.config.renamed import with_new_names
+from hpamdp.config.schema import AgentConfig, Config, EnvConfig
+from hpamdp.settings import Settings
 
 _CHOICES = "choices"
+# Values of the run that earlier versions did not save, as they were at the time.
+_BEFORE = {"film": True, "compile_updates": False, "update_precision": "float32"}
+_RUN_GROUPS: dict[str, type[Settings]] = {"agent": AgentConfig, "env": EnvConfig}
 
 
 def choices_of(saved: Mapping[str, Any]) -> dict[str, str]:
@@ -34,7 +27,7 @@ def choices_of(saved: Mapping[str, Any]) -> dict[str, str]:
     Raises:
         ConfigError: `saved` is no config of this program.
     """
-    choices = in_todays_form(saved)[_CHOICES]
+    choices = upgraded(saved)[_CHOICES]
     return {group: choices[group] for group in GROUPS}
 
 
@@ -61,13 +54,14 @@ def read_saved(
             value from `saved` alone.
     """
     given, names = given or {}, names or {}
-    saved = in_todays_form(saved)
+    saved = upgraded(saved)
     groups = [group for group in GROUPS if group not in given]
     choices = {group: saved[_CHOICES][group] for group in groups}
     today = plain_groups(compose([choosing(group, name) for group, name in choices.items()]), saved, groups)
     values = {name: value for name, value in saved.items() if name not in (*GROUPS, _CHOICES)}
     for group in groups:
-        values[group] = {**today[group], **saved[group], TARGET: today[group][TARGET]}
+        renamed = with_new_names(group, saved[group], today[group])
+        values[group] = {**today[group], **renamed, TARGET: today[group][TARGET]}
     for name, value in given.items():
         _set(values, name.split("."), value)
     config = check(values, {**choices, **names})
@@ -84,7 +78,7 @@ def read_saved(
 def needs_trust(config: Config) -> bool:
     """Return whether continuing a run of this config may need `trust=true`, because a guarded setting is not null."""
     parts = [getattr(config, group) for group in GROUPS if group != "data"] + [*config.low_of.values()]
-    settings = [(part, name, value) for part in parts for name, value in part.options.items()]
+    settings = [(part, name, value) for part in parts for name, value in part.settings.items()]
     return any(value is not None and part.is_guarded(name, value) for part, name, value in settings)
 
 
@@ -93,10 +87,10 @@ def _guarded(
 ) -> dict[str, Any]:
     """Return the guarded settings whose values come from a saved config alone."""
     found = {}
-    for group, yaml in today.items():
+    for group, ours in today.items():
         for name, value in saved[group].items():
             setting = f"{group}.{name}"
-            if setting not in given and value != yaml.get(name) and getattr(config, group).is_guarded(name, value):
+            if setting not in given and value != ours.get(name) and getattr(config, group).is_guarded(name, value):
                 found[setting] = value
     for option, low in config.low_of.items():
         choice = (saved["low"].get("per_option") or {}).get(option)
@@ -106,7 +100,7 @@ def _guarded(
     return found
 
 
-def in_todays_form(saved: Mapping[str, Any]) -> dict[str, Any]:
+def upgraded(saved: Mapping[str, Any]) -> dict[str, Any]:
     """Return a saved config in the form that `Config.to_dict` has today, with defaults for missing values.
 
     Raises:
@@ -122,8 +116,10 @@ def in_todays_form(saved: Mapping[str, Any]) -> dict[str, Any]:
         if not is_name(name):
             raise ConfigError(f"the saved config chose {group}={as_json(name)}, which is no name of a yaml file")
     values.pop("trust", None)
-    fields = {name: field for name, field in RunConfig.model_fields.items() if name != "trust"}
-    return {name: field.default for name, field in fields.items() if not field.is_required()} | values
+    for group, entries in _RUN_GROUPS.items():
+        if isinstance(values.get(group), Mapping):
+            values[group] = with_new_names(group, values[group], entries.model_fields)
+    return {**_BEFORE, **values}
 
 
 def _from_first_form(saved: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,0 +1,273 @@
+"""The words of a command line: parsed once, checked, and completed by what they stand for."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import hydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, QuotedString
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hpamdp import __version__
+from hpamdp.config.components import GROUPS
+from hpamdp.config.compose import choosing
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.shell import setting
+
+GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE"
+_SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
+# Flags of Hydra, with their short forms and what argparse needs to know of them.
+_SWITCH: dict[str, Any] = {"action": "store_true"}
+_INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+_FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "help": ("-h", _SWITCH),
+    "hydra-help": ("", _SWITCH),
+    "cfg": ("-c", {"choices": ("job", "hydra", "all")}),
+    "resolve": ("", _SWITCH),
+    "package": ("-p", {}),
+    "run": ("-r", _SWITCH),
+    "multirun": ("-m", _SWITCH),
+    "shell-completion": ("-sc", _SWITCH),
+    "config-path": ("-cp", {}),
+    "config-name": ("-cn", {}),
+    "config-dir": ("-cd", {}),
+    "info": ("-i", {"nargs": "?", "const": "all", "choices": _INFO}),
+}
+# Flags of which a command line has one at most.
+_EXCLUSIVE = ("run", "multirun", "cfg", "info", "shell-completion")
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """A command line in Hydra's grammar.
+
+    Attributes:
+        flags: the values of `--multirun`, `--config-dir` and so on, by their names.
+        overrides: the settings.
+    """
+
+    flags: dict[str, Any]
+    overrides: tuple[Override, ...]
+
+    @property
+    def words(self) -> list[str]:
+        """The settings as they were written."""
+        return [override.input_line or "" for override in self.overrides]
+
+    @property
+    def is_multirun(self) -> bool:
+        """Whether several jobs are to run."""
+        return bool(self.flags["multirun"])
+
+    @property
+    def only_shows(self) -> bool:
+        """Whether the command shows something instead of running a job."""
+        return any(self.flags[name] for name in ("cfg", "info", "hydra-help", "shell-completion"))
+
+    def argv(self) -> list[str]:
+        """Return the words as a program gets them."""
+        flags = []
+        for name, value in self.flags.items():
+            if value:
+                flags += [f"--{name}"] if value is True else [f"--{name}", value]
+        return [*flags, *self.words]
+
+    def given(self) -> dict[str, Override]:
+        """Return the settings by what they set."""
+        return {override.key_or_group: override for override in self.overrides}
+
+    def with_words(self, words: Sequence[str]) -> CommandLine:
+        """Return the command line with these words in front of its settings."""
+        return replace(self, overrides=(*_parsed(words), *self.overrides))
+
+
+def parse(argv: Sequence[str], conf: Path) -> CommandLine:
+    """Parse the words of a command line, and refuse what Hydra refuses with a traceback or a page of text.
+
+    Args:
+        argv: the words after the program's name.
+        conf: the folder of the yaml files.
+
+    Raises:
+        ConfigError: a flag or a setting that does not exist, or flags that do not go together.
+        OverrideParseException: a word is not in Hydra's grammar.
+    """
+    arguments = vars(_parser().parse_args(argv))
+    words = arguments.pop("overrides")
+    flags = {name: arguments[name.replace("-", "_")] for name in _FLAGS}
+    given = [f"--{name}" for name in _EXCLUSIVE if flags[name]]
+    if len(given) > 1:
+        _refuse(f"{' and '.join(given)} do not go together")
+    if flags["resolve"] and not flags["cfg"]:
+        _refuse("--resolve goes with --cfg only")
+    line = CommandLine(flags, _parsed(words))
+    _check_groups(line, conf)
+    return line
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.error = _refuse  # type: ignore[method-assign]  # the parser's own prints two lines
+    parser.add_argument("--version", action="version", version=f"hpamdp {__version__}, Hydra {hydra.__version__}")
+    parser.add_argument("overrides", nargs="*")
+    for name, (short, arguments) in _FLAGS.items():
+        parser.add_argument(*filter(None, (f"--{name}", short)), **arguments)
+    return parser
+
+
+def _refuse(message: str) -> NoReturn:
+    # argparse takes the settings on one side of a flag for all of them.
+    split = re.fullmatch(r"unrecognized arguments: ([^-].*=.*)", message)
+    if split:
+        raise ConfigError(f"{split.group(1)}: settings on both sides of a flag; write all of them after the flags")
+    dashed = re.fullmatch(r"unrecognized arguments: --([^ =-][^ =]*=[^ ]*)( .*)?", message)
+    if dashed:
+        word = dashed.group(1)
+        raise ConfigError(f"--{word}: settings have no dashes, write {word}; a wandb sweep ${{args_no_hyphens}}")
+    raise ConfigError(f"{message}; see --help")
+
+
+def _parsed(words: Sequence[str]) -> tuple[Override, ...]:
+    return tuple(OverridesParser.create().parse_overrides(list(words)))
+
+
+def _check_groups(line: CommandLine, conf: Path) -> None:
+    """Refuse a choice that is no name, such as `low=3`, on which Hydra ends in a traceback."""
+    for override in line.overrides:
+        if not override.key_or_group or override.key_or_group == "hydra":
+            raise ConfigError(f"{override.input_line}: {GRAMMAR}")
+        if override.is_delete() and override.key_or_group in GROUPS:
+            raise ConfigError(f"{override.key_or_group}: nothing chosen; set {override.key_or_group}=NAME")
+        is_text = override.is_sweep_override() or isinstance(override.value(), str | QuotedString | None)
+        if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
+            raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")
+        folder = conf / override.key_or_group
+        if not os.path.isdir(folder) or override.is_delete():  # unlike `Path.is_dir` for any text
+            continue
+        values = override.sweep_iterator() if override.is_discrete_sweep() else [override.value()]
+        if not all(_is_choice(value) for value in values):
+            raise ConfigError(
+                f"{override.input_line}: no such choice; conf/{folder.name} has {', '.join(choices_in(folder))}"
+            )
+
+
+def _is_choice(value: object) -> bool:
+    """Return whether the value can name a yaml file in a group's folder, or in a folder there."""
+    return isinstance(value, str | QuotedString) and not set(_text(value).split("/")) & {"", "..", "."}
+
+
+def _text(value: Any) -> str:
+    return value.text if isinstance(value, QuotedString) else str(value)
+
+
+def as_text(word: str) -> str:
+    """Return `KEY=VALUE` quoted for the shell and Hydra, so that the value is a text."""
+    key, _, value = word.partition("=")
+    return setting(key, value)
+
+
+def choices_in(folder: Path) -> list[str]:
+    """Return the choices in a group's folder. Experiments may lie in folders there, which stand for all in them."""
+    files = folder.rglob("*.yaml") if folder.name == "experiment" else folder.glob("*.yaml")
+    names = [file.relative_to(folder).with_suffix("") for file in files]
+    return sorted({str(choice) for name in names for choice in (name, *name.parents[:-1])})
+
+
+def completed(line: CommandLine, conf: Path) -> CommandLine:
+    """Complete the command line: the choices of a saved run, the experiments of a folder, the folder of their sweep.
+
+    Raises:
+        ConfigError: there is no such run, or the experiments of a sweep have different folders.
+    """
+    line = line.with_words(_saved_choices(line, conf))
+    line = _with_experiments_of_a_folder(line, conf)
+    return line.with_words(_sweep_folder(line, conf))
+
+
+def _saved_choices(line: CommandLine, conf: Path) -> list[str]:
+    """Return the choices of the run that this one starts from, as words of the command line, without those given."""
+    values = {o.key_or_group: o.value() for o in line.overrides if not o.is_sweep_override() and not o.is_delete()}
+    where = "resume" if values.get("resume") else "checkpoint"
+    source = values.get(where)
+    if not isinstance(source, str | QuotedString) or not _text(source) or "${" in _text(source):
+        return []
+    if where == "checkpoint" and values.get("mode") != "eval":
+        return []  # which is refused
+    if line.is_multirun or (where == "resume" and source == RESUME_AUTO):
+        return []  # the command line alone describes the run
+    from hpamdp.run.resume import saved_choices  # takes seconds, which other commands need not wait for
+
+    given = line.given()
+    has_own_files = line.flags["config-dir"] is not None or "hydra.searchpath" in given
+    choices = saved_choices(_text(source), where, line.words)
+    return [
+        choosing(group, name)
+        for group, name in choices.items()
+        if group not in given and (has_own_files or os.path.isfile(conf / group / f"{name}.yaml"))
+    ]
+
+
+def _with_experiments_of_a_folder(line: CommandLine, conf: Path) -> CommandLine:
+    """Write `experiment=FOLDER` out as a sweep over all experiments in it."""
+    chosen = line.given().get("experiment")
+    if chosen is None or chosen.is_delete() or chosen.is_sweep_override():
+        return line
+    folder = conf / "experiment" / _text(chosen.value())
+    if not os.path.isdir(folder):
+        return line
+    experiments = ",".join(f"{folder.name}/{file.stem}" for file in sorted(folder.glob("*.yaml")))
+    words = [f"experiment={experiments}" if override is chosen else override.input_line for override in line.overrides]
+    return CommandLine({**line.flags, "multirun": True}, _parsed([word or "" for word in words]))
+
+
+def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:
+    """Return the word with the folder that all experiments of a sweep over experiments name, if there is one.
+
+    Hydra takes a sweep's folder from the config without swept groups, in which no experiment is chosen.
+
+    Raises:
+        ConfigError: they name different ones.
+    """
+    given = line.given()
+    experiments = given.get("experiment")
+    if not line.is_multirun or "hydra.sweep.dir" in given:
+        return []
+    if experiments is None or not experiments.is_discrete_sweep():
+        return []
+    search_path: list[str] = []
+    if "hydra.searchpath" in given:
+        search_path = [given["hydra.searchpath"].input_line or ""]
+    elif line.flags["config-dir"] is not None:
+        search_path = [f"hydra.searchpath=['{Path(line.flags['config-dir']).absolute()}']"]
+    folders: dict[str, None] = {}
+    for choice in written_out(experiments):
+        try:
+            with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+                cfg = hydra.compose("config", [choice, *search_path], return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            return []  # which Hydra will report
+        settings: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)
+        folders[settings["dir"]] = None
+    if len(folders) > 1:
+        different = f"their sweeps have different folders, {' and '.join(folders)}"
+        raise ConfigError(f"{experiments.input_line}: {different}; set hydra.sweep.dir")
+    return [f"hydra.sweep.dir='{folder}'" for folder in folders if "${" not in folder]
+
+
+def written_out(override: Override) -> Iterator[str]:
+    """Yield the overrides, each with a single value, that one with a sweep stands for."""
+    if not override.is_discrete_sweep():
+        yield override.input_line or ""
+        return
+    for value in override.sweep_string_iterator():
+        yield f"{override.get_key_element()}={value}"

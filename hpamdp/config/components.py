@@ -1,0 +1,278 @@
+"""The classes that are chosen for the groups of conf/, each with its checked settings.
+
+A class lists its settings in a model, `Options`. If it has none, its constructor's arguments are the settings: their
+names, types and defaults.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import linecache
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, get_type_hints
+
+from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
+
+from hpamdp.config.errors import ConfigError, as_json, validated
+from hpamdp.memory import is_about_memory
+from hpamdp.messages import first_line
+from hpamdp.settings import SettingError, Settings
+
+# The groups of conf/, and the constructor arguments that the program supplies; all others are set in the yaml.
+GROUPS: dict[str, tuple[str, ...]] = {
+    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human"),
+    "high": ("specs", "device"),
+    "low": ("specs", "device"),
+    "data": ("env",),
+    "logger": ("output_dir", "config", "earlier"),
+    "collector": ("config", "parts", "frames"),
+}
+TARGET = "_target_"
+# Entries of a group that are values of the run, not settings of its class.
+RUN_ENTRIES: dict[str, tuple[str, ...]] = {
+    "low": ("budget", "checkpoint", "freeze", "per_option"),
+    "env": ("grouping",),
+}
+# The base class of each group's classes. If it is a protocol, a class only needs its methods.
+_KINDS = {
+    "env": "hpamdp.env.base.PAMDPEnv",
+    "high": "hpamdp.policies.base.Selector",
+    "low": "hpamdp.policies.base.Learner",
+    "data": "hpamdp.data.demonstrations.Demonstrations",
+    "logger": "hpamdp.run.loggers.Logger",
+    "collector": "hpamdp.run.collection.base.Collection",
+}
+_CAN_BE_NONE = ("high", "data")
+_STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
+
+
+@dataclass(frozen=True)
+class Component:
+    """A class that was chosen for a group, with its settings.
+
+    Attributes:
+        group: such as `low`.
+        name: of its yaml, such as `hyar`.
+        cls: the class; None for `high=none` and `data=none`.
+        settings: checked values by name.
+    """
+
+    group: str
+    name: str
+    cls: type | None
+    settings: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        return f"{self.group}={self.name}"
+
+    @property
+    def options(self) -> Any:
+        """The settings as the class's own model; None if it has no model."""
+        if self.cls is None or not takes_options(self.cls):
+            return None
+        return options_model(self.cls)(**self.settings)
+
+    def is_guarded(self, name: str, value: object) -> bool:
+        """Return whether a saved config may give a setting this value only if the user says so.
+
+        The class lists such settings in `guarded_settings`, as `name`, or as `name=value` if only that value is
+        guarded.
+        """
+        guarded = getattr(self.cls, "guarded_settings", ())
+        return name in guarded or f"{name}={value}" in guarded
+
+    def build(self, **context: Any) -> Any:
+        """Build the object; None where there is no class.
+
+        Args:
+            context: what the program supplies; each goes to a constructor that has an argument of that name.
+
+        Raises:
+            ConfigError: the constructor refuses its settings with a `SettingError`, or memory does not suffice.
+        """
+        if self.cls is None:
+            return None
+        accepted = constructor_arguments(self.cls)
+        supplied = {name: value for name, value in context.items() if name in accepted}
+        options = self.options
+        settings = self.settings if options is None else {"options": options}
+        try:
+            return self.cls(**supplied, **settings)
+        except ValueError as error:
+            if not _is_refusal(error, self.cls):
+                raise
+            where = f"{self.cls.__name__}, {file_of(self.group, self.name)}"
+            raise ConfigError(f"{self.group}: {first_line(error)} ({where})") from error
+        except Exception as error:
+            if not is_about_memory(error):
+                raise
+            raise ConfigError(f"{self.largest_sizes()}: takes more memory than there is") from error
+
+    def largest_sizes(self) -> str:
+        """Return in words the settings that may have made this component too large."""
+        sizes = {name: value for name, value in self.settings.items() if _is_size(value)}
+        largest = sorted(sizes, key=lambda name: _size(sizes[name]))[-2:]
+        return ", ".join(f"{self.group}.{name}={as_json(sizes[name])}" for name in reversed(largest)) or str(self)
+
+
+def component(group: str, name: str, given: Mapping[str, Any]) -> Component:
+    """Check the class and the settings of a group; build nothing.
+
+    Args:
+        group: such as `low`.
+        name: of the yaml that was chosen.
+        given: the group's part of the config as plain values, with its `_target_`.
+
+    Raises:
+        ConfigError: all that is wrong with this group, in one line.
+    """
+    own = RUN_ENTRIES.get(group, ())
+    settings = {setting: value for setting, value in given.items() if setting not in (TARGET, *own)}
+    file = file_of(group, name)
+    target = given.get(TARGET)
+    if target is None and group in _CAN_BE_NONE:
+        model = create_model("none", __config__=_STRICT)
+        validated(model, settings, f"{group}.", f"setting of none ({file})", f"none, {file}")
+        return Component(group, name, None, {})
+    cls = _load_target(group, target, file)
+    model = options_model(cls, GROUPS[group])
+    taken = [entry for entry in (TARGET, *own) if entry in model.model_fields]
+    if taken:
+        raise ConfigError(
+            f"{group}={name}: {cls.__name__} has a setting {taken[0]}, but {group}.{taken[0]} is a value of the run; "
+            f"rename the setting ({file})"
+        )
+    where = f"{cls.__name__}, {file}"
+    checked = validated(model, settings, f"{group}.", f"setting of {cls.__name__} ({file})", where)
+    return Component(group, name, cls, dict(checked))
+
+
+def check_kind(group: str, name: str, target: object) -> None:
+    """Refuse a class that does not fit the group, or that is abstract.
+
+    Raises:
+        ConfigError: with what the class lacks.
+    """
+    if target is None and group in _CAN_BE_NONE:
+        return
+    file = file_of(group, name)
+    cls, kind = _load_target(group, target, file), load_class(_KINDS[group])
+    of_kind = f"{kind.__name__} ({kind.__module__})"
+    given = f"{group}={name}: {cls.__name__}"
+    if getattr(kind, "_is_protocol", False):
+        methods = [method for method in vars(kind) if not method.startswith("_")]
+        lacks = [method for method in methods if not callable(getattr(cls, method, None))]
+        if lacks:
+            raise ConfigError(f"{given} is no {of_kind}; it lacks {', '.join(lacks)} ({file})")
+    elif not issubclass(cls, kind):
+        raise ConfigError(f"{given} is no {of_kind}; derive it from {kind.__name__} ({file})")
+    left = [method for method in dir(cls) if getattr(getattr(cls, method, None), "__isabstractmethod__", False)]
+    if left or cls is kind:
+        missing = f", which have {', '.join(left)}" if left else ""
+        raise ConfigError(f"{given} is abstract; choose one of its subclasses{missing} ({file})")
+
+
+def load_class(dotted: str) -> type:
+    """Import a class by its dotted name.
+
+    Raises:
+        ConfigError: there is no such class.
+    """
+    module_name, _, name = dotted.rpartition(".")
+    if not module_name or not all(part.isidentifier() for part in dotted.split(".")):
+        raise ConfigError(f"{dotted}: must be a class, as package.module.Class")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        # A module that is there but lacks something it imports is no mistake of the user's.
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise
+        raise ConfigError(f"{dotted}: there is no module {error.name}") from error
+    cls = getattr(module, name, None)
+    if not inspect.isclass(cls):
+        raise ConfigError(f"{dotted}: there is no class {name} in {module_name}")
+    return cls
+
+
+def _load_target(group: str, target: object, file: str) -> type:
+    try:
+        return load_class(str(target))
+    except ConfigError as error:
+        raise ConfigError(f"{group}.{TARGET}={error} ({file})") from error
+
+
+def constructor_arguments(cls: type) -> dict[str, inspect.Parameter]:
+    """Return the arguments of a class's constructor, without `self`."""
+    constructor: Callable[..., None] = cls.__init__  # type: ignore[misc]  # a subclass's may differ, but this is `cls`
+    return dict(list(inspect.signature(constructor).parameters.items())[1:])
+
+
+def takes_options(cls: type) -> bool:
+    """Return whether the constructor takes a model of settings."""
+    return hasattr(cls, "Options") and "options" in constructor_arguments(cls)
+
+
+def options_model(cls: type, supplied: Iterable[str] = ()) -> type[BaseModel]:
+    """Return the model of a class's settings: its `Options`, or one made of its constructor's arguments.
+
+    Args:
+        cls: the class.
+        supplied: arguments of its constructor that are no settings.
+
+    Raises:
+        ConfigError: there is no such model.
+    """
+    if takes_options(cls):
+        model = cls.Options  # type: ignore[attr-defined]
+        if not (inspect.isclass(model) and issubclass(model, Settings)):
+            raise ConfigError(f"{cls.__name__}.Options: must be a subclass of {Settings.__module__}.Settings")
+        return model
+    hints = get_type_hints(cls.__init__, include_extras=True)  # type: ignore[misc]  # as in `constructor_arguments`
+    fields: dict[str, Any] = {}
+    for name, argument in constructor_arguments(cls).items():
+        if name in supplied or argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
+            continue
+        default = ... if argument.default is argument.empty else argument.default
+        fields[name] = (hints.get(name, Any), default)
+    try:
+        return create_model(cls.__name__, __config__=_STRICT, **fields)
+    except PydanticUserError as error:
+        raise ConfigError(f"{cls.__name__}: has an argument that no yaml file can hold: {first_line(error)}") from error
+
+
+def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the default of each setting as yaml holds it; `???` for settings that have none."""
+    defaults = model.model_construct().model_dump(mode="json", warnings=False)
+    for name, field in model.model_fields.items():
+        inner = field.annotation
+        if inspect.isclass(inner) and issubclass(inner, BaseModel):
+            defaults[name] = defaults_of(inner)
+        elif field.is_required():
+            defaults[name] = "???"
+    return defaults
+
+
+def file_of(group: str, name: str) -> str:
+    """Return the yaml file of a choice, as messages name it."""
+    return f"conf/{group}/{name}.yaml"
+
+
+def _is_refusal(error: ValueError, cls: type) -> bool:
+    """Return whether the error is a `raise` in the class's own package, hence about its arguments, and not a bug."""
+    if isinstance(error, SettingError):
+        return True
+    frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
+    is_own = frame.f_globals["__name__"].partition(".")[0] == cls.__module__.partition(".")[0]
+    return is_own and linecache.getline(frame.f_code.co_filename, line).lstrip().startswith("raise ")
+
+
+def _is_size(value: Any) -> bool:
+    numbers = value if isinstance(value, list | tuple) else [value]
+    return bool(numbers) and all(isinstance(number, int) and not isinstance(number, bool) for number in numbers)
+
+
+def _size(value: Any) -> int:
+    return max(value) if isinstance(value, list | tuple) else value

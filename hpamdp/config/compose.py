@@ -1,0 +1,239 @@
+"""Configs as Hydra composes them from yaml files and words of a command line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hpamdp.config.components import GROUPS, TARGET, file_of
+from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json, no_such
+from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
+from hpamdp.config.yaml_files import complete_yaml_files
+from hpamdp.messages import first_line
+
+NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
+RECIPE = "recipe"
+_LONGEST_NAME = 200  # letters of a yaml file's name
+_SHOWN = 200  # letters of a command line in an error
+# Entries of a learner that the learner of a single option cannot have, and what to do instead.
+_NOT_PER_OPTION = {
+    TARGET: "a yaml file names the class; give the name of the file",
+    "budget": "a run has one budget; set total_frames, num_envs, steps_per_batch or eval.every",
+    "checkpoint": "a checkpoint fills all learners; set low.checkpoint",
+    "freeze": "all learners are frozen or none; set low.freeze",
+    "per_option": "an option has one learner",
+}
+
+complete_yaml_files()
+
+
+def conf_dir() -> Path:
+    """Return the folder of the yaml files."""
+    folder = package_dir("conf")
+    if folder is None or not (folder / "config.yaml").is_file():
+        package = _package()
+        raise ConfigError(f"there is no conf/config.yaml in {package} or beside it; install hpamdp again")
+    return folder
+
+
+def package_dir(name: str) -> Path | None:
+    """Return a folder that lies inside the package where it is installed, and beside it in a clone; None: neither."""
+    folders = (_package() / name, _package().parent / name)
+    return next((folder for folder in folders if folder.is_dir()), None)
+
+
+def _package() -> Path:
+    return Path(__file__).resolve().parent.parent
+
+
+def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
+    """Check the composed config.
+
+    Args:
+        cfg: as Hydra composes conf/config.yaml, with or without its `hydra` part.
+        choices: the name that was chosen for each group; None: those that Hydra knows.
+
+    Raises:
+        ConfigError: a wrong value, or a group for which nothing is chosen.
+    """
+    names = chosen_names(cfg) if choices is None else choices
+    for group in GROUPS:
+        if cfg.get(group) is None or TARGET not in cfg[group]:
+            if names.get(group) is not None:
+                raise ConfigError(f"{group}={names[group]}: {file_of(group, names[group])} names no class as {TARGET}")
+            raise ConfigError(f"{group}: nothing chosen; set {group}=NAME with one of the files in conf/{group}")
+    own = cfg.copy()
+    OmegaConf.set_struct(own, False)
+    own.pop("hydra", None)
+    if "hydra" in cfg or HydraConfig.initialized():
+        _check_found(cfg.hydra if "hydra" in cfg else HydraConfig.get(), names)
+    return check(plain(own), names)
+
+
+def _check_found(node: Any, names: Mapping[str, str]) -> None:
+    """Refuse a recipe or a folder of yaml files that does not exist; Hydra leaves it out without a message.
+
+    Args:
+        node: the config's `hydra` part.
+        names: the name that was chosen for each group.
+    """
+    for path in node.searchpath:
+        scheme, _, folder = str(path).rpartition("://")
+        if scheme in ("", "file") and not Path(folder).is_dir():
+            raise ConfigError(f"hydra.searchpath={path}: there is no such folder")
+    for group, level in ((RECIPE, "low"), (f"{RECIPE}/high", "high")):
+        recipe = names.get(group)
+        is_said = any(word.startswith(f"{group}=") for word in _words_of(node))
+        if recipe is None or (recipe == f"{names['env']}_{names[level]}" and not is_said):
+            continue
+        if recipe not in names_of(group):
+            raise ConfigError(f"{group}={recipe}: {no_such(f'file in conf/{group}', recipe, names_of(group))}")
+
+
+def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
+    """Check the config as plain values, in which no text is resolved.
+
+    Args:
+        given: the values of the run; for each group a mapping of `_target_` and the settings.
+        names: the name that was chosen for each group.
+
+    Raises:
+        ConfigError: a wrong value.
+    """
+    run = check_run(given, names)
+    return checked_config(run, given, names, _learners_of_options(run, names["env"]))
+
+
+def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[str, Any]]]:
+    """Return each learner in `low.per_option`: its name, and its yaml and its recipe with the given settings."""
+    learners = {}
+    for option, choice in (run.low.per_option or {}).items():
+        given = {"name": choice} if isinstance(choice, str) else dict(choice)
+        where = f"low.per_option.{option}"
+        name = given.pop("name", None)
+        if not is_name(name):
+            raise ConfigError(f"{where}={as_json(choice)}: must be the name of a learner, or its name and settings")
+        for word, instead in _NOT_PER_OPTION.items():
+            if word in given:
+                raise ConfigError(f"{where}.{word}: {instead}")
+        try:
+            cfg = compose([choosing("env", env), choosing("low", name)])
+        except ConfigError as error:
+            raise ConfigError(f"{where}={name}: there is no {file_of('low', name)}") from error
+        learners[option] = name, {**plain_groups(cfg, run.model_dump(), ["low"])["low"], **given}
+    return learners
+
+
+def compose(overrides: list[str]) -> DictConfig:
+    """Return the config of these words, in the folders that the running job searches for yaml files.
+
+    Raises:
+        MissingChoiceError: a word chooses a yaml file that is in none of these folders.
+    """
+    if HydraConfig.initialized():
+        given = HydraConfig.get().overrides.hydra
+        overrides = [*(word for word in given if word.startswith("hydra.searchpath=")), *overrides]
+    try:
+        if GlobalHydra.instance().is_initialized():
+            return hydra.compose("config", overrides)
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+            return hydra.compose("config", overrides)
+    except hydra.errors.MissingConfigException as error:
+        raise MissingChoiceError(str(error.missing_cfg_file), error.options or ()) from error
+
+
+def compose_words(words: list[str]) -> DictConfig:
+    """Return the config of a command line's words, with its `hydra` part, outside of Hydra's own command line.
+
+    Raises:
+        ConfigError: the words cannot be composed.
+    """
+    folder = str(conf_dir())
+    try:
+        with hydra.initialize_config_dir(folder, version_base="1.3"):
+            cfg = hydra.compose("config", words, return_hydra_config=True)
+            HydraConfig.instance().set_config(cfg)  # as for a job; `compose` takes the searched folders from it
+            return cfg
+    except (hydra.errors.HydraException, OmegaConfBaseException, OSError, ValueError) as error:
+        raise ConfigError(beginning_of(words) + first_line(error)) from error
+    except RecursionError as error:
+        raise ConfigError(beginning_of(words) + NESTED) from error
+
+
+def beginning_of(words: Sequence[str]) -> str:
+    """Return the words of a command line, or as much of them as fits before an error."""
+    return f"{' '.join(words)[:_SHOWN]}: "
+
+
+def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
+    """Return the name that was chosen for each group, from the config's `hydra` part or else from the running job."""
+    node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
+    return node.runtime.choices
+
+
+def job_overrides() -> list[str]:
+    """Return the words of the running job's command line, as they were written."""
+    return _words_of(HydraConfig.get())
+
+
+def _words_of(node: Any) -> list[str]:
+    words = OmegaConf.to_container(node.overrides.task, resolve=False)
+    assert isinstance(words, list)
+    return [str(word) for word in words]
+
+
+def names_of(group: str) -> tuple[str, ...]:
+    """Return the names of a group's yaml files in all folders that are searched."""
+    try:
+        compose([f"+{group}@__none__=__none__"])  # added to the group's own choice, which may be optional
+    except MissingChoiceError as error:  # Hydra lists the names only here.
+        return error.known
+    return ()
+
+
+def plain_groups(cfg: DictConfig, run: Mapping[str, Any], groups: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return these groups of a composed config as plain values.
+
+    Settings that refer to a number of the run, such as `${total_frames}`, get it from `run`. Text of `run` is not used.
+    """
+    cfg = cfg.copy()
+    for name in RunConfig.model_fields:
+        if name in cfg and isinstance(run.get(name), int | float):
+            cfg[name] = run[name]
+    return {group: plain(cfg[group], group) for group in groups}
+
+
+def plain(node: Any, where: str = "the config") -> dict[str, Any]:
+    """Resolve a part of the config into plain Python values."""
+    if not isinstance(node, Mapping | DictConfig):
+        raise ConfigError(f"{where}={as_json(node)}: must be a mapping")
+    if not isinstance(node, DictConfig):
+        return dict(node)
+    try:
+        container = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"{error.full_key or where}: {first_line(error)}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{where}: a value refers to itself, or nests too deep") from error
+    assert isinstance(container, dict)
+    return {str(name): value for name, value in container.items()}
+
+
+def is_name(name: object) -> TypeGuard[str]:
+    """Return whether this can be the name of a group's yaml file: words and slashes, but no way out of the folder."""
+    if not isinstance(name, str) or len(name) > _LONGEST_NAME:
+        return False
+    return re.fullmatch(r"\w[\w.+-]*(/\w[\w.+-]*)*", name) is not None
+
+
+def choosing(group: str, name: str) -> str:
+    """Return the word that chooses a yaml file for a group; in quotes even `null` and `3` are names."""
+    return f"{group}='{name}'"

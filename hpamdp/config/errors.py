@@ -1,0 +1,149 @@
+"""The wording of a user's mistakes: one line that names what was given, what is allowed and where it was set."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from hpamdp.config.renamed import renamed
+
+_MOST_COMPLAINTS = 3
+_LONGEST_VALUE = 300  # letters of a value in a message
+# Larger numbers leave the range that a computation can hold; infinity is refused as well.
+_LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+class ConfigError(ValueError):
+    """A user's mistake; the message is one line."""
+
+
+class MissingChoiceError(ConfigError):
+    """A choice whose yaml file is in none of the searched folders.
+
+    Attributes:
+        known: the names that exist in the group.
+    """
+
+    def __init__(self, choice: str, known: Iterable[str]) -> None:
+        super().__init__(f"the saved run chose {choice}, which is not there; is a --config-dir missing?")
+        self.known = tuple(known)
+
+
+def as_json(value: object) -> str:
+    """Return a value as JSON, for a message; a long one is cut short."""
+    text = json.dumps(value, default=str)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
+
+
+def no_such(what: str, name: str, known: Iterable[str]) -> str:
+    """Return that there is no such thing, the likely spelling first, then all that there is."""
+    known = sorted(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    guess = f"did you mean {close[0]}? It" if close else "it"
+    return f"no such {what}; {guess} has {', '.join(known) or 'none'}"
+
+
+def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: str, where: str) -> ModelT:
+    """Return the values as the model.
+
+    Args:
+        model: the pydantic model.
+        values: plain values by name.
+        prefix: what stands before a name on the command line, such as `low.`.
+        what: the values are, such as `setting of HPPO`.
+        where: they are set.
+
+    Raises:
+        ConfigError: all that is wrong with the values, in one line.
+    """
+    try:
+        # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
+        checked = model.model_validate_json(json.dumps(values, default=str))
+    except ValidationError as error:
+        raise ConfigError(_in_one_line(error, model, values, prefix, what, where)) from error
+    _refuse_huge(model, values, prefix, where)
+    return checked
+
+
+def _in_one_line(
+    error: ValidationError, model: type[BaseModel], values: dict[str, Any], prefix: str, what: str, where: str
+) -> str:
+    unknown: list[str] = []
+    wrong: dict[str, dict[str, None]] = {}
+    for problem in error.errors(include_url=False):
+        path, value = _locate(problem["loc"], values)
+        key = prefix + ".".join(path)
+        if problem["type"] == "extra_forbidden":
+            known = _fields(model, path[:-1])
+            unknown.append(f"{key}: {renamed(key, known) or no_such(what, path[-1], known)}")
+        elif problem["type"] == "missing":
+            wrong[key] = {"missing": None}
+        elif not path:  # a check of several fields, whose message names them
+            wrong[prefix.replace(".", ": ") + _reworded(problem["msg"], value)] = {"": None}
+        else:
+            # A union complains once for each of its types.
+            wrong.setdefault(f"{key}={as_json(value)}", {})[_reworded(problem["msg"], value)] = None
+    complaints = [
+        f"{key}: {' or '.join(messages)} ({where})" if any(messages) else f"{key} ({where})"
+        for key, messages in wrong.items()
+    ]
+    return "; ".join([*_shortened(unknown), *complaints])
+
+
+def _reworded(message: str, value: Any) -> str:
+    """Return pydantic's message in the words of a yaml file."""
+    message = message.removeprefix("Value error, ").replace("valid array", "list").replace("valid tuple", "list")
+    message = message.replace("an object", "a mapping").replace(" or None", " or null")
+    length = len(value) if isinstance(value, list) else None
+    message = message.removesuffix(f" after validation, not {length}")
+    return re.sub("^(Input|String|List|Tuple) should", "must", message)
+
+
+def _shortened(complaints: list[str]) -> list[str]:
+    """Return the first complaints, and how many more there are: the settings of another class may all be wrong."""
+    num_more = len(complaints) - _MOST_COMPLAINTS
+    return complaints if num_more <= 0 else [*complaints[:_MOST_COMPLAINTS], f"and {num_more} more like this"]
+
+
+def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: str) -> None:
+    """Refuse numbers that no computation can hold, in a model's own fields and in lists there."""
+    for name in model.model_fields:
+        value = values.get(name)
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, bool) or not isinstance(number, int | float):
+                continue
+            largest = _LARGEST_INT if isinstance(number, int) else _LARGEST_FLOAT
+            if abs(number) > largest:
+                raise ConfigError(
+                    f"{prefix}{name}={as_json(value)}: must lie between -{largest} and {largest} ({where})"
+                )
+
+
+def _locate(location: tuple[int | str, ...], values: dict[str, Any]) -> tuple[list[str], Any]:
+    """Return the keys that lead to a problem, and the value there."""
+    path: list[str] = []
+    value: Any = values
+    for part in location:
+        # The other parts name the type of a union that was tried.
+        if isinstance(value, dict):
+            path.append(str(part))
+            value = value.get(part)
+        elif isinstance(value, list) and isinstance(part, int):
+            path.append(str(part))
+            value = value[part]
+    return path, value
+
+
+def _fields(model: type[BaseModel], path: list[str]) -> Iterable[str]:
+    for name in path:
+        inner = model.model_fields[name].annotation
+        assert isinstance(inner, type)
+        model = inner
+    return model.model_fields

@@ -1,0 +1,101 @@
+"""The page of `--help`, made of the yaml files and the settings models."""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from hpamdp.config.command_line import CommandLine, choices_in
+from hpamdp.config.components import GROUPS, component
+from hpamdp.config.compose import compose_words, plain
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import RunConfig
+from hpamdp.config.stand_ins import quick_imports
+from hpamdp.shell import program
+
+_WIDTH = 110  # letters of a line
+_PAGE = """\
+hpamdp trains and scores two-level agents on parameterised-action MDPs: a selector (high) chooses an option; a learner
+(low) chooses a discrete action and its parameters at every step.
+
+Usage: {program} [GROUP=CHOICE ...] [GROUP.SETTING=VALUE ...] [VALUE=... ...] [--multirun]
+
+Groups and their choices
+{groups}
+
+{chosen}Values of the run, with their defaults
+{values}
+
+Examples
+  {program} low=pdqn --help
+      explains the settings of a choice, too
+  {program} high=ucb low=hyar
+      trains; the results go to a folder of their own in outputs/
+  {program} mode=eval checkpoint=outputs/2025-01-31/12-00-00 eval.layouts=5000
+      scores the agent of an earlier run
+  {program} --multirun high=ucb,uniform seed=0,1,2 eval.every=50000
+      six runs one after another, in multirun/; with hydra.sweep.dir=FOLDER a second start does what is left
+  {program} --multirun high=ucb,uniform seed=0,1,2 hydra/launcher=joblib hydra.launcher.n_jobs=2
+      the same, two at a time; needs hpamdp[joblib]
+
+  {program} play
+      lets you play the problem yourself; see {program} play --help
+  {program} watch FOLDER
+      films the agent of a run; see {program} watch --help
+  {program} low=hyar --cfg job
+      shows every value and setting without running
+  {program} --hydra-help
+      shows Hydra's own flags
+"""
+
+
+def help_page(line: CommandLine, conf: Path) -> str:
+    """Return the text of `--help`; it explains the settings of every choice that the command line names.
+
+    Raises:
+        ConfigError: the command line cannot be composed.
+    """
+    folders = {folder.name: choices_in(folder) for folder in sorted(conf.iterdir()) if folder.is_dir()}
+    groups = [
+        textwrap.fill(f"{name:<12}{', '.join(choices)}", _WIDTH, initial_indent="  ", subsequent_indent=" " * 14)
+        for name, choices in folders.items()
+    ]
+    return _PAGE.format(
+        program=program(),
+        groups="\n".join(groups),
+        chosen="".join(_explained_choice(line, group) for group in line.given() if group in GROUPS),
+        values="\n".join(_explained(RunConfig, "", {})),
+    )
+
+
+def _explained_choice(line: CommandLine, group: str) -> str:
+    cfg = compose_words([word for word in line.words if not word.startswith("hydra.")])
+    name = str(cfg.hydra.runtime.choices[group])
+    try:
+        with quick_imports():
+            chosen = component(group, name, plain(cfg[group], group))
+    except ConfigError:
+        return ""
+    if chosen.options is None:
+        return f"{group}={name} has the settings {', '.join(chosen.settings) or 'of its class alone: none'}\n\n"
+    lines = _explained(type(chosen.options), f"{group}.", dict(chosen.settings))
+    return "\n".join([f"Settings of {group}={name}", *lines, "", ""])
+
+
+def _explained(model: type[BaseModel], prefix: str, values: dict[str, Any]) -> Iterator[str]:
+    """Yield a line with each setting and its value, and its meaning below."""
+    for name, field in model.model_fields.items():
+        default = values.get(name, field.default)
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _explained(field.annotation, f"{prefix}{name}.", {})
+            continue
+        shown = "" if default is PydanticUndefined else json.dumps(default, default=str)
+        yield f"  {prefix}{name}={shown}"
+        meaning = " ".join((field.description or "").split())
+        yield textwrap.fill(meaning, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)

@@ -1,0 +1,122 @@
+"""What Hydra says of a wrong command line or yaml file, in one line."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra
+import yaml
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from hpamdp.config.command_line import GRAMMAR, CommandLine, as_text, choices_in, written_out
+from hpamdp.config.components import GROUPS, TARGET, file_of
+from hpamdp.config.compose import NESTED, beginning_of
+from hpamdp.config.errors import no_such
+from hpamdp.config.renamed import renamed
+from hpamdp.config.schema import RUN_FILE
+from hpamdp.messages import file_and_reason, first_line
+
+# Launchers and sweepers of packages of their own, and the extra of pyproject.toml that brings each.
+_EXTRAS = {
+    "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
+    "hydra/sweeper": {"optuna": "optuna"},
+}
+
+
+def explained(error: Exception, line: CommandLine, conf: Path) -> str:
+    """Return in one line what is wrong with the command line or the yaml files, given what Hydra says."""
+    if isinstance(error, OverrideParseException):
+        return not_understood(error.override)
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        return _missing_choice(error.missing_cfg_file, error.options, conf)
+    if not isinstance(error, HydraException | OmegaConfBaseException):
+        return _first_lines(error, line.words)
+    for override in line.overrides:
+        if override.is_sweep_override() and not line.is_multirun:
+            several = f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
+            return f"{several}; for one text write {as_text(override.input_line or '')}"
+    return _wrong_key(line.overrides, conf) or _first_lines(error, line.words)
+
+
+def not_understood(word: str) -> str:
+    """Return that a word is not in Hydra's grammar, and how to write it if its value is a text."""
+    if re.match(r"[+~]*[A-Za-z_@][\w.@/]*=.", word):
+        return f"{word}: {GRAMMAR}, and a text with special characters as {as_text(word)}"
+    return f"{word}: {GRAMMAR}"
+
+
+def _missing_choice(file: str, there: Sequence[str], conf: Path) -> str:
+    group, _, name = file.rpartition("/")
+    if group in _EXTRAS:
+        if name in _EXTRAS[group]:
+            return f"{group}={name}: not installed; pip install 'hpamdp[{_EXTRAS[group][name]}]'"
+        return f"{group}={name}: no such choice; there is {', '.join(sorted({*there, *_EXTRAS[group]}))}"
+    if not group.startswith("hydra"):  # a folder of a group may be part of the choice
+        group, _, name = file.partition("/")
+    return f"{group}={name}: no such choice; conf/{group} has {', '.join(sorted({*there, *choices_in(conf / group)}))}"
+
+
+def _first_lines(error: Exception, words: Sequence[str]) -> str:
+    """Return in one line the place of an error in a yaml file, or the messages of an error and its cause."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
+    if isinstance(error, UnicodeDecodeError):  # which does not name the file
+        return f"a yaml file that was chosen is not written in UTF-8 ({error})"
+    if isinstance(error, OSError):
+        return file_and_reason(error)
+    if isinstance(error, RecursionError | ValueError) and not isinstance(error, OmegaConfBaseException):
+        return beginning_of(words) + (NESTED if isinstance(error, RecursionError) else first_line(error))
+    causes = [error] if error.__cause__ is None else [error, error.__cause__]
+    lines = [first_line(cause).rstrip(".") for cause in causes]
+    if lines[0].endswith(":"):
+        lines[:1] = [lines[0].rstrip(":"), first_line(str(error).partition("\n")[2])]
+    return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
+
+
+def _wrong_key(overrides: Sequence[Override], conf: Path) -> str | None:
+    """Return what is wrong with the first override whose key is not in the config, if there is one."""
+    groups = [o for o in overrides if "/" in o.key_or_group or os.path.isdir(conf / o.key_or_group)]
+    others = [o for o in overrides if o not in groups and not o.is_add() and not o.is_force_add()]
+    for choices in itertools.product(*map(written_out, groups)):
+        try:
+            with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+                cfg = hydra.compose("config", list(choices), return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            return None
+        for override in others:
+            wrong = _missing_key(cfg, override.key_or_group, conf)
+            if wrong is not None:
+                return wrong
+    return None
+
+
+def _missing_key(cfg: DictConfig, key: str, conf: Path) -> str | None:
+    """Return what is wrong with a dotted key that is not in the config; None if it is there."""
+    node: Any = OmegaConf.to_container(cfg)
+    names = key.split(".")
+    for depth, name in enumerate(names):
+        if not isinstance(node, dict):
+            return None
+        if name not in node:
+            known = [each for each in node if each not in (TARGET, "budget")]
+            return f"{key}: {renamed(key, known) or _no_such_key(cfg, names[:depth], name, known, conf)}"
+        node = node[name]
+    return None
+
+
+def _no_such_key(cfg: DictConfig, path: list[str], name: str, known: list[str], conf: Path) -> str:
+    if not path:
+        folders = {folder.name for folder in conf.iterdir() if folder.is_dir()}
+        return no_such(f"group or value of the run ({RUN_FILE})", name, {*known, *folders} - {"hydra"})
+    if len(path) == 1 and path[0] in GROUPS:
+        cls = str(OmegaConf.to_container(cfg[path[0]]).get(TARGET) or "none").rpartition(".")[2]  # type: ignore[union-attr]
+        return no_such(f"setting of {cls} ({file_of(path[0], cfg.hydra.runtime.choices[path[0]])})", name, known)
+    return no_such(f"value of {'.'.join(path)}", name, known)

@@ -1,0 +1,62 @@
+"""Settings that had other names in earlier versions: refused with the new name, and read from saved runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+# Old names of settings and the new ones. A dotted name is the setting of a group, a plain one that of any group.
+_NEW_NAMES = {
+    "agent.uniform_option_frames": "uniform_option_steps",
+    "env.options": "grouping",
+    "warmup_frames": "warmup_steps",
+    "updates_per_frame": "updates_per_step",
+    "epsilon_frames": "epsilon_steps",
+    "lr_frames": "lr_steps",
+    "anneal_frames": "anneal_steps",
+    "twin_q": "twin",
+    "rl": "twin",
+    "target_noise": "target_smoothing",
+    "target_noise_clip": "target_smoothing_clip",
+    "exploration_noise": "parameter_noise",
+}
+# Old values whose meaning changed with the name.
+_NEW_VALUES: dict[tuple[str, Any], Any] = {("rl", "td3"): True, ("rl", "ddpg"): False}
+
+
+def renamed(key: str, known: Iterable[str]) -> str | None:
+    """Return in words the new name of a setting, if it was renamed and `known` has the new one.
+
+    Args:
+        key: as on the command line, such as `low.warmup_frames`.
+        known: the names of the settings beside it.
+    """
+    new = _NEW_NAMES.get(key) or _NEW_NAMES.get(key.rpartition(".")[2])
+    if new is None or new not in known:
+        return None
+    values = [
+        f"{old}={value} is {new}={str(now).lower()}"
+        for (old, value), now in _NEW_VALUES.items()
+        if key.endswith(f".{old}")
+    ]
+    meaning = f" ({', '.join(values)})" if values else ""
+    return f"is called {key.rpartition('.')[0]}.{new} now{meaning}"
+
+
+def with_new_names(group: str, settings: Mapping[str, Any], known: Iterable[str]) -> dict[str, Any]:
+    """Return the settings of a saved run under today's names.
+
+    Args:
+        group: such as `low`.
+        settings: by their names at the time.
+        known: today's names of the group's settings.
+    """
+    known = set(known)
+    values: dict[str, Any] = {}
+    for name, value in settings.items():
+        new = _NEW_NAMES.get(f"{group}.{name}") or _NEW_NAMES.get(name)
+        is_renamed = new is not None and name not in known and new in known and new not in settings
+        if is_renamed and isinstance(value, str | bool):
+            value = _NEW_VALUES.get((name, value), value)
+        values[new if is_renamed and new is not None else name] = value
+    return values

@@ -1,0 +1,263 @@
+"""The values of a run, and the config of a run as one checked object."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import yaml
+from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
+
+from hpamdp.config.components import GROUPS, TARGET, Component, check_kind, component, file_of
+from hpamdp.config.errors import ConfigError, as_json, validated
+from hpamdp.settings import Settings
+
+if TYPE_CHECKING:
+    import torch  # takes seconds
+
+RUN_FILE = "conf/config.yaml"
+# The value of `resume` that continues the run in its own folder, or starts it there.
+RESUME_AUTO = "auto"
+
+Seed = Annotated[int, Field(ge=0, lt=2**32)]  # NumPy takes no larger ones
+
+
+def _check_device(name: str) -> str:
+    if not re.fullmatch(r"auto|cpu|cuda(:\d{1,2})?", name):
+        raise ValueError("must be auto, cpu, cuda or cuda:N")
+    return name
+
+
+class AgentConfig(Settings):
+    """How the two levels are put together."""
+
+    sharing: Literal["per_option", "shared"] = "per_option"
+    """`per_option`: one learner for each option. `shared`: one learner for all options, which observes the option."""
+    termination: Literal["episode", "steps", "learned"] = "episode"
+    """Where options end: with the episode, after `option_length` steps, or where the selector decides, at any step."""
+    option_length: PositiveInt | None = None
+    """Steps of an option, with `termination=steps` only."""
+    uniform_option_steps: NonNegativeInt = 0
+    """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
+
+    Otherwise a selector may settle early on the option whose learner improves first.
+    """
+
+
+class EnvConfig(Settings):
+    """What can be made of any problem."""
+
+    grouping: Literal["default"] | dict[str, list[int | str]] | None = None
+    """Options made of the discrete actions: `{NAME: [ACTION, ...], ...}`, or `default` for the problem's suggestion."""
+
+
+class StartConfig(Settings):
+    """The learners that a run starts with, and which of them are of another class than `low`."""
+
+    checkpoint: str | None = None
+    """An earlier run whose learners' networks this run starts with: its output folder, or the checkpoint in it."""
+    freeze: bool = False
+    """Keep the learners as they are and train only the selector; frames are then counted in decisions."""
+    per_option: dict[str, str | dict[str, Any]] | None = None
+    """Learners of single options: `{OPTION: LEARNER}`, or `{OPTION: {name: LEARNER, SETTING: VALUE, ...}}`."""
+
+
+class BudgetConfig(Settings):
+    """What a learner's yaml recommends; the values of a run take what is there."""
+
+    num_envs: PositiveInt | None = None
+    steps_per_batch: PositiveInt | None = None
+    total_frames: PositiveInt | None = None
+    eval_every: NonNegativeInt | None = None
+
+
+class OfflineConfig(Settings):
+    """How much is learned from a data set alone."""
+
+    updates: PositiveInt = 5000
+    """Updates of each learner, and of a selector that learns by updates, with `mode=offline`."""
+    eval_every: NonNegativeInt = 500
+    """Updates between two evaluations; 0: only at the start and at the end."""
+
+
+class EvalConfig(Settings):
+    """How agents are scored."""
+
+    every: NonNegativeInt
+    """Steps between two evaluations; 0: only at the start and at the end. By default the learner's recommendation."""
+    layouts: PositiveInt = 1000
+    """Episodes to score the agent on, greedily; the same ones at every evaluation."""
+    seed: Seed = 0
+    """Seed of these episodes."""
+    stop_score: float | None = None
+    """End training at the first evaluation that reaches this score; null: train to the end."""
+
+
+class RunConfig(Settings):
+    """The run's own values."""
+
+    mode: Literal["train", "offline", "eval"] = "train"
+    """`train`: learn from the agent's own steps. `offline`: from a data set alone. `eval`: only score a checkpoint."""
+    seed: Seed = 0
+    """Seed of everything random in training: episodes, exploration, initial weights."""
+    device: Annotated[str, AfterValidator(_check_device)] = "auto"
+    """`auto` (CUDA if there is a device, else the CPU), `cpu`, `cuda` or `cuda:N`."""
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    """CPU threads of the learner. Small networks train fastest with one."""
+    compile_updates: bool | Literal["auto"] = "auto"
+    """Compile the learners' updates by `torch.compile`; `auto`: if there is a compiler and the run is long enough."""
+    update_precision: Literal["float32", "bfloat16"] = "float32"
+    """Precision of the matrix products in updates. bfloat16 is faster only with hardware support and large networks."""
+    agent: AgentConfig = AgentConfig()
+    env: EnvConfig = EnvConfig()
+    low: StartConfig = StartConfig()
+    total_frames: PositiveInt
+    """Steps to train for, over all environments. By default the learner's recommendation."""
+    num_envs: PositiveInt
+    """Environments that run in parallel. By default the learner's recommendation."""
+    steps_per_batch: PositiveInt
+    """Steps of each environment in a batch, after which the agent learns. By default the learner's recommendation."""
+    log_every: NonNegativeInt = 5000
+    """Steps between two rows of metrics.csv; 0: only with an evaluation."""
+    offline: OfflineConfig = OfflineConfig()
+    eval: EvalConfig
+    checkpoint_every: NonNegativeInt = 0
+    """Steps between two checkpoints; 0: none by steps."""
+    checkpoint_minutes: Annotated[float, Field(ge=0.0)] = 5.0
+    """Minutes between two checkpoints; 0: none by time. A killed run loses no more than that."""
+    checkpoint_replay: bool = True
+    """Save the replay buffers in checkpoints. A learner that is resumed without them begins with empty ones."""
+    checkpoint: str | None = None
+    """The agent to score with `mode=eval`: the output folder of a run, or the checkpoint in it."""
+    resume: str | None = None
+    """The run to continue: its output folder, or the checkpoint in it.
+
+    `auto` continues the run in `hydra.run.dir` if it is this very run, or starts a new run if the folder holds none.
+    """
+    trust: bool = False
+    """Let the file of `resume` or `checkpoint` give settings that can run code, read files or reach servers.
+
+    If false, such settings (`env.entry_point`, for example) must be on the command line, too.
+    """
+    overwrite: bool = False
+    """Delete another run in the output folder as a whole, right before this one writes its first file."""
+    film: bool = True
+    """Leave episodes.gif in the folder, in which the agent plays three episodes of its last evaluation."""
+
+    @property
+    def num_frames(self) -> int:
+        """Length of the training: in updates with mode=offline, else in steps or decisions."""
+        return self.offline.updates if self.mode == "offline" else self.total_frames
+
+    @property
+    def eval_every(self) -> int:
+        """Distance between two evaluations, in the same unit; 0: only at the start and at the end."""
+        return self.offline.eval_every if self.mode == "offline" else self.eval.every
+
+    def resolve_device(self) -> torch.device:
+        """Return the device to run on.
+
+        Raises:
+            ConfigError: this machine does not have it.
+        """
+        import torch
+
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        if self.device == "auto":
+            return torch.device("cuda" if count else "cpu")
+        device = torch.device(self.device)
+        if device.type == "cuda" and (device.index or 0) >= count:
+            there = f"has CUDA devices 0 to {count - 1}" if count else "has no usable CUDA device"
+            raise ConfigError(f"device={self.device}: this machine {there}; use device=auto or device=cpu")
+        return device
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that was set for a run, checked."""
+
+    run: RunConfig
+    env: Component
+    high: Component
+    low: Component
+    data: Component
+    logger: Component
+    collector: Component
+    low_of: Mapping[str, Component] = field(default_factory=dict)
+
+    @property
+    def learners(self) -> list[Component]:
+        """The learner that was chosen and those of single options."""
+        return [self.low, *self.low_of.values()]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the config as plain values: what a run saves and is resumed from.
+
+        A value has its name on the command line, such as `low` / `lr`. `choices` has the name that was chosen for each
+        group, so that a class may have a setting of any name.
+        """
+        values = self.run.model_dump(mode="json", exclude={"trust"})
+        values["choices"] = {group: getattr(self, group).name for group in GROUPS}
+        for group in GROUPS:
+            part: Component = getattr(self, group)
+            settings = json.loads(json.dumps(dict(part.settings)))  # tuples become lists
+            values[group] = {**settings, **values.get(group, {})}
+        return values
+
+    def to_yaml(self) -> str:
+        """Return `to_dict` as yaml; a reader must not resolve text that looks like an interpolation."""
+        return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
+
+
+def check_run(given: Mapping[str, Any], names: Mapping[str, str]) -> RunConfig:
+    """Check the values of the run.
+
+    Args:
+        given: its values; of the groups `env` and `low`, too.
+        names: the name that was chosen for each group.
+
+    Raises:
+        ConfigError: a wrong value.
+    """
+    values = {name: value for name, value in given.items() if name not in GROUPS}
+    own: dict[str, type[Settings]] = {"env": EnvConfig, "low": StartConfig}
+    for group, entries in own.items():
+        values[group] = {name: given[group][name] for name in entries.model_fields if name in given[group]}
+    run = validated(RunConfig, values, "", f"value of the run ({RUN_FILE})", RUN_FILE)
+    if "budget" in given["low"]:
+        file, budget = file_of("low", names["low"]), given["low"]["budget"]
+        if not isinstance(budget, dict):
+            raise ConfigError(f"low.budget={as_json(budget)}: must be a mapping ({file})")
+        validated(BudgetConfig, budget, "low.budget.", f"value of low.budget ({file})", file)
+    return run
+
+
+def checked_config(
+    run: RunConfig, given: Mapping[str, Any], names: Mapping[str, str], learners: Mapping[str, tuple[str, Any]]
+) -> Config:
+    """Check the classes and the settings of all groups.
+
+    Args:
+        run: the checked values of the run.
+        given: for each group a mapping of `_target_` and the settings, plain values in which no text is resolved.
+        names: the name that was chosen for each group.
+        learners: of single options, by the option's name: the learner's name, and a mapping as for a group.
+
+    Raises:
+        ConfigError: a wrong value.
+    """
+    for group in GROUPS:
+        check_kind(group, names[group], given[group].get(TARGET))
+    components = {group: component(group, names[group], given[group]) for group in GROUPS}
+    low_of = {}
+    for option, (name, low) in learners.items():
+        check_kind("low", name, low.get(TARGET))
+        low_of[option] = component("low", name, low)
+    if low_of:
+        # With all their settings, so that a saved run keeps them if their yaml files change.
+        in_full = {option: {**low.settings, "name": low.name} for option, low in low_of.items()}
+        run = run.model_copy(update={"low": run.low.model_copy(update={"per_option": in_full})})
+    return Config(run, **components, low_of=low_of)

@@ -1,0 +1,102 @@
+"""What happens to yaml files when Hydra reads them: they are checked, and completed by their classes' settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from hydra.core.plugins import Plugins
+from hydra.plugins.config_source import ConfigResult, ConfigSource
+from omegaconf import DictConfig, Node, OmegaConf
+
+from hpamdp.config.components import GROUPS, TARGET, defaults_of, load_class, options_model
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import RunConfig
+from hpamdp.config.stand_ins import quick_imports
+
+_MOST_VALUES, _MOST_LEVELS = 100_000, 50
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def complete_yaml_files() -> None:
+    """Have Hydra's reader refuse files that would fill the memory, and add the defaults of missing settings.
+
+    So the composed config has all settings: the command line can override them, `--cfg job` shows them, and other yaml
+    files can refer to them.
+    """
+    readers: list[Any] = [each for each in Plugins.instance().discover(ConfigSource) if each.scheme() == "file"]  # type: ignore[attr-defined]
+    for reader in readers:
+        if not hasattr(reader, "load_alone"):
+            reader.load_alone = reader.load_config
+            reader.load_config = _load_complete
+
+
+def _load_complete(reader: Any, config_path: str) -> ConfigResult:
+    """Read a yaml file; takes the place of the method `load_config` of Hydra's reader."""
+    check_size(Path(reader.path, reader._normalize_file_name(config_path)))
+    result: ConfigResult = reader.load_alone(config_path)
+    if isinstance(result.config, DictConfig):
+        result.config = OmegaConf.merge(_defaults(config_path, result.config), result.config)
+    return result
+
+
+def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
+    """Return the defaults of the settings that a yaml file can have: those of its class, or of the run."""
+    if config_path.removesuffix(".yaml") == "config":
+        return defaults_of(RunConfig)
+    group = config_path.partition("/")[0]
+    target = cfg._get_node(TARGET) if group in GROUPS else None  # as it is written, not resolved
+    if not isinstance(target, Node) or not isinstance(target._value(), str):
+        return {}
+    try:
+        with quick_imports():
+            return defaults_of(options_model(load_class(target._value()), GROUPS[group]))
+    except ConfigError:  # which the check of the config raises again, with the name of the file
+        return {}
+
+
+def check_size(file: Path) -> None:
+    """Refuse a file that a few aliases make huge, or that nests too deep. Aliases are counted, not expanded.
+
+    Raises:
+        ConfigError: the message names the file.
+    """
+    try:
+        with file.open("rb") as stream:
+            for count, levels in _counted(stream):
+                if count > _MOST_VALUES:
+                    raise ConfigError(f"{file}: has more than {_MOST_VALUES:,} values")
+                if levels > _MOST_LEVELS:
+                    raise ConfigError(f"{file}: nests more than {_MOST_LEVELS} levels deep")
+    except KeyError as error:
+        raise ConfigError(f"{file}: *{error.args[0]} refers to nothing, or to a value that contains it") from error
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return  # Hydra reports these errors with the line
+
+
+def _counted(stream: Any) -> Iterator[tuple[int, int]]:
+    """Yield the numbers of values so far and of open levels after each event of a yaml file.
+
+    Raises:
+        KeyError: an alias refers to nothing, or to a value that contains it.
+    """
+    sizes: dict[str, int] = {}  # number of values under each anchor
+    opened: list[tuple[str | None, int]] = []  # each open list's or mapping's anchor, and the values before it
+    count = 0
+    for event in yaml.parse(stream, Loader=_LOADER):
+        if isinstance(event, yaml.AliasEvent):
+            count += sizes[str(event.anchor)]
+        elif isinstance(event, yaml.CollectionStartEvent):
+            opened.append((event.anchor, count))
+            count += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = opened.pop()
+            if anchor is not None:
+                sizes[anchor] = count - before
+        elif isinstance(event, yaml.ScalarEvent):
+            count += 1
+            if event.anchor is not None:
+                sizes[event.anchor] = 1
+        yield count, len(opened)

@@ -1,0 +1,144 @@
+"""Refuse runs that memory is too small for, or whose budget is too small for a first update."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import torch
+
+from hpamdp.config.components import Component
+from hpamdp.config.errors import ConfigError, as_json
+from hpamdp.config.schema import Config, RunConfig
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.memory import in_gigabytes, is_about_memory, total_memory
+from hpamdp.messages import first_line
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Learner
+from hpamdp.specs import PAMDPSpecs
+
+# Fewer steps or episodes than this need no estimate of their memory, for which an environment is built.
+_MANY = 1_000_000
+# A weight is there four times: itself, its gradient and two moments of Adam.
+_BYTES_A_WEIGHT = 16
+
+
+def check_run(run: RunConfig, device: torch.device, build_one: Callable[[], PAMDPEnv]) -> None:
+    """Refuse more environments, steps or episodes than there is memory for, before any of them is built.
+
+    The estimate counts the tensors of a step and the paths that an evaluation records.
+
+    Args:
+        run: its values.
+        device: of the tensors.
+        build_one: builds a single environment; called only if the numbers are large.
+
+    Raises:
+        ConfigError: with the bytes that are surely needed.
+    """
+    num_steps = 0 if run.mode != "train" else run.num_envs * run.steps_per_batch
+    if max(run.num_envs, num_steps, run.eval.layouts) < _MANY:
+        return
+    one = build_one()
+    step = one.fake_tensordict().bytes()
+    path = 0 if one.position is None else 8 * one.max_steps
+    one.close()
+    needs = {
+        f"num_envs={run.num_envs}": run.num_envs * step,
+        f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}": num_steps * step,
+        f"eval.layouts={run.eval.layouts}": run.eval.layouts * (step + path),
+    }
+    _check_memory(needs, device)
+
+
+def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component], device: torch.device) -> None:
+    """Refuse replay buffers, batches and layers that there is no memory for, before any of them is built.
+
+    They are known by the names of their settings: `buffer_size`, `batch_size`, `minibatch_size` and those that end in
+    `hidden_dims`.
+
+    Args:
+        config: of the run.
+        specs: of its problem.
+        learners: the component of each learner.
+        device: of the tensors.
+
+    Raises:
+        ConfigError: with the bytes that are surely needed.
+    """
+    # Two observations, the action, reward and flags.
+    row = 4 * (2 * specs.observation_dim + specs.num_parameters + 2)
+    needs = {}
+    for component, num in ((config.high, 1), *((low, learners.count(low)) for low in learners)):
+        for name, value in component.settings.items():
+            setting = f"{component.group}.{name}={as_json(value)}"
+            if name == "buffer_size":
+                needs[setting] = num * value * row
+            elif name in ("batch_size", "minibatch_size"):
+                needs[setting] = value * row
+            elif name.endswith("hidden_dims"):
+                sizes = [specs.observation_dim, *value]
+                weights = sum(a * b for a, b in zip(sizes, value, strict=False))
+                needs[setting] = num * weights * _BYTES_A_WEIGHT
+    _check_memory(needs, device)
+
+
+def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
+    """Refuse settings that together need more bytes than there are; the error names the one that needs most."""
+    if not needs:
+        return
+    available = total_memory(device)
+    setting = max(needs, key=needs.__getitem__)
+    if sum(needs.values()) > available:
+        raise ConfigError(
+            f"{setting}: the run takes at least {in_gigabytes(sum(needs.values()))} of memory, and there are "
+            f"{in_gigabytes(available)}"
+        )
+
+
+@contextmanager
+def memory_errors_explained(config: Config) -> Iterator[None]:
+    """Turn the errors of what does not fit into memory into one line that names the largest sizes.
+
+    Raises:
+        ConfigError: there was such an error.
+    """
+    try:
+        yield
+    except Exception as error:
+        if isinstance(error, ConfigError) or not is_about_memory(error):
+            raise
+        run = config.run
+        sizes = f"num_envs={run.num_envs}, steps_per_batch={run.steps_per_batch}, eval.layouts={run.eval.layouts}"
+        parts = f"{sizes}, {config.low.largest_sizes()}, {config.high.largest_sizes()}"
+        raise ConfigError(f"{parts}: the run takes more memory than there is ({first_line(error):.160})") from error
+
+
+def check_length(config: Config, agent: HierarchicalAgent, learners: Iterable[tuple[Component, Learner]]) -> None:
+    """Refuse a training run that must end before the first update of the selector or of a learner.
+
+    Args:
+        config: of the run.
+        agent: with its selector.
+        learners: of the agent, each with its component.
+
+    Raises:
+        ConfigError: the message names the setting that requires the most steps, and the number of steps of the run.
+    """
+    run = config.run
+    if run.mode != "train":
+        return
+    batch = run.num_envs * run.steps_per_batch
+    num = -(-run.total_frames // batch) * batch
+    needs = [] if agent.selector is None else [(config.high, agent.selector.decisions_to_update())]
+    if not run.low.freeze:
+        needs += [(low, learner.steps_to_update()) for low, learner in learners]
+    for component, needed in needs:
+        name = max(needed, key=needed.__getitem__, default="")
+        if name and needed[name] > num:
+            setting = f"{component.group}.{name}"
+            raise ConfigError(
+                f"{setting}={as_json(component.settings.get(name))} ({component}): the first update comes after "
+                f"{needed[name]:,} steps or decisions, but total_frames={run.total_frames} gives at most {num:,}; "
+                f"set a larger total_frames or another {setting}"
+            )

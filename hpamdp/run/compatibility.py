@@ -1,0 +1,349 @@
+"""What goes together in a run and what does not: two lists of rules, checked before anything is built.
+
+A rule returns one line with the settings to change, or None if it has nothing against the run. Rules read settings and
+attributes of classes alone, so they can be checked without torch.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import TypeAlias
+
+from hpamdp.config.components import Component, constructor_arguments
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.schema import Config
+from hpamdp.env.facts import ProblemFacts
+
+# The choice of a selector by itself, and the selector where there are options.
+AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
+
+Rule: TypeAlias = Callable[[Config], "str | None"]
+ProblemRule: TypeAlias = Callable[[Config, ProblemFacts], "str | None"]
+
+
+def check(config: Config) -> None:
+    """Refuse settings that do not go together, as far as they can be compared before the environment is built.
+
+    Raises:
+        ConfigError: with the settings to change.
+    """
+    check_rules(config, RULES)
+    facts = facts_of(config)
+    if facts is not None:
+        check_problem(config, facts)
+
+
+def check_rules(config: Config, rules: Sequence[Rule]) -> None:
+    """Check some of the rules.
+
+    Raises:
+        ConfigError: with the settings to change.
+    """
+    _check(rule(config) for rule in rules)
+
+
+def check_problem(config: Config, facts: ProblemFacts) -> None:
+    """Refuse settings that do not go with the problem.
+
+    Raises:
+        ConfigError: with the settings to change.
+    """
+    _check(rule(config, facts) for rule in PROBLEM_RULES)
+
+
+def facts_of(config: Config) -> ProblemFacts | None:
+    """Return what the settings tell of the problem; None if only a built environment knows it."""
+    facts = getattr(config.env.cls, "facts", None)
+    options = config.env.options
+    return None if facts is None or options is None else facts(options)
+
+
+def with_selector(config: Config, problem: ProblemFacts, words: Sequence[str] = ()) -> Config:
+    """Return the config with a selector in the place of `high=auto`: none if there is no option to choose.
+
+    Args:
+        config: of the run.
+        problem: the facts about its problem.
+        words: of the command line.
+
+    Raises:
+        ConfigError: a word sets something of a selector, but there is none.
+    """
+    if config.high.name != AUTO_SELECTOR:
+        return config
+    if _has_choice(config, problem):
+        return replace(config, high=replace(config.high, name=DEFAULT_SELECTOR))
+    lost = [word for word in words if word.lstrip("+").startswith("high.")]
+    if lost:
+        raise ConfigError(f"{lost[0]}: {config.env} has no option to choose, so it has no selector; leave it out")
+    return replace(config, high=Component("high", "none", None, {}))
+
+
+def _check(complaints: Iterator[str | None]) -> None:
+    complaint = next((complaint for complaint in complaints if complaint is not None), None)
+    if complaint is not None:
+        raise ConfigError(complaint)
+
+
+def _levels(config: Config) -> list[Component]:
+    return [config.high, *config.learners]
+
+
+def _needs(component: Component) -> tuple[str, ...]:
+    return getattr(component.cls, "needs", ())
+
+
+# Rules about the values of the run.
+
+
+def option_length_goes_with_steps(config: Config) -> str | None:
+    """`agent.option_length` is there with `agent.termination=steps`, and only then."""
+    termination, length = config.run.agent.termination, config.run.agent.option_length
+    if termination == "steps" and length is None:
+        return "agent.option_length: missing; agent.termination=steps needs the number of steps of an option"
+    if termination != "steps" and length is not None:
+        return f"agent.option_length={length}: goes with agent.termination=steps only, not with {termination}"
+    return None
+
+
+def saved_runs_are_named(config: Config) -> str | None:
+    """Settings that name a saved run are not empty, and go with the mode."""
+    run = config.run
+    for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
+        if value == "":
+            return f"{name}: empty; give the output folder of a run, or leave {name} out"
+    if run.mode == "eval" and run.checkpoint is None:
+        return "checkpoint: missing; mode=eval needs the output folder of a run"
+    if run.mode != "eval" and run.checkpoint is not None:
+        return "checkpoint: goes with mode=eval only; to go on with a run, set resume"
+    if run.mode == "eval" and run.resume is not None:
+        return "resume: goes with mode=train and mode=offline; to score an agent, set checkpoint"
+    return None
+
+
+def stop_score_needs_evaluations(config: Config) -> str | None:
+    """Training is evaluated where a score is to end it."""
+    run = config.run
+    if run.mode == "eval" or run.eval.stop_score is None or run.eval_every > 0:
+        return None
+    every = "offline.eval_every" if run.mode == "offline" else "eval.every"
+    return f"eval.stop_score={run.eval.stop_score}: needs evaluations during training; set {every} above 0"
+
+
+# Rules about what the agent learns from.
+
+
+def offline_runs_have_data(config: Config) -> str | None:
+    """With `mode=offline` there is a data set, and there are learners to train."""
+    if config.run.mode == "offline" and config.data.cls is None:
+        return "mode=offline: data=none leaves nothing to learn from; choose a data set"
+    return None
+
+
+def levels_learn_from_what_there_is(config: Config) -> str | None:
+    """Learners and selector can learn from the run's own steps, or from its data set."""
+    mode, has_data = config.run.mode, config.data.cls is not None
+    sources = {"train": "its own steps", "offline": "data sets"}
+    for low in config.learners:
+        modes: tuple[str, ...] = getattr(low.cls, "modes", ())
+        learns = f"{low} learns from {' and '.join(sources[known] for known in modes)}"
+        if mode == "train" and "train" not in modes:
+            return f"mode=train: {learns} only; use mode=offline and a data set, or another low"
+        if mode != "eval" and has_data and "offline" not in modes:
+            return f"{config.data}: {learns} only; use data=none, or another low"
+    if mode == "offline" and "offline" not in getattr(config.high.cls, "modes", ("offline",)):
+        return f"{config.high}: learns from its own choices only; use mode=train, or another high"
+    if mode == "offline" and config.run.low.freeze:
+        return "low.freeze=true: mode=offline trains the learners; use low.freeze=false"
+    return None
+
+
+def sums_of_rewards_fit_a_batch(config: Config) -> str | None:
+    """`low.n_step` is at most the length of a batch."""
+    n_step = max(low.settings.get("n_step", 1) for low in config.learners)
+    if config.run.mode == "train" and n_step > config.run.steps_per_batch:
+        return (
+            f"low.n_step={n_step}: must be at most steps_per_batch={config.run.steps_per_batch}, as sums of rewards "
+            "end with a batch"
+        )
+    return None
+
+
+def learners_have_the_values_that_are_compared(config: Config) -> str | None:
+    """A selector that compares the learners' values gets learners that have some."""
+    if not getattr(config.high.cls, "asks_learners", False):
+        return None
+    for low in config.learners:
+        setting = getattr(low.cls, "value_option", None)
+        if setting is not None and not low.settings[setting]:
+            return f"{config.high}: {low} has no value to compare without low.{setting}=true"
+        if not _overrides(low.cls, "value", base="hpamdp.policies.base"):
+            return f"{config.high}: {low} has no value to compare; use another low or another high"
+    return None
+
+
+# Rules about the collector.
+
+
+def workers_share_the_environments(config: Config) -> str | None:
+    """A collector with workers is installed, has a run that takes steps, and gives all workers as many environments."""
+    collector, run = config.collector, config.run
+    if run.mode == "eval":  # which collects nothing
+        return None
+    if run.mode == "offline" and getattr(collector.cls, "has_workers", False):
+        return f"{collector}: mode=offline takes no steps; use collector=single"
+    package: str | None = getattr(collector.cls, "package", None)
+    if package is not None and importlib.util.find_spec(package) is None:
+        return f"{collector}: {package} is not installed; pip install hpamdp[{package}]"
+    num_workers = collector.settings.get("num_workers", 1)
+    if run.num_envs % num_workers:
+        return (
+            f"collector.num_workers={num_workers}: must divide num_envs={run.num_envs}, of which each worker "
+            "has an equal share"
+        )
+    return None
+
+
+def workers_need_nothing_of_one_another(config: Config, problem: ProblemFacts) -> str | None:
+    """Environments that learn a common scale are in one process."""
+    if config.run.mode == "eval" or config.collector.settings.get("num_workers", 1) == 1 or problem.is_shardable:
+        return None
+    return (
+        f"{config.collector}: {config.env} learns the scale of its observations from all environments together; "
+        "use collector=single or env.observation_scaling=bounds"
+    )
+
+
+# Rules about the problem and its options.
+
+
+def the_problem_has_what_levels_need(config: Config) -> str | None:
+    """A level that asks a planner or human data gets a problem whose constructor has an argument for it."""
+    assert config.env.cls is not None
+    there = constructor_arguments(config.env.cls)
+    lacks = {"oracle": "has no planner to ask", "human": "has no human data"}
+    for level in _levels(config):
+        for need in _needs(level):
+            if need not in there:
+                return f"{level}: {config.env} {lacks[need]}"
+    return None
+
+
+def actions_are_grouped_once(config: Config, problem: ProblemFacts) -> str | None:
+    """`env.grouping` makes options for levels that know nothing of other ones."""
+    if config.run.env.grouping is None:
+        return None
+    if config.run.env.grouping == "default" and not problem.default_options:
+        return f"env.grouping=default: {config.env} suggests none; name the actions of each option"
+    for level in _levels(config):
+        if _needs(level):
+            return f"env.grouping: {level} knows nothing of them; use another {level.group}"
+    return None
+
+
+def a_choice_has_a_selector(config: Config, problem: ProblemFacts) -> str | None:
+    """There is a selector where the agent chooses options, and only there."""
+    has_selector, has_choice = config.high.cls is not None, _has_choice(config, problem)
+    if has_selector and not has_choice:
+        if not problem.option_names:
+            return f"{config.high}: {config.env} has no options to choose; use high=none"
+        choice = getattr(config.env.cls, "choice_setting", "")
+        return f"{config.high}: {config.env} leaves nothing to choose; use high=none or {choice}"
+    if not has_selector and has_choice:
+        without = getattr(config.env.cls, "no_choice_setting", "")
+        without = f" or {without}" if without else ""
+        return f"high=none: {config.env} needs a selector; use another high{without}"
+    if config.run.low.freeze and not has_choice:
+        return "low.freeze=true: there is no choice left to learn; use low.freeze=false"
+    return None
+
+
+def plans_keep_the_option(config: Config, problem: ProblemFacts) -> str | None:
+    """Plans that change options are not asked for where an option lasts for its episode."""
+    if config.run.agent.termination != "episode" or not problem.plans_change_options:
+        return None
+    for low in config.learners:
+        if "oracle" in _needs(low):
+            return (
+                f"{low}: its plans on {config.env} change options, but agent.termination=episode keeps them; use "
+                "agent.termination=steps agent.option_length=1"
+            )
+    return None
+
+
+def options_end_where_they_may(config: Config, problem: ProblemFacts) -> str | None:
+    """Options end inside their episodes only if the problem, the selector and the run have a use for it."""
+    termination, high = config.run.agent.termination, config.high
+    if termination == "episode":
+        return None
+    given, has_choice = f"agent.termination={termination}", _has_choice(config, problem)
+    if not (has_choice and problem.can_change_option):
+        why = "keeps an option for an episode" if has_choice else "has no options"
+        change = getattr(config.env.cls, "change_setting", "")
+        change = f" or {change}" if has_choice and change else ""
+        return f"{given}: {config.env} {why}; use agent.termination=episode{change}"
+    if config.run.low.freeze:
+        return f"{given}: low.freeze=true plays whole episodes; use agent.termination=episode"
+    if getattr(high.cls, "is_bandit", False):
+        return (
+            f"{given}: {high} is a bandit, which counts what an option returns and nothing of what follows it; use "
+            "agent.termination=episode, high=meta_critic or high=actor"
+        )
+    if termination == "learned" and not getattr(high.cls, "ends_options", False):
+        return (
+            f"{given}: {high} does not decide where options end; use high=option_critic, high=meta_critic or "
+            "agent.termination=steps"
+        )
+    return None
+
+
+def learners_of_options_have_an_option(config: Config, problem: ProblemFacts) -> str | None:
+    """`low.per_option` names options that exist and do not share a learner."""
+    names = _option_names(config, problem) if _has_choice(config, problem) else ()
+    unknown = [name for name in config.low_of if name not in names]
+    if unknown:
+        known = ", ".join(names) or "none to choose"
+        return f"low.per_option: {config.env} has no option {unknown[0]}; it has {known}"
+    if config.low_of and config.run.agent.sharing == "shared":
+        return "low.per_option: agent.sharing=shared has one learner for all; use agent.sharing=per_option"
+    return None
+
+
+def _overrides(cls: type | None, method: str, base: str) -> bool:
+    """Return whether a class has a method that is not the one of a class in the module `base`."""
+    owner = next((each for each in getattr(cls, "__mro__", ()) if method in vars(each)), None)
+    return owner is not None and owner.__module__ != base
+
+
+def _has_choice(config: Config, problem: ProblemFacts) -> bool:
+    return problem.has_choice or config.run.env.grouping is not None
+
+
+def _option_names(config: Config, problem: ProblemFacts) -> tuple[str, ...]:
+    grouping = config.run.env.grouping
+    if grouping is None:
+        return problem.option_names
+    return tuple(problem.default_options if grouping == "default" else grouping)
+
+
+RULES: tuple[Rule, ...] = (
+    option_length_goes_with_steps,
+    saved_runs_are_named,
+    stop_score_needs_evaluations,
+    offline_runs_have_data,
+    levels_learn_from_what_there_is,
+    sums_of_rewards_fit_a_batch,
+    learners_have_the_values_that_are_compared,
+    workers_share_the_environments,
+    the_problem_has_what_levels_need,
+)
+PROBLEM_RULES: tuple[ProblemRule, ...] = (
+    actions_are_grouped_once,
+    a_choice_has_a_selector,
+    plans_keep_the_option,
+    options_end_where_they_may,
+    learners_of_options_have_an_option,
+    workers_need_nothing_of_one_another,
+)
