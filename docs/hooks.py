@@ -198,12 +198,12 @@ def fields_of(path: str, target: str | None) -> dict[str, tuple[str, object, str
     """Return the values, the default and the sentence of each setting of a yaml's class."""
     if target is None or not target.startswith("hpamdp."):
         return {}
-    from hpamdp import config
+    from hpamdp.config.components import GROUPS, defaults_of, load_class, options_model
 
     group = Path(path).parent.name
-    model = config.options_model(config.load_class(target), config.GROUPS.get(group, ()))
+    model = options_model(load_class(target), GROUPS.get(group, ()))
     schema = model.model_json_schema()
-    defaults = config.defaults_of(model)
+    defaults = defaults_of(model)
     return {
         name: (
             allowed_values(schema["properties"][name], schema.get("$defs", {})),

@@ -83,7 +83,7 @@ def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(tmp_
         *(
             (
                 f"high={high} env=crossing low=stepper agent.termination=steps agent.option_length=3",
-                f"agent.termination=steps: high={high} is a bandit, which counts what an option pays and nothing of "
+                f"agent.termination=steps: high={high} is a bandit, which counts what an option returns and nothing of "
                 "what follows it; use agent.termination=episode, high=meta_critic or high=actor",
             )
             for high in ("ucb", "epsilon_greedy", "thompson", "exp3", "linucb", "lin_thompson")

@@ -30,7 +30,6 @@ MISTAKES = [
     (["high=none", "high.window=3"], "high.window: no such setting of none (conf/high/none.yaml); it has none"),
     (["low.lrr=1"], "low.lrr: no such setting of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
     (["~low.tua"], "low.tua: no such setting of HyAR (conf/low/hyar.yaml); did you mean tau? It has "),
-    (["~low.tau"], "low.tau: missing (HyAR, conf/low/hyar.yaml)"),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
     # A name that leaves its group.
     (["low=../env/boatdock"], "low=../env/boatdock: no such choice; conf/low has bc, "),

@@ -6,10 +6,10 @@ import pytest
 import torch
 import yaml
 from conftest import CONF, choices, compose_config, make_config
-from hpamdp.config.UNKNOWN_schema import schema
 from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
+from hpamdp.config import schema
 from hpamdp.config.components import GROUPS, component, defaults_of, load_class, options_model
 from hpamdp.config.compose import plain, read
 from hpamdp.config.errors import ConfigError
@@ -137,7 +137,7 @@ def test_all_problems_come_in_one_line():
         ("data", "hpamdp.run.loggers.CSVLogger", "data=none: CSVLogger is no Demonstrations (hpamdp.data.demonstrat"),
         ("data", "hpamdp.data.demonstrations.Demonstrations", "data=none: Demonstrations is abstract; choose one of "),
         ("env", "hpamdp.env.base.PAMDPEnv", "env=boatdock: PAMDPEnv is abstract; choose one of its subclasses, which"),
-        ("env", "hpamdp.env.choice.OptionChoiceEnv", "OptionChoiceEnv: has an argument that no yaml file can hold: U"),
+        ("env", "hpamdp.env.option_choice.OptionChoiceEnv", "OptionChoiceEnv: has an argument that no yaml file can hold: U"),
         (
             "high",
             "torch.nn.Module",

@@ -39,11 +39,11 @@ def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_
     words = ["env=goal", "high=ucb", "low=pdqn", "+env.grouping=default", "total_frames=1234"]
     own = "+low.per_option={shoot: {name: hppo, clip: 0.3}, kick: qpamdp, dribble: pdqn}"
     config = make_config([*words, own])
-    recipe = make_config(["env=goal", "high=none", "low=qpamdp"]).low.options
-    assert config.low_of["kick"].options == recipe != make_config(["low=qpamdp"]).low.options
-    assert config.low_of["dribble"].options == config.low.options
-    hppo = make_config(["env=goal", "high=none", "low=hppo", "low.clip=0.3", "total_frames=1234"]).low.options
-    assert config.low_of["shoot"].options == hppo and hppo["anneal_steps"] == 1234
+    recipe = make_config(["env=goal", "high=none", "low=qpamdp"]).low.settings
+    assert config.low_of["kick"].settings == recipe != make_config(["low=qpamdp"]).low.settings
+    assert config.low_of["dribble"].settings == config.low.settings
+    hppo = make_config(["env=goal", "high=none", "low=hppo", "low.clip=0.3", "total_frames=1234"]).low.settings
+    assert config.low_of["shoot"].settings == hppo and hppo["anneal_steps"] == 1234
     assert read_saved(config.to_dict()) == config
 
 

@@ -15,6 +15,7 @@ from hpamdp.env.goal.environment import GoalEnv, HardGoalEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform.environment import PlatformEnv
 from hpamdp.policies.random_agent import random_agent
+from hpamdp.run import compatibility
 from hpamdp.run.assemble import make_env
 from hpamdp.specs import PAMDPSpecs
 
@@ -73,7 +74,9 @@ def test_problems_suggest_options():
 def test_options_that_cannot_be_are_told_in_one_line(words, complaint):
     low = [] if any(word.startswith("low=") for word in words) else ["low=random"]
     with pytest.raises(ConfigError) as error:
-        make_env(make_config(["high=uniform", *low, *words]), 2, CPU, 0)
+        config = make_config(["high=uniform", *low, *words])
+        compatibility.check(config)
+        make_env(config, 2, CPU, 0)
     assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
 
 

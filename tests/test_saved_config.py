@@ -267,7 +267,7 @@ def test_text_of_a_saved_config_stays_text(of_toy, monkeypatch, tmp_path, comman
     values = saved(make_config(["logger=wandb", "low=random"]))
     for text in ("${oc.env:SECRET}", "${", "???", "a\\${seed}"):
         values["logger"]["name"] = text
-        values["env"]["options"] = {text: [text]}
+        values["env"]["grouping"] = {text: [text]}
         config = read_saved(values)
         assert config.logger.settings["name"] == text and config.run.env.grouping == {text: [text]}
         assert read_saved(saved(config)) == config

@@ -12,11 +12,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from pydantic import PositiveInt, ValidationError, model_validator
+from pydantic import PositiveInt, ValidationError
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
-from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
@@ -30,7 +29,7 @@ from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
 from hpamdp.env.gymnasium.time_limit import with_limit
 from hpamdp.env.gymnasium.values import flag
 from hpamdp.messages import one_line
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 
 _SUCCESS = "success"
 # If an info has both entries, the first one counts.
@@ -71,13 +70,6 @@ class GymnasiumOptions(Settings):
     """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not."""
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        if (self.id is None) == (self.entry_point is None):
-            given = "neither is" if self.id is None else "both are"
-            raise ValueError(f"set env.id=Name-v0 or env.entry_point=package.module:name; {given} set")
-        return self
 
 
 class GymnasiumEnv(PAMDPEnv):
@@ -120,6 +112,10 @@ class GymnasiumEnv(PAMDPEnv):
         **settings: Any,
     ) -> None:
         options = self.options = GymnasiumOptions.of(options, settings)
+        # Not a check of the model: the command that resumes a run need not repeat them.
+        if (options.id is None) == (options.entry_point is None):
+            given = "neither is" if options.id is None else "both are"
+            raise SettingError(f"set env.id=Name-v0 or env.entry_point=package.module:name; {given} set")
         if num_envs < 1:
             raise ValueError(f"GymnasiumEnv: {num_envs=}, but must be at least 1")
         super().__init__(device=device, batch_size=[num_envs])
