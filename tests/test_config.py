@@ -137,7 +137,11 @@ def test_all_problems_come_in_one_line():
         ("data", "hpamdp.run.loggers.CSVLogger", "data=none: CSVLogger is no Demonstrations (hpamdp.data.demonstrat"),
         ("data", "hpamdp.data.demonstrations.Demonstrations", "data=none: Demonstrations is abstract; choose one of "),
         ("env", "hpamdp.env.base.PAMDPEnv", "env=boatdock: PAMDPEnv is abstract; choose one of its subclasses, which"),
-        ("env", "hpamdp.env.option_choice.OptionChoiceEnv", "OptionChoiceEnv: has an argument that no yaml file can hold: U"),
+        (
+            "env",
+            "hpamdp.env.option_choice.OptionChoiceEnv",
+            "OptionChoiceEnv: has an argument that no yaml file can hold: U",
+        ),
         (
             "high",
             "torch.nn.Module",
