@@ -93,11 +93,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
         Metric("human_normalised", "random 0, people 1"),
-        Metric("success", "success", "share"),
-        Metric("too_fast", "too fast", "share"),
-        Metric("out_of_bounds", "out of bounds", "share"),
-        Metric("out_of_fuel", "out of fuel", "share"),
-        Metric("time_limit", "time limit", "share"),
+        *(Metric(name, name.replace("_", " "), "share") for name in task.OUTCOMES[1:]),
         Metric("steps", "presses an episode", "count"),
         Metric("option_congruent", "congruent boat", "share"),
         Metric("option_changes", "changes of boats an episode", "count"),

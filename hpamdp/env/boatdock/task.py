@@ -22,8 +22,9 @@ def speed(duration: Any) -> Any:
     return duration * duration * (100.0 - (20.0 / 3.0) * duration)
 
 
-SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(6)
+# Going on, success, the failures, and the time limit at the end. `physics` and `kernel` decide among them.
 OUTCOMES = ("sailing", "success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit")
+SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(len(OUTCOMES))
 
 # With less fuel than this (seconds) the tank counts as empty: the rest is rounding in float32.
 DRY = 1e-6
