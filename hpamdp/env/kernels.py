@@ -270,6 +270,14 @@ def new_episode(integers: Any, row: Any, settings: Any) -> Any:
 
 
 @inlined
+def end_step(integers: Any, row: Any, outcome: Any, num_outcomes: Any, settings: Any) -> None:
+    """Count a row's step, and keep its outcome; an episode that would go on may run out of time."""
+    steps = integers[STEPS_ROW, row] + 1
+    is_late = (outcome == 0) & (steps >= settings[MAX_STEPS])
+    integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, num_outcomes - 1 if is_late else outcome
+
+
+@inlined
 def report(outcome: Any, num_outcomes: Any, row: Any, outcomes: Any, flags: Any) -> None:
     """Write an outcome int64 `[N]` and the flags bool `[3, N]`: done, terminated, truncated."""
     outcomes[row] = outcome

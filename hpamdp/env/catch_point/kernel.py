@@ -65,12 +65,10 @@ def advance(
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
-            action, steps = discrete[row], integers[STEPS_ROW, row] + 1
+            action = discrete[row]
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
             outcome, rewards[row] = _act(floats, integers, row, action, given, settings)
-            if outcome == rules.GOING_ON and steps >= settings[kernels.MAX_STEPS]:
-                outcome = rules.TIME_LIMIT
-            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, outcome
+            kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 bits, step = kernels.new_episode(integers, row, settings)

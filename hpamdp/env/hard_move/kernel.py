@@ -11,7 +11,7 @@ import numpy as np
 
 from hpamdp.env import kernels, point_kernel
 from hpamdp.env.hard_move import rules
-from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW, ZERO, kernel
+from hpamdp.env.kernels import OUTCOME_ROW, ZERO, kernel
 
 MOTIONS = kernels.OWN  # from here on the settings are the motions of the sets, x and y in turn
 
@@ -44,7 +44,7 @@ def advance(
     for row in range(len(mask)):
         was_over = integers[OUTCOME_ROW, row] != rules.GOING_ON
         if mode != kernels.RESTART and mask[row] and not was_over:
-            action, steps = discrete[row], integers[STEPS_ROW, row] + 1
+            action = discrete[row]
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
             push = _FORCE * given
             motion_x, motion_y = _F(settings[MOTIONS + 2 * action]), _F(settings[MOTIONS + 2 * action + 1])
@@ -52,9 +52,7 @@ def advance(
             is_hit = squared <= point_kernel.HIT
             rewards[row] = (point_kernel.HIT_REWARD if is_hit else ZERO) - squared
             outcome = rules.REACHED if is_hit else rules.GOING_ON
-            if outcome == rules.GOING_ON and steps >= settings[kernels.MAX_STEPS]:
-                outcome = rules.TIME_LIMIT
-            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, outcome
+            kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
                 bits, step = kernels.new_episode(integers, row, settings)

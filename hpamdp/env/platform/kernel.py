@@ -170,9 +170,7 @@ def advance(
             given = kernels.parameter(parameters, row, 0, action, places, bounds)
             bits, step = kernels.noise_rng(settings, row, integers[EPISODE_ROW, row])
             outcome = _act(floats, row, action, given, steps * rules._NUMBERS_PER_ACTION, bits, step, noise)
-            if outcome == rules.ON_THE_WAY and steps + 1 >= settings[kernels.MAX_STEPS]:
-                outcome = rules.TIME_LIMIT
-            integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps + 1, outcome
+            kernels.end_step(integers, row, outcome, len(rules.OUTCOMES), settings)
             rewards[row] = (floats[_X, row] - before) / _END
         for reading in range(len(observations)):
             if kernels.must_restart(mode, reading, was_over, integers[OUTCOME_ROW, row], mask[row]):
