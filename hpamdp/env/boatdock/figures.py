@@ -64,7 +64,7 @@ def _trajectories(evaluation: Mapping[str, np.ndarray], names: tuple[str, ...]) 
         _draw_episode(axes, evaluation, int(episode), names)
     present = [(name, (outcomes == code).mean()) for code, name in enumerate(OUTCOMES) if (outcomes == code).any()]
     handles = [
-        Line2D([], [], color=_OUTCOME_COLOURS.get(name, FAINT), marker=_end_marker(name), label=f"{_words(name)} {share:.1%}")
+        Line2D([], [], color=_colour(name), marker=_end_marker(name), label=f"{_words(name)} {share:.1%}")
         for name, share in present
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
@@ -77,6 +77,10 @@ def _trajectories(evaluation: Mapping[str, np.ndarray], names: tuple[str, ...]) 
     return figure
 
 
+def _colour(outcome: str) -> str:
+    return _OUTCOME_COLOURS.get(outcome, FAINT)
+
+
 def _words(name: str) -> str:
     return name.replace("_", " ")
 
@@ -87,7 +91,7 @@ def _end_marker(outcome: str) -> str:
 
 def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...]) -> None:
     outcome = OUTCOMES[int(evaluation["outcome"][episode])]
-    colour = _OUTCOME_COLOURS.get(outcome, FAINT)
+    colour = _colour(outcome)
     path = evaluation["path"][episode]
     path = path[np.isfinite(path).all(axis=-1)]
     axes.add_patch(Circle((0, 0), HARBOUR_RADIUS, facecolor=_WATER, edgecolor=_RIM, linewidth=0.8))
@@ -222,7 +226,7 @@ def _draw_outcomes(axes: Axes, outcomes: np.ndarray, people: Mapping[str, float]
     colour = REFERENCES["human"][1]
     for row, name in enumerate(names):
         share = (outcomes == OUTCOMES.index(name)).mean()
-        axes.barh(row, share, color=_OUTCOME_COLOURS.get(name, FAINT), height=0.62)
+        axes.barh(row, share, color=_colour(name), height=0.62)
         axes.annotate(f"{share:.1%}", (1.19, row), ha="right", va="center", fontsize=8.5, annotation_clip=False)
         if people.get(name) is not None:
             for edge, width in (("white", 4.5), (colour, 2.0)):  # the white edge keeps it apart from the bar
