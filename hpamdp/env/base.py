@@ -43,7 +43,7 @@ class Metric:
 
 
 class ProblemError(ValueError):
-    """A problem that breaks its own contract, such as with an observation outside its space; told in one line."""
+    """A problem breaks its own contract, such as with an observation outside its space; the message is one line."""
 
 
 class PAMDPEnv(EnvBase):
@@ -52,21 +52,21 @@ class PAMDPEnv(EnvBase):
     A subclass has these specs:
     - `observation` float32 `[N, observation_dim]`;
     - the action leaves `("action", "discrete")` int64 `[N]` and `("action", "parameters")` float32
-      `[N, num_parameters]`: the bounded parameters of all discrete actions side by side, of which only those of the
-      chosen one count;
-    - where the agent chooses options, the action leaf `option` int64 `[N]`;
-    - where some choices are forbidden at times, `action_mask` bool `[N, num_discrete]` and `option_mask` bool
+      `[N, num_parameters]`: the bounded parameters of all discrete actions side by side. Only those of the chosen
+      action count;
+    - if the agent chooses options, the action leaf `option` int64 `[N]`;
+    - if some choices are forbidden at times, `action_mask` bool `[N, num_discrete]` and `option_mask` bool
       `[N, num_options]` beside the observation: what may be chosen in the current state;
     - `reward`, `done`, `terminated`, `truncated` `[N, 1]`; a time limit is `truncated` only.
 
-    A step leaves an episode that is over as it is and earns 0.
+    A step does not change an episode that is over, and its reward is 0.
 
-    The other attributes and methods tell the framework what it cannot know: how an episode went, what is best possible,
-    and which tables and figures show it. All of them have defaults.
+    The other attributes and methods tell the framework how an episode went, what is best possible, and which tables and
+    figures show it. All of them have defaults.
     """
 
     option_names: tuple[str, ...] = ()
-    discrete_names: tuple[str, ...] = ()  # of the discrete actions, where they have names
+    discrete_names: tuple[str, ...] = ()  # of the discrete actions, if they have names
     option_actions: tuple[tuple[bool, ...], ...] | None = None  # what `group_actions` has made of the options
     can_change_option: bool = True  # whether an option may end before its episode
     plans_change_options: bool = False  # whether the planned actions under `oracle` count on that
@@ -74,17 +74,17 @@ class PAMDPEnv(EnvBase):
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
 
-    # Whether a reset of some environments returns the others as they are. Then TorchRL's merge of the two, which takes
-    # longer than simple physics of 65,536 environments, would change nothing and is left out.
+    # Whether a reset of some environments returns the others unchanged. If so, TorchRL's merge of the two changes
+    # nothing and is left out, since it takes longer than simple physics of 65,536 environments.
     reset_returns_all_rows: ClassVar[bool] = False
 
-    # Settings that can run code, read files or reach servers. A saved config sets them only if the user says so.
+    # Settings that can run code, read files or reach servers. A saved config sets them only if the user allows it.
     guarded_settings: ClassVar[tuple[str, ...]] = ()
 
-    # Settings that leave the choice of an option to the agent and that take it away, to name in an error.
+    # Settings that let the agent choose an option, and settings that do not. Errors name them.
     choice_setting: ClassVar[str] = ""
     no_choice_setting: ClassVar[str] = ""
-    # A setting with which an option may end before its episode, where others forbid it.
+    # A setting with which an option may end before its episode, if other settings forbid it. Errors name it.
     change_setting: ClassVar[str] = ""
 
     # Rows of the closing table, and panels of the learning curves.
@@ -111,14 +111,14 @@ class PAMDPEnv(EnvBase):
 
     @property
     def default_options(self) -> Mapping[str, Sequence[int | str]]:
-        """Options to begin with, as for `group_actions`; empty where none suggest themselves."""
+        """Options to begin with, as for `group_actions`; empty if the problem suggests none."""
         return {}
 
     def group_actions(self, options: Mapping[str, Sequence[int | str]]) -> None:
         """Let the agent choose among options that allow some of the discrete actions each.
 
-        The action spec then has the leaf `option`. An action that the option does not allow is refused. Actions of no
-        option are never taken; an action may belong to several.
+        The action spec then has the leaf `option`. A step refuses an action that the option does not allow. An action
+        may belong to several options or to none.
 
         Args:
             options: for each option's name its discrete actions, by number or name, with _ for a space.
@@ -156,13 +156,12 @@ class PAMDPEnv(EnvBase):
         raise ValueError(f"{self.title} has no discrete action {action}; it has 0 to {num_discrete - 1}{named}")
 
     def check_masks(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return what a step or a reset gave, with masks that allow something in every row.
+        """Return the result of a step or a reset with masks that allow something in every row.
 
-        Where an episode is over, nothing is chosen any more, so a mask that allows nothing becomes one that allows
-        everything.
+        If an episode is over and its mask allows nothing, the mask becomes one that allows everything.
 
         Raises:
-            ProblemError: a mask allows nothing where the episode goes on.
+            ProblemError: an episode goes on, but its mask allows nothing.
         """
         for name in (keys.ACTION_MASK, keys.OPTION_MASK):
             mask = tensordict.get(name, None)
@@ -183,67 +182,67 @@ class PAMDPEnv(EnvBase):
 
     @property
     def is_shardable(self) -> bool:
-        """Whether several processes can each step a shard of the environments: they learn nothing from one another."""
+        """Whether several processes can each step some of the environments, since these share no state."""
         return True
 
     @property
     def position(self) -> Tensor | None:
-        """Positions of the agents for drawing, `[N, 2]`; None where that means nothing."""
+        """Positions of the agents for drawing, `[N, 2]`; None if there are none."""
         return None
 
     @property
     def symmetries(self) -> Symmetries | None:
-        """The maps under which neither dynamics nor reward change; None: there are none, or none that is known."""
+        """The maps that leave dynamics and reward unchanged; None if none is known."""
         return None
 
     @property
     def geometry(self) -> PlaneGeometry | None:
-        """Which entries of the observation are vectors, and where the actions point; None where that means nothing."""
+        """Which entries of the observation are vectors, and where the actions point; None if there are no vectors."""
         return None
 
     def fixed_episodes(self, seed: int) -> TensorDict | None:
-        """Return what to `reset` with for the evaluation episodes of a seed, one for each environment.
+        """Return the argument of `reset` for the evaluation episodes of a seed, one for each environment.
 
-        None: `seed_evaluation(seed)` and a reset without arguments fix them.
+        If None, `seed_evaluation(seed)` and a reset without arguments begin these episodes.
         """
         return None
 
     def seed_evaluation(self, seed: int) -> None:
-        """Seed the episodes and the noise of an evaluation, which should not be those of training with any seed.
+        """Seed the episodes and the noise of an evaluation, which should differ from those of training with any seed.
 
-        The default is `set_seed` with another seed. An environment whose random numbers come from `counter_rng` does
-        better to draw them from the streams EVALUATION and EVALUATION_NOISE until the next `set_seed`.
+        The default is `set_seed` with another seed. With random numbers from `counter_rng`, draw them from the streams
+        EVALUATION and EVALUATION_NOISE until the next `set_seed`.
         """
         self.set_seed(seed ^ _EVALUATION)
 
     def describe(self) -> dict[str, Tensor]:
-        """Return what is known of the episodes that were just reset, first dimension `N`; computed once a run."""
+        """Return facts about the episodes that have just begun, first dimension `N`. A run asks once."""
         return {}
 
     def initial_parameters(self) -> tuple[Tensor, Tensor] | None:
-        """Return the parameters that learners conventionally start this problem with, where there is a convention.
+        """Return the initial parameters that learners of this problem conventionally start with; None if none are.
 
-        They are linear in the observation, as the learner sees it: weights `[num_parameters, observation_dim]` and a
-        bias `[num_parameters]`, in units where the parameters' bounds are [-1, 1].
+        They are linear in the observation that the learner sees: weights `[num_parameters, observation_dim]` and a bias
+        `[num_parameters]`, in units in which the parameters' bounds are [-1, 1].
         """
         return None
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return how episodes `[M]` went, from the leaves `result_keys` of their last steps, each `[M]`.
+        """Return results of episodes, `[M]` each, from the leaves `result_keys` of their last steps.
 
-        A `score` takes the place of the return wherever agents are compared; `success` is bool.
+        Comparisons of agents use `score`, if there is one, instead of the return. `success` is bool.
         """
         return {}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return means of an evaluation, whose arrays are those of `Evaluation.run`, beside score and success.
+        """Return further means of an evaluation, beside score and success, from the arrays of `Evaluation.run`.
 
-        `ceiling` is the best possible mean score on the same episodes, where it is known.
+        `ceiling` is the best possible mean score on the same episodes, if it is known.
         """
         return {}
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return figures to show beside the agent's own, by the name of who reached them.
+        """Return figures to compare with the agent's own, by the name of the player who reached them.
 
         Args:
             measured: the means of the agent's evaluation. `random`, the uniformly random agent, is added by the run.
@@ -253,7 +252,7 @@ class PAMDPEnv(EnvBase):
         return {"ceiling": {"score": measured["ceiling"], "optimality_gap": 0.0}}
 
     def summary_entries(self) -> dict[str, Any]:
-        """Return JSON values that a run's summary shows of the problem."""
+        """Return JSON values about the problem for a run's summary."""
         return {}
 
     @classmethod
@@ -272,7 +271,7 @@ class PAMDPEnv(EnvBase):
         return {}
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterable[np.ndarray]:
-        """Return the pictures of one episode, uint8 `[size, size, 3]` each; none where there is nothing to see.
+        """Return the pictures of one episode, uint8 `[size, size, 3]` each; none if the problem has no pictures.
 
         Args:
             track: its `env_state` at the start and after every step, columns `[1, ...]`.
@@ -295,7 +294,7 @@ class PAMDPEnv(EnvBase):
         return bool(self.env_state())
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return what the episodes' future depends on, each `[N, ...]`, for a checkpoint; empty where it is unknown."""
+        """Return the state of the episodes for a checkpoint, `[N, ...]` each; empty if it is unknown."""
         return {}
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
@@ -318,10 +317,10 @@ class PAMDPEnv(EnvBase):
         """
 
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
-        """Take only the scale of the observations from an `env_state`, to score a saved agent."""
+        """Set only the scale of the observations from an `env_state`, to score a saved agent."""
 
     def set_scaling_from(self, other: PAMDPEnv) -> None:
-        """Scale observations as the other environment does, now and later, where their scale is learned."""
+        """Scale observations as the other environment does, now and later, if their scale is learned."""
 
     def make_action_spec(self, low: Tensor, high: Tensor, *, has_option: bool = False) -> Composite:
         """Return the spec of the action leaves, given the bounds `[num_parameters]` of all parameters.
@@ -341,7 +340,7 @@ class PAMDPEnv(EnvBase):
         return Composite(**option, action=action, shape=n)
 
     def reset_mask(self, tensordict: TensorDictBase | None) -> Tensor:
-        """Return which environments `_reset` is asked to reset, bool `[N]`: all, where its argument does not say."""
+        """Return which environments `_reset` must reset, bool `[N]`: all, unless its argument says otherwise."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             return torch.ones(self.batch_size, dtype=torch.bool, device=self.device)

@@ -28,7 +28,7 @@ from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import Settings
 
-# What a tensordict has whose next root holds nothing else, beside the entries of the problem.
+# If a tensordict has only these keys and the problem's entries, its next root has no others either.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
@@ -110,8 +110,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     result_keys: tuple[str, ...] = (keys.OUTCOME,)
     reset_returns_all_rows = True
     num_envs: int
-    rows: KernelRows | None = None  # what the kernel moves; None where the tensor functions do
-    limit_terminates = False  # whether values stop at the time limit, as at any other end
+    rows: KernelRows | None = None  # the state that the kernel moves; None if the tensor functions do
+    limit_terminates = False  # whether the time limit terminates an episode instead of truncating it
     float_type = torch.float32  # of observations and rewards
     _has_oracle = False
 
@@ -203,7 +203,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     @property
     def _state(self) -> EpisodeState:
-        """The columns; where a kernel moves them, they change in place."""
+        """The columns; a kernel changes them in place."""
         if self.rows is None:
             return self._columns
         return from_arrays(type(self._columns), (*self.rows.floats, *self.rows.integers))

@@ -37,8 +37,9 @@ class DecisionTracker(Transform):
 
     Args:
         gamma: discount of an environment step within the option.
-        option_length: steps after which an option ends, unless its episode ends first; None: it lasts the episode;
-            `math.inf`: the selector ends it, by setting `is_decision` in the root of the step that it chooses anew at.
+        option_length: steps after which an option ends, unless its episode ends first. If None, an option lasts the
+            episode. If `math.inf`, the selector ends it: it sets `is_decision` in the root of the step at which it
+            chooses again.
         option_actions: the discrete actions of each option, bool `[num_options, num_discrete]`, if options are sets of
             actions and some may be forbidden; else None.
     """

@@ -1,12 +1,12 @@
 """Kernels: loops over the rows of a batch that Numba compiles for one core of the CPU.
 
-The rules of a problem are tensor functions, which run on CPU and CUDA, compile and differentiate. Eagerly each of their
-operations reads and writes whole columns, and costs microseconds even for one row. A kernel states the same rules for
-one row and takes all rows through a whole step, so that one environment and a million are both fast. A test compares
-the two.
+The rules of a problem are tensor functions. They run on CPU and CUDA, compile and differentiate. Without compilation
+each of their operations reads and writes whole columns, and takes microseconds even for one row. A kernel states the
+same rules for one row and takes all rows through a whole step, so one environment and a million are both fast. A test
+compares the two.
 
-Random numbers are those of `counter_rng`, bit for bit. Machine code is kept on disk, so that only the first run on a
-machine compiles.
+Random numbers are those of `counter_rng`, bit for bit. Machine code is kept on disk, so only the first run on a machine
+compiles.
 """
 
 from __future__ import annotations
@@ -178,8 +178,8 @@ def atan2(y: Any, x: Any) -> Any:
 # What the kernels of all `CounterEnv`s share: the modes, the first places in their settings, and the last rows of their
 # integers.
 #
-# Each kernel states its loop over the rows itself. A factory that closes over the problem's functions would compile it
-# anew in every process: Numba's cache on disk never hits for closures over compiled functions.
+# Each kernel has its own loop over the rows. A factory that closes over the problem's functions would compile the loop
+# anew in every process, because Numba's cache on disk never hits for closures over compiled functions.
 ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
 SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, NUM_OPTIONS, OWN = range(7)
 STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1
@@ -219,7 +219,7 @@ def invalid_row(
         places: int64 `[K + 1]`; the parameters of action k are those from `places[k]` to `places[k + 1]`.
         integers: of the state.
         settings: of the problem.
-        mode: with ACT_OR_RESTART, rows that start anew may have any action; with RESTART, all.
+        mode: with ACT_OR_RESTART, rows that start anew may have any action; with RESTART, all rows may.
     """
     if mode == RESTART:
         return -1

@@ -18,9 +18,8 @@ from hpamdp.env.base import PAMDPEnv
 class OptionChoiceEnv(PAMDPEnv):
     """Choose an option and receive the episode's return: an ordinary environment with one discrete action.
 
-    The action is `option` int64 `[N]`. A step plays the episode to its end with the greedy low-level policy and is
-    terminal; its reward is the episode's discounted return, and what it observes is what the episode's last step
-    observed.
+    The action is `option` int64 `[N]`. A step plays the episode to its end with the greedy low-level policy, and
+    terminates. Its reward is the episode's discounted return, and its observation is that of the episode's last step.
 
     Args:
         low_policy: writes the action leaves, given `observation` and `option`.

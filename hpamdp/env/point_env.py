@@ -1,4 +1,4 @@
-"""A base for problems in which a point has to reach a target in the plane: where it is, and its pictures."""
+"""A base for problems in which a point must reach a target in the plane."""
 
 from __future__ import annotations
 

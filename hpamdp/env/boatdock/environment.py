@@ -174,9 +174,9 @@ class BoatDockEnv(CounterEnv[BoatState]):
     def symmetries(self) -> Symmetries:
         """The turns and mirrors of the plane that permute a boat's directions or swap boats that occur.
 
-        Of people's two boats, six maps keep each, and six more swap it for the other, whose directions are the opposite
-        ones. With a random key map, which is not observed, only those remain that permute the keys of both key maps
-        alike; with motor noise that differs between boats, those that keep them.
+        Six maps keep each of people's two boats. Six more swap it for the other one, whose directions are opposite. A
+        random key map is not observed, so only maps remain that permute the keys of both key maps alike. If motor noise
+        differs between boats, only maps remain that keep the boats.
         """
         tables = self._directions()
         found = []  # the map, which boats the boats become, and which keys their keys become
@@ -202,7 +202,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
         )
 
     def _orders(self, num_boats: int) -> list[tuple[int, ...]]:
-        """Return which boats the boats may become under a map: with the same noise, and few enough to try them all."""
+        """Return which boats the boats may become under a map: those of equal noise, and only themselves if many."""
         orders = itertools.permutations(range(num_boats)) if num_boats <= _MOST_SWAPPED else [range(num_boats)]
         noise = self.rules.motor_noise
         allowed = [tuple(order) for order in orders]
@@ -210,10 +210,10 @@ class BoatDockEnv(CounterEnv[BoatState]):
 
     @property
     def geometry(self) -> PlaneGeometry:
-        """The places and the velocity, and where the keys point, unless a random key map leaves that open.
+        """The places and the velocity, and where the keys point, unless the key map is random.
 
-        Every press begins at rest, so that the velocity tells nothing; where the start was shows in the distances
-        alone. The harbour is always the same. With the goal's offset, the goal itself is known, too.
+        Some entries are redundant. Every press begins at rest, so the velocity does not matter. The start affects only
+        the distance. The harbour is always the same. The goal follows from its offset.
         """
         names = ["start_x", "start_y", "centre_x", "centre_y", "radius", "velocity_x", "velocity_y"]
         if self.rules.observation == "scaled" and self.rules.sensor_noise == 0.0:
@@ -254,7 +254,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
         return (*places, (10, 11), (14, 15)), ()
 
     def fixed_episodes(self, seed: int) -> TensorDict:
-        """Return layouts to `reset` with, one for each boat, that no training episode meets, whatever its seed."""
+        """Return layouts to `reset` with, one for each boat. No training episode has them, whatever its seed."""
         layout = harbour.fixed_layouts(self.num_envs, seed)
         centre = torch.tensor(harbour.CENTRE, dtype=torch.float32)
         points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
@@ -311,7 +311,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
 
     @classmethod
     def curves(cls, summary: Mapping[str, Any]) -> tuple[Metric, ...]:
-        """Return the panels of the learning curves: where there are `boats`, with the share of each."""
+        """Return the panels of the learning curves; with `boats`, also how often each is chosen."""
         if not summary.get("boats"):
             return cls.curve_metrics
         shares = (Metric(f"option_{name}", f"{name} chosen", "share") for name in summary["boats"])
@@ -341,7 +341,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
         return BoatPage(seed, self.rules)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the boats' columns and, where there is an oracle, its plans, first dimension `N`."""
+        """Return the boats' columns and, with `oracle`, its plans, first dimension `N`."""
         plans = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
         return {**self.state._asdict(), **plans}
 
@@ -402,7 +402,7 @@ def _figures_of(recording: str, controller: str) -> dict[str, float]:
 def _as_one_table(plane: Tensor, tables: list[Tensor], targets: list[Tensor]) -> Tensor | None:
     """Return which keys the keys become, int64 `[3]`, if a map makes every table the target of its number.
 
-    None: some direction becomes none of the targets, or another key with another key map.
+    If None, a direction becomes none of the targets, or becomes another key with another key map.
     """
     if len(tables) != len(targets):
         return None
