@@ -5,12 +5,13 @@ Importing it registers the Gymnasium ids of its problems and loads neither torch
 
 from hpamdp.search_path import is_command_line, put_working_directory_last
 
-# `python -m` puts the working directory first, and the next import needs other packages.
+__version__ = "0.3.0"
+
 if is_command_line():
+    # `python -m` puts the working directory first, and the next import needs other packages.
     put_working_directory_last()
+else:
+    # The command line leaves this to `env=gymnasium`: importing Gymnasium takes longer than refusing a wrong setting.
+    from hpamdp.env.registration import register
 
-from hpamdp.env.registration import register
-
-__version__ = "0.2.0"
-
-register()
+    register()

@@ -18,6 +18,7 @@ from hpamdp.policies.high_level.ucb import UCB
 from hpamdp.policies.low_level.random import Random
 from hpamdp.run import compatibility
 from hpamdp.run.train import run
+from hpamdp.settings import SettingError
 
 FILES = [(group, name) for group in GROUPS for name in choices(group)]
 
@@ -40,7 +41,7 @@ class Sample:
         model_lr: float = 1e-3,
     ) -> None:
         if widths == [13]:
-            raise ValueError("widths: 13 is unlucky")
+            raise SettingError("widths: 13 is unlucky")
         if widths == [14]:
             _, _ = widths  # a bug
         self.specs = specs

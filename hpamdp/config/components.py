@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import linecache
-import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, get_type_hints
@@ -101,9 +99,7 @@ class Component:
         settings = self.settings if options is None else {"options": options}
         try:
             return self.cls(**supplied, **settings)
-        except ValueError as error:
-            if not _is_refusal(error, self.cls):
-                raise
+        except SettingError as error:
             where = f"{self.cls.__name__}, {file_of(self.group, self.name)}"
             raise ConfigError(f"{self.group}: {first_line(error)} ({where})") from error
         except Exception as error:
@@ -258,15 +254,6 @@ def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
 def file_of(group: str, name: str) -> str:
     """Return the yaml file of a choice, as messages name it."""
     return f"conf/{group}/{name}.yaml"
-
-
-def _is_refusal(error: ValueError, cls: type) -> bool:
-    """Return whether the error is a `raise` in the class's own package, hence about its arguments, and not a bug."""
-    if isinstance(error, SettingError):
-        return True
-    frame, line = list(traceback.walk_tb(error.__traceback__))[-1]
-    is_own = frame.f_globals["__name__"].partition(".")[0] == cls.__module__.partition(".")[0]
-    return is_own and linecache.getline(frame.f_code.co_filename, line).lstrip().startswith("raise ")
 
 
 def _is_size(value: Any) -> bool:

@@ -26,7 +26,7 @@ from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 
 # If a tensordict has only these keys and the problem's entries, its next root has no others either.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
@@ -127,7 +127,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     ) -> None:
         self.options = self.Options.of(options, settings)
         if num_envs < 1:
-            raise ValueError(f"{type(self).__name__}: num_envs={num_envs}, but must be at least 1")
+            raise SettingError(f"{type(self).__name__}: num_envs={num_envs}, but must be at least 1")
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         facts = self.facts(self.options)

@@ -19,7 +19,7 @@ from pydantic import Field, ValidationError
 from hpamdp.messages import first_line, warn
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 from hpamdp.run_files import TENSORBOARD_NAME, WANDB_NAME
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 
 
 class EarlierRun(NamedTuple):
@@ -289,10 +289,10 @@ class WandbLogger:
             )
             server = _wandb_setup(wandb_settings).settings.base_url
         except wandb.errors.UsageError as error:
-            raise ValueError(f"project={project}: {first_line(error)}") from error
+            raise SettingError(f"project={project}: {first_line(error)}") from error
         except ValidationError as error:  # of what wandb reads from the environment and from its own files
             wrong = error.errors()[0]
-            raise ValueError(f"wandb: {'.'.join(map(str, wrong['loc']))}={wrong['input']}: {wrong['msg']}") from error
+            raise SettingError(f"wandb: {'.'.join(map(str, wrong['loc']))}={wrong['input']}: {wrong['msg']}") from error
 
         def start(chosen: WandbMode) -> wandb.Run:
             # `setup` needs the mode, too: it silences the login, and keeps an offline run from reporting its use.
@@ -391,7 +391,7 @@ def _wandb_id(folder: Path) -> str | None:
 def _check_wandb_mode() -> None:
     given = os.environ.get("WANDB_MODE")
     if given and given not in _WANDB_MODES:
-        raise ValueError(f"WANDB_MODE={given}: must be one of {', '.join(_WANDB_MODES)}")
+        raise SettingError(f"WANDB_MODE={given}: must be one of {', '.join(_WANDB_MODES)}")
 
 
 def _wandb_mode(mode: str, server: str) -> WandbMode:

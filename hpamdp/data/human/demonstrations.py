@@ -17,7 +17,7 @@ from hpamdp.data.human.rest_to_rest import to_rest_to_rest
 from hpamdp.data.human.transitions import decisions, transitions
 from hpamdp.env.boatdock import harbour
 from hpamdp.env.boatdock.environment import BoatDockEnv
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 
 
 class PeoplesOptions(Settings):
@@ -102,9 +102,9 @@ class PlayedDemonstrations(Demonstrations):
 
 def _boats(env: object) -> BoatDockEnv:
     if not isinstance(env, BoatDockEnv):
-        raise ValueError("people docked boats; use env=boatdock or data=none")
+        raise SettingError("people docked boats; use env=boatdock or data=none")
     if not env.rules.are_peoples:
-        raise ValueError(
+        raise SettingError(
             "people kept one of their two boats; use data=none, or leave out env.boats and env.switch_cost"
         )
     return env

@@ -33,6 +33,7 @@ from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
+from hpamdp.settings import SettingError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -130,7 +131,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
     def _prepare(self) -> None:
         options = self.options
         if self._has_human and not options.are_peoples:
-            raise ValueError(
+            raise SettingError(
                 f"{options.unlike_peoples()}: people kept one of their two boats, so what they chose says nothing "
                 "here; leave it out"
             )

@@ -26,7 +26,7 @@ from hpamdp.env.boatdock_released.rules import ReleasedState
 from hpamdp.env.counter_env import Action, CounterEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.state_columns import check_range, where
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 
 
 class ReleasedBoatDockOptions(Settings):
@@ -105,7 +105,7 @@ class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
         **settings: Any,
     ) -> None:
         if dtype not in ("float32", "float64"):
-            raise ValueError(f"ReleasedBoatDockEnv: {dtype=}, but must be float32 or float64")
+            raise SettingError(f"ReleasedBoatDockEnv: {dtype=}, but must be float32 or float64")
         self.float_type = getattr(torch, dtype)
         super().__init__(num_envs, options=options, device=device, seed=seed, first_env=first_env, **settings)
 

@@ -31,6 +31,8 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from hpamdp.settings import SettingError
+
 _ACCEPTED = (
     "accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P, where P is a Tuple or a Dict of K Boxes or "
     "one Box for all discrete actions, Tuple(Discrete(K), Box, ..., Box) with K Boxes, and OneOf(K Boxes)"
@@ -156,7 +158,7 @@ class ActionSpace:
         size = int(np.prod(self._boxes[0].shape))
         if len(parameter_dims) != num_discrete or min(parameter_dims) < 0 or sum(parameter_dims) != size:
             allowed = f"{num_discrete} numbers of at least 0 that add up to {size}"
-            raise ValueError(f"{given}, but must be {allowed}, with the action space {written(self._space)}")
+            raise SettingError(f"{given}, but must be {allowed}, with the action space {written(self._space)}")
 
     def _refusal(self, reason: str) -> ValueError:
         return ValueError(f"action space {written(self._space)}: {reason}; {_ACCEPTED}")
@@ -195,7 +197,7 @@ class OptionSpace:
         option = entries.pop(option_key, None)
         if not isinstance(option, spaces.Discrete) or not entries:
             given = written(space)
-            raise ValueError(
+            raise SettingError(
                 f"option_key={option_key}: must name a Discrete beside the action, in the action space {given}"
             )
         self._key = option_key

@@ -28,6 +28,7 @@ from hpamdp.env.gymnasium.masks import Masks, MaskSource
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
 from hpamdp.env.gymnasium.time_limit import with_limit
 from hpamdp.env.gymnasium.values import flag
+from hpamdp.env.registration import register
 from hpamdp.messages import one_line
 from hpamdp.settings import SettingError, Settings
 
@@ -116,8 +117,9 @@ class GymnasiumEnv(PAMDPEnv):
         if (options.id is None) == (options.entry_point is None):
             given = "neither is" if options.id is None else "both are"
             raise SettingError(f"set env.id=Name-v0 or env.entry_point=package.module:name; {given} set")
+        register()
         if num_envs < 1:
-            raise ValueError(f"GymnasiumEnv: {num_envs=}, but must be at least 1")
+            raise SettingError(f"GymnasiumEnv: {num_envs=}, but must be at least 1")
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.first_env = first_env
@@ -143,7 +145,7 @@ class GymnasiumEnv(PAMDPEnv):
                 self.envs[0].observation_space, options.observation_scaling, observation_keys, options.out_of_bounds
             )
         except ValueError as error:
-            raise ValueError(f"{self._name}: {error}") from error
+            raise SettingError(f"{self._name}: {error}") from error
         self.parameter_dims = self._actions.parameter_dims
         self.option_names = self._names_of_options()
         self._make_specs()
@@ -226,18 +228,18 @@ class GymnasiumEnv(PAMDPEnv):
                 return checked(gymnasium.make(id, max_episode_steps=limit, disable_env_checker=True, **kwargs))
             env = self._load(self.options.entry_point)(**kwargs)
         except (gymnasium.error.Error, ImportError) as error:
-            raise ValueError(f"{self._name}: {one_line(error)}") from error
+            raise SettingError(f"{self._name}: {one_line(error)}") from error
         except (TypeError, ValueError) as error:
             cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
             if isinstance(cause, ValidationError):  # a class with Options refuses a setting
                 wrong = cause.errors()[0]
                 given = "".join(f"{name}={wrong['input']}: " for name in wrong["loc"][:1])
-                raise ValueError(f"{self._name}: {given}{wrong['msg']}") from error
+                raise SettingError(f"{self._name}: {given}{wrong['msg']}") from error
             # A constructor may pass unknown arguments on to another one, which then raises the error.
             is_unknown = any(f"unexpected keyword argument '{name}'" in str(cause) for name in kwargs)
             if not (is_unknown or _is_about_the_call(cause)):
                 raise
-            raise ValueError(f"{self._name}: {one_line(cause)}") from error
+            raise SettingError(f"{self._name}: {one_line(cause)}") from error
         if not isinstance(env, gymnasium.Env):
             env = FourValueEnv(env)
         return checked(env)
@@ -248,15 +250,16 @@ class GymnasiumEnv(PAMDPEnv):
             for name in ("action_space", "observation_space"):
                 if getattr(env, name) != getattr(first, name):
                     given, wanted = written(getattr(env, name)), written(getattr(first, name))
-                    raise ValueError(f"{self._name}: the {name} of copy {row} is {given}, but that of copy 0 {wanted}")
+                    different = f"the {name} of copy {row} is {given}, but that of copy 0 {wanted}"
+                    raise SettingError(f"{self._name}: {different}")
 
     def _load(self, entry_point: str) -> Any:
         module_name, _, name = entry_point.partition(":")
         if not all(part.isidentifier() for part in (*module_name.split("."), name)):
-            raise ValueError(f"{self._name}: must be a class or function, as package.module:name")
+            raise SettingError(f"{self._name}: must be a class or function, as package.module:name")
         entry = getattr(importlib.import_module(module_name), name, None)
         if not callable(entry):
-            raise ValueError(f"{self._name}: there is no class or function {name} in {module_name}")
+            raise SettingError(f"{self._name}: there is no class or function {name} in {module_name}")
         return entry
 
     def _names_of_options(self) -> tuple[str, ...]:
@@ -265,7 +268,7 @@ class GymnasiumEnv(PAMDPEnv):
         try:
             names = checked_option_names(() if given is None else given)
         except ProblemError as error:
-            raise ValueError(f"{self._name}: {error}") from error
+            raise SettingError(f"{self._name}: {error}") from error
         return names if num_options and len(names) == num_options else tuple(f"option{i}" for i in range(num_options))
 
     def _make_specs(self) -> None:

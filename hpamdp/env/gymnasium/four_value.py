@@ -12,6 +12,7 @@ from gymnasium import spaces
 
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.values import flag, shown
+from hpamdp.settings import SettingError
 
 _ADVICE = "an environment with Gymnasium's interface must inherit from gymnasium.Env"
 
@@ -36,7 +37,7 @@ class FourValueEnv(gymnasium.Env):
     def __init__(self, env: Any) -> None:
         missing = [name for name in ("reset", "step", "action_space", "observation_space") if not hasattr(env, name)]
         if missing:
-            raise ValueError(f"FourValueEnv: {_kind(env)} is no environment: it has no {', '.join(missing)}")
+            raise SettingError(f"FourValueEnv: {_kind(env)} is no environment: it has no {', '.join(missing)}")
         self.env = env
         self.spec = getattr(env, "spec", None)
         self.metadata = getattr(env, "metadata", {})
@@ -94,7 +95,7 @@ def to_gymnasium(space: Any) -> spaces.Space:
     for attributes, convert in _CONVERSIONS:
         if all(hasattr(space, attribute) for attribute in attributes):
             return convert(space)
-    raise ValueError(
+    raise SettingError(
         f"FourValueEnv: {_kind(space)} is no known space: "
         "accepted are Box, Discrete, MultiDiscrete, MultiBinary, Tuple and Dict"
     )

@@ -11,6 +11,7 @@ from gymnasium.spaces.utils import flatten
 
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.values import as_numbers, shown
+from hpamdp.settings import SettingError
 
 OutOfBounds = Literal["refuse", "clip", "allow"]
 
@@ -182,7 +183,7 @@ def leaves(
         ValueError: `out_of_bounds` has no allowed value.
     """
     if out_of_bounds not in get_args(OutOfBounds):
-        raise ValueError(f"out_of_bounds={out_of_bounds}, but must be one of {', '.join(get_args(OutOfBounds))}")
+        raise SettingError(f"out_of_bounds={out_of_bounds}, but must be one of {', '.join(get_args(OutOfBounds))}")
     entries = children(space)
     if not isinstance(space, spaces.Tuple | spaces.Dict):
         yield Leaf(space, path, lengths, out_of_bounds)

@@ -16,6 +16,7 @@ from hpamdp import keys
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.leaves import leaves
 from hpamdp.env.gymnasium.values import as_numbers, shown
+from hpamdp.settings import SettingError
 
 MaskSource = Literal["info", "ignore"]
 
@@ -51,7 +52,7 @@ class Masks:
 
     def __init__(self, env: gymnasium.Env, num_envs: int, sizes: Mapping[str, int], source: MaskSource | None) -> None:
         if source not in (None, "info", "ignore"):
-            raise ValueError(f"action_mask={source}: must be info, ignore or null")
+            raise SettingError(f"action_mask={source}: must be info, ignore or null")
         space = env.observation_space
         entries = space.spaces if isinstance(space, spaces.Dict) else {}
         sizes = {name: size for name, size in sizes.items() if size > 0 and source != "ignore"}

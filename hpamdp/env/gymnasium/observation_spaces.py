@@ -18,6 +18,7 @@ from torch import Tensor
 
 from hpamdp.env.gymnasium.action_spaces import written
 from hpamdp.env.gymnasium.leaves import Leaf, OutOfBounds, children, leaves
+from hpamdp.settings import SettingError
 
 Scaling = Literal["bounds", "running", "none"]
 
@@ -53,10 +54,10 @@ class ObservationSpace:
         out_of_bounds: OutOfBounds = "refuse",
     ) -> None:
         if scaling not in get_args(Scaling):
-            raise ValueError(f"observation_scaling={scaling!r}, but must be one of {', '.join(get_args(Scaling))}")
+            raise SettingError(f"observation_scaling={scaling!r}, but must be one of {', '.join(get_args(Scaling))}")
         if not _is_flat(space):
             accepted = "Box, Discrete, MultiDiscrete, MultiBinary and Tuple and Dict of these"
-            raise ValueError(f"observation space {written(space)}; accepted are {accepted}")
+            raise SettingError(f"observation space {written(space)}; accepted are {accepted}")
         self._names = list(children(space))
         self._leaves = list(leaves(space, out_of_bounds))
         if entries is not None:
@@ -165,10 +166,10 @@ class RunningStatistics(RunningMeanStd):
 def _check_entries(space: spaces.Space, entries: Sequence[int | str]) -> None:
     names = list(children(space))
     if not names:
-        raise ValueError(f"observation_keys={entries}: the observation {written(space)} has no entries; use null")
+        raise SettingError(f"observation_keys={entries}: the observation {written(space)} has no entries; use null")
     wrong = [entry for entry in entries if entry not in names]
     if wrong or not entries or len(set(entries)) < len(entries):
-        raise ValueError(f"observation_keys={entries}: must name different entries of {names}; null: all")
+        raise SettingError(f"observation_keys={entries}: must name different entries of {names}; null: all")
 
 
 def _is_flat(space: spaces.Space) -> bool:

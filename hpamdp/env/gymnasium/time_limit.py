@@ -8,6 +8,7 @@ import gymnasium
 from gymnasium.wrappers import TimeLimit
 
 from hpamdp.env.gymnasium.values import shown
+from hpamdp.settings import SettingError
 
 
 def with_limit(env: gymnasium.Env, max_steps: int | None) -> tuple[gymnasium.Env, int]:
@@ -43,9 +44,9 @@ def _limit_of_spec(env: gymnasium.Env) -> int:
     limit = getattr(env.unwrapped.spec, "max_episode_steps", None)
     is_whole = isinstance(limit, numbers.Integral) and not isinstance(limit, bool)
     if limit is None or (is_whole and limit == -1):  # `gymnasium.make` takes -1 as no limit
-        raise ValueError("has no time limit of its own; set env.max_steps")
+        raise SettingError("has no time limit of its own; set env.max_steps")
     if not is_whole or limit < 1:
-        raise ValueError(
+        raise SettingError(
             f"its spec has max_episode_steps={shown(limit)}, which must be a whole number of at least 1; "
             "set env.max_steps"
         )

@@ -11,7 +11,7 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.policies.base import Selector
 from hpamdp.policies.masks import allowed_or_first
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -37,7 +37,7 @@ class Fixed(Selector):
         option = self.options.option
         names = specs.option_names
         if option not in names and option not in range(specs.num_options):
-            raise ValueError(f"option={option}: no such option; there are {', '.join(names)}")
+            raise SettingError(f"option={option}: no such option; there are {', '.join(names)}")
         self.option = names.index(option) if isinstance(option, str) else option
 
     def select(self, td: TensorDictBase) -> Tensor:

@@ -45,7 +45,7 @@ from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
 from hpamdp.policies.shared.sized_by_data import SizedByData
-from hpamdp.settings import Fraction, PositiveFraction, Settings
+from hpamdp.settings import Fraction, PositiveFraction, SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
@@ -621,12 +621,12 @@ def check_features(options: QPAMDPOptions, specs: PAMDPSpecs) -> None:
     """
     features, last = options.features, specs.observation_dim - 1
     if features is not None and (not features or max(features) > last):
-        raise ValueError(f"features={list(features)}: name some of the observation's entries 0 to {last}; null: all")
+        raise SettingError(f"features={list(features)}: name some of the observation's entries 0 to {last}; null: all")
     num_inputs = specs.observation_dim if features is None else len(features)
     num_regressors = specs.num_parameters * num_fourier_features(num_inputs, options.psi_order, options.psi_max_coupled)
     num_regressors += num_fourier_features(num_inputs, options.phi_order, options.phi_max_coupled)
     if num_regressors > MAX_REGRESSORS:
-        raise ValueError(
+        raise SettingError(
             f"phi_order={options.phi_order}, psi_order={options.psi_order}: the regression for the parameters would "
             f"have {num_regressors:,} coefficients, more than {MAX_REGRESSORS:,}; use fewer features or lower orders"
         )

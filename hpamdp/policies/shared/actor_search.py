@@ -18,6 +18,7 @@ from torch.quasirandom import SobolEngine
 
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, AnnealedRateOptions, TwinCriticOptions
 from hpamdp.policies.shared.exploration import EpsilonOptions
+from hpamdp.settings import SettingError
 
 
 class SearchingActorOptions(EpsilonOptions, AnnealedRateOptions, TwinCriticOptions, ActorCriticOptions):
@@ -71,7 +72,7 @@ def even_normal(num: int, dim: int, deviation: float) -> Tensor:
     if num == 0 or dim == 0:
         return torch.zeros(num, dim, dtype=torch.float32)
     if dim > SobolEngine.MAXDIM:
-        raise ValueError(
+        raise SettingError(
             f"greedy_samples={num}: {dim} parameters are more than {SobolEngine.MAXDIM}; use greedy_samples=0"
         )
     uniform = SobolEngine(dim, scramble=True, seed=0).draw(num, dtype=torch.float32)

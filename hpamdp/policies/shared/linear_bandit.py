@@ -16,7 +16,7 @@ from hpamdp import keys
 from hpamdp.policies.base import Selector, is_greedy
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.bandit import BanditOptions, RewardStatistics
-from hpamdp.settings import Indices
+from hpamdp.settings import Indices, SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -56,13 +56,13 @@ class ContextFeatures(nn.Module):
         degree = options.degree
         if not inputs or not all(0 <= i < specs.observation_dim for i in inputs):
             last = specs.observation_dim - 1
-            raise ValueError(f"inputs={inputs}: the observation has entries 0 to {last}; null: all")
+            raise SettingError(f"inputs={inputs}: the observation has entries 0 to {last}; null: all")
         if len(set(inputs)) < len(inputs):
-            raise ValueError(f"inputs={inputs}: names an entry twice")
+            raise SettingError(f"inputs={inputs}: names an entry twice")
         self.is_polynomial = options.features == "polynomial"
         self.num_features = math.comb(len(inputs) + degree, degree) if self.is_polynomial else degree + 1
         if self.num_features > 2000:
-            raise ValueError(f"degree={degree}: {self.num_features} features of {len(inputs)} inputs; at most 2000")
+            raise SettingError(f"degree={degree}: {self.num_features} features of {len(inputs)} inputs; at most 2000")
         self.register_buffer("inputs", torch.tensor(inputs))
         if self.is_polynomial:
             # A monomial is a product of `degree` factors, each an input or the constant 1, which comes last.

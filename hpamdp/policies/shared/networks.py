@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 # Initial parameters: the problem's own convention, if it has one (`domain`), or the network's initial output (`none`).
@@ -149,7 +150,7 @@ class VectorProducts(nn.Module):
         super().__init__()
         geometry = specs.geometry
         if geometry is None or len(geometry.vectors) < 2:
-            raise ValueError(
+            raise SettingError(
                 "vector_products=true: the problem declares no two vectors of the plane; use vector_products=false"
             )
         self.register_buffer("entries", torch.tensor(geometry.vectors), persistent=False)

@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp.geometry import Symmetries
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -23,7 +24,7 @@ class RandomSymmetry:
 
     def __init__(self, specs: PAMDPSpecs, device: torch.device) -> None:
         if specs.symmetries is None:
-            raise ValueError("augment=true: the problem declares no symmetries; use augment=false")
+            raise SettingError("augment=true: the problem declares no symmetries; use augment=false")
         self.maps: Symmetries = specs.symmetries.to(device)
 
     def __call__(self, rows: TensorDictBase) -> TensorDictBase:

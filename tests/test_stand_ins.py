@@ -1,0 +1,64 @@
+"""Classes read with stand-ins for slow libraries tell the same as the real ones, and leave nothing behind."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import CONF, choices
+from told_by_classes import told
+
+from hpamdp.config.components import GROUPS, load_class
+
+FILES = [(group, name) for group in GROUPS for name in choices(group)]
+
+
+def target_of(group: str, name: str) -> str | None:
+    return yaml.safe_load((CONF / group / f"{name}.yaml").read_text())["_target_"]
+
+
+def python(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    environment = os.environ | {"PYTHONPATH": str(CONF.parent)}
+    return subprocess.run([sys.executable, *words], capture_output=True, text=True, cwd=cwd, env=environment)
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """What all classes tell in a process with stand-ins, and which modules it has left."""
+    targets = [(target_of(group, name), group) for group, name in FILES]
+    script = str(Path(__file__).with_name("told_by_classes.py"))
+    done = python(script, json.dumps([each for each in targets if each[0] is not None]))
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize(("group", "name"), FILES)
+def test_a_class_read_with_stand_ins_has_the_settings_and_facts_of_the_real_one(group, name, quick):
+    target = target_of(group, name)
+    if target is not None:
+        assert quick["told"][target] == json.loads(json.dumps(told(load_class(target), group)))
+
+
+def test_modules_with_stand_ins_are_not_seen_afterwards(quick):
+    assert quick["left"] == []
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["low.gamma=hi", "low.gama=1", "total_frames=-1", "high=none", "env=goal high=ucb", "num_envs=3 collector=multi"],
+)
+def test_a_wrong_setting_is_refused_before_torch_is_imported(words, tmp_path):
+    program = f"""
+import sys
+sys.argv = ["hpamdp", *{words.split()!r}]
+from hpamdp.cli import main
+try:
+    main()
+except SystemExit as end:
+    print(end.code, "torch" in sys.modules, "tensordict" in sys.modules)
+"""
+    done = python("-c", program, cwd=tmp_path)
+    assert done.stdout == "2 False False\n" and done.stderr.count("\n") == 1, done.stderr

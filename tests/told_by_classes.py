@@ -1,0 +1,25 @@
+"""What a class tells of its settings and of itself; run in a process of its own, it reads classes with stand-ins."""
+
+import json
+import sys
+
+from hpamdp.config.components import GROUPS, defaults_of, load_class, options_model
+from hpamdp.config.stand_ins import quick_imports
+
+# Facts of classes that the rules of `hpamdp.run.compatibility` read.
+FACTS = ("modes", "needs", "is_bandit", "ends_options", "asks_learners", "value_option", "guarded_settings")
+
+
+def told(cls: type, group: str) -> dict:
+    """Return the settings' defaults and the facts of a class as JSON values."""
+    facts = {name: list(value) if isinstance(value := getattr(cls, name, None), tuple) else value for name in FACTS}
+    return {"defaults": defaults_of(options_model(cls, GROUPS[group])), "facts": facts}
+
+
+if __name__ == "__main__":
+    before = set(sys.modules)
+    with quick_imports():
+        classes = {target: (load_class(target), group) for target, group in json.loads(sys.argv[1])}
+    rooms = ("hpamdp.env", "hpamdp.policies", "hpamdp.run", "torch", "tensordict")
+    left = sorted(name for name in set(sys.modules) - before if name.startswith(rooms))
+    print(json.dumps({"told": {target: told(*each) for target, each in classes.items()}, "left": left}))
