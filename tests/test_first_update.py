@@ -9,8 +9,11 @@ from test_grid import SHORT
 
 from hpamdp.config.errors import ConfigError
 from hpamdp.policies.base import have_stepped
-from hpamdp.run.assemble import assemble
+from hpamdp.policies.low_level.pdqn import PDQN
+from hpamdp.run.assemble import assemble, make_agent, make_env, set_up_updates
+from hpamdp.run.closing_table import short_sight
 from hpamdp.run.train import run
+from hpamdp.specs import PAMDPSpecs
 
 TINY = ["num_envs=16", "steps_per_batch=4", "eval.layouts=4", "eval.every=0"]
 
@@ -66,3 +69,28 @@ def test_optimizers_with_a_state_show_whether_they_have_stepped():
     weight.sum().backward()
     adam.step()
     assert have_stepped({"adam": adam, "plain": plain})
+
+
+def test_the_closing_table_names_learners_that_look_far_less_ahead_than_episodes_last():
+    config = make_config(["env=platform", "low=pdqn", "low.gamma=0.5"])
+    assert short_sight(config.learners, 9.0) == [
+        "low=pdqn: low.gamma=0.5 counts about 2 steps, but episodes have 9 on average"
+    ]
+    assert short_sight(config.learners, 8.0) == []
+    planner = make_config(["env=platform", "low=dlpa", "low.horizon=3"])
+    assert short_sight(planner.learners, 30.0) == [
+        "low=dlpa: plans see low.horizon=3 steps, but episodes have 30 on average"
+    ]
+
+
+def test_updates_are_compiled_by_default_if_the_run_makes_many(monkeypatch):
+    asked = []
+    monkeypatch.setattr(PDQN, "compile_updates", lambda self: asked.append(self))
+    few, many = (f"total_frames={steps}" for steps in (20_000, 400_000))
+    for words, is_compiled in (([few], False), ([many], True), ([many, "compile_updates=false"], False)):
+        asked.clear()
+        config = make_config(["env=platform", "low=pdqn", "low.updates_per_step=0.1", *words])
+        env = make_env(config, 1, torch.device("cpu"), 0)
+        agent = make_agent(config, PAMDPSpecs.from_env(env), torch.device("cpu"))
+        set_up_updates(config, agent)
+        assert bool(asked) is is_compiled, words

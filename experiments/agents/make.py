@@ -44,7 +44,7 @@ AGENTS = {
 
 def make(name: str) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        words = [*AGENTS[name], f"hydra.run.dir={folder}", "overwrite=true"]
+        words = [*AGENTS[name], "compile_updates=false", f"hydra.run.dir={folder}", "overwrite=true"]
         subprocess.run([sys.executable, str(ROOT / "run.py"), *words], check=True)
         keep(name, Path(folder))
 

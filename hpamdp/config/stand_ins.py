@@ -16,7 +16,20 @@ from types import ModuleType
 from typing import Any
 
 _SLOW = frozenset(
-    {"gymnasium", "h5py", "matplotlib", "minari", "numba", "numpy", "optuna", "PIL", "pooch", "ray", "scipy", "tensorboard"}
+    {
+        "gymnasium",
+        "h5py",
+        "matplotlib",
+        "minari",
+        "numba",
+        "numpy",
+        "optuna",
+        "PIL",
+        "pooch",
+        "ray",
+        "scipy",
+        "tensorboard",
+    }
     | {"tensordict", "torch", "torchrl", "tqdm", "wandb"}
 )
 _PACKAGE = __name__.partition(".")[0]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, ClassVar, Protocol
 
 import torch
@@ -380,6 +381,7 @@ class Learner(Level, nn.Module):
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
             counters. They start afresh if a new run takes over the learner.
         next_options: which options follow one that ended, and their values. The agent sets it.
+        while_compiling: gives a context for updates that are compiled first, which takes seconds. The run sets it.
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train",)
@@ -388,6 +390,7 @@ class Learner(Level, nn.Module):
 
     policy: TensorDictModuleBase
     next_options: NextOptions
+    while_compiling: Callable[[], AbstractContextManager] = nullcontext
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+from hpamdp.config.components import Component
 from hpamdp.env.base import Metric
 from hpamdp.figure_style import REFERENCES
 from hpamdp.messages import duration
 from hpamdp.metrics_file import FRAMES, WALL_SECONDS
 
 WITHOUT_UPDATE = "without_update"  # names of the levels that made no update
+SHORT_SIGHT = "short_sight"  # lines about learners that look far less ahead than episodes last
+# An episode is far longer than a learner looks ahead if it has more than this many times the steps.
+_FAR = 4.0
 
 
 def _number(value: float) -> str:
@@ -25,7 +29,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     """Return a plain aligned table of this agent beside the references.
 
     Args:
-        summary: the agent's figures by their names, `references`, `mode`, `frames`, `wall_s` and `without_update`.
+        summary: the agent's figures by their names, `references`, `mode`, `frames`, `wall_s`,
+            `without_update` and `short_sight`.
             Rows that the agent has no figure for are left out, and so are columns without any.
         metrics: the rows.
     """
@@ -48,9 +53,30 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     for first, *others in cells:
         aligned = [first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]
         lines.append("   ".join(aligned).rstrip())
+    lines += summary.get(SHORT_SIGHT, [])
     without = summary.get(WITHOUT_UPDATE, [])
     lines += [f"no update was made: {', '.join(without)}"] if without else []
     return "\n".join([*lines, *_effort(summary)])
+
+
+def short_sight(learners: Iterable[Component], episode_steps: float) -> list[str]:
+    """Return a line for each learner that looks far less ahead than the episodes that were seen.
+
+    Args:
+        learners: with a discount `gamma` or a planning `horizon` among their settings.
+        episode_steps: mean length of the episodes.
+    """
+    lines: dict[str, None] = {}
+    for low in learners:
+        gamma, horizon = low.settings.get("gamma"), low.settings.get("horizon")
+        seen = ""
+        if isinstance(horizon, int) and not low.settings.get("end_values") and episode_steps > _FAR * horizon:
+            seen = f"{low}: plans see low.horizon={horizon} steps"
+        elif isinstance(gamma, float) and gamma < 1.0 and episode_steps > _FAR / (1.0 - gamma):
+            seen = f"{low}: low.gamma={gamma} counts about {1.0 / (1.0 - gamma):.0f} steps"
+        if seen:
+            lines[f"{seen}, but episodes have {episode_steps:.0f} on average"] = None
+    return list(lines)
 
 
 def _order(reference: str) -> int:

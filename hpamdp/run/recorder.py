@@ -20,7 +20,7 @@ from hpamdp.files import replacing
 from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import Parts
-from hpamdp.run.closing_table import WITHOUT_UPDATE, closing_table
+from hpamdp.run.closing_table import SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
 from hpamdp.run.loggers import CSVLogger, EarlierRun, Guarded, Logger
 from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
 from hpamdp.run.summary import summarise
@@ -166,6 +166,7 @@ class Recorder:
         summary = summarise(self.config, env, measured, self._random, effort, is_finished=is_finished)
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
+            summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
         with replacing(self.output_dir / SUMMARY_NAME) as partial:
             partial.write_text(json.dumps(summary, indent=2) + "\n")
         logger = self._logger

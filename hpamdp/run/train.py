@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -21,6 +23,7 @@ from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
+from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import Parts, assemble
 from hpamdp.run.capacity import memory_errors_explained
@@ -269,6 +272,9 @@ class Trainer:
             mininterval=1.0,
             file=LenientStream(sys.stderr),
         )
+        for learner in self.parts.agent.learners:
+            assert isinstance(learner, Learner)
+            learner.while_compiling = partial(_said_by, bar, "compiling the updates")
         with bar:
             if self.last_score is None and self.frames == 0:
                 self._evaluate(bar)
@@ -397,6 +403,16 @@ def check_scalars(scalars: Mapping[str, float]) -> None:
     for name, value in scalars.items():
         if not math.isfinite(value):
             raise DivergedError(f"{name} is {value}")
+
+
+@contextmanager
+def _said_by(bar: tqdm, text: str) -> Iterator[None]:
+    """Show a text before the bar, at once and as long as the block takes."""
+    bar.set_description_str(text)
+    try:
+        yield
+    finally:
+        bar.set_description_str(None)
 
 
 def _tell_notices(collection: Collection, bar: tqdm) -> None:

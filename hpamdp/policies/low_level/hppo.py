@@ -273,7 +273,7 @@ class HPPO(OnPolicy, Learner):
     def compile_updates(self) -> None:
         """Compile the loss and its gradient, at the first update."""
         # Minibatches differ in size where other options take their share of the steps.
-        self.descent.compile(self.frames.device, any_size=True)
+        self.descent.compile(self.frames.device, any_size=True, while_compiling=lambda: self.while_compiling())
 
     def lower_precision(self) -> None:
         """Have the matrix products of the loss and its gradient in bfloat16."""

@@ -6,7 +6,7 @@ Compiled code merges the many small operations around the matrix products.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torch._dynamo.guards import GuardFilterEntry
 
 Inputs: TypeAlias = Tensor | Mapping[str, Tensor] | TensorDictBase | None
-# Maps what an update sees to the loss and to scalars to log.
+# Maps what an update sees to the loss and to scalars to log; a function or a method, which has a name.
 LossFunction = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 Gradients = Callable[..., tuple[dict[str, Tensor], tuple[Tensor | None, ...]]]
 
@@ -27,11 +27,26 @@ class Descent:
 
     def __init__(self) -> None:
         self._gradients_of: Gradients = gradients_of
+        self._while_compiling: Callable[[], AbstractContextManager] = nullcontext
+        self._losses: set[str] = set()  # of which the gradients have been compiled
         self.precision = torch.float32
 
-    def compile(self, device: torch.device, *, any_size: bool) -> None:
-        """Compile the gradients of each loss at the first step down it; see `compiled`."""
+    def compile(
+        self,
+        device: torch.device,
+        *,
+        any_size: bool,
+        while_compiling: Callable[[], AbstractContextManager] = nullcontext,
+    ) -> None:
+        """Compile the gradients of each loss at the first step down it; see `compiled`.
+
+        Args:
+            device: of the parameters.
+            any_size: whether the inputs of a loss change their size.
+            while_compiling: gives a context for the steps that compile, which take seconds.
+        """
         self._gradients_of = compiled(device, any_size=any_size)
+        self._while_compiling = while_compiling
 
     def lower_precision(self) -> None:
         """Compute matrix products in bfloat16; parameters and sums over many terms stay in float32."""
@@ -56,7 +71,11 @@ class Descent:
         """
         groups = optimizer.param_groups
         parameters = [parameter for group in groups for parameter in group["params"] if parameter.requires_grad]
-        scalars, gradients = self._gradients_of(loss_of, parameters, *inputs, precision=self.precision)
+        is_first = self._gradients_of is not gradients_of and loss_of.__qualname__ not in self._losses
+        with self._while_compiling() if is_first else nullcontext():
+            scalars, gradients = self._gradients_of(loss_of, parameters, *inputs, precision=self.precision)
+        if is_first:
+            self._losses.add(loss_of.__qualname__)
         for parameter, gradient in zip(parameters, gradients, strict=True):
             parameter.grad = gradient
         if max_grad_norm is not None:

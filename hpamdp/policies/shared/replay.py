@@ -163,7 +163,7 @@ class ReplayLearner(Learner):
 
     def compile_updates(self) -> None:
         """Compile the gradients of each loss, at the first gradient step that needs it."""
-        self.descent.compile(self.frames.device, any_size=False)
+        self.descent.compile(self.frames.device, any_size=False, while_compiling=lambda: self.while_compiling())
 
     def lower_precision(self) -> None:
         """Compute the matrix products of losses and gradients in bfloat16."""
