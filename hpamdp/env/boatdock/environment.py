@@ -31,6 +31,7 @@ from hpamdp.env.boatdock.task import BoatState
 from hpamdp.env.counter_env import Action, CounterEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.play_page import EpisodeError
 from hpamdp.env.state_columns import check_range
 from hpamdp.geometry import PlaneGeometry, Symmetries, as_directions, make_symmetries, on_observations, plane_maps
 from hpamdp.settings import SettingError
@@ -393,7 +394,10 @@ def _figures_of(recording: str, controller: str) -> dict[str, float]:
     from hpamdp.env.boatdock.play import episodes  # only recordings need it
 
     of_controller = controller if controller in harbour.CONTROLLERS else None
-    means = episodes.figures([*episodes.read(Path(recording)).values()], of_controller)
+    try:
+        means = episodes.figures([*episodes.read(Path(recording)).values()], of_controller)
+    except EpisodeError as error:
+        raise SettingError(str(error)) from error
     return {
         **means,
         "human_normalised": human_normalised(means["score"], "chosen" if of_controller is None else controller),

@@ -2,7 +2,7 @@
 
 Source: `BDtrajectory40.mat`, the human data released with *A Benchmark for Hierarchical Parameterized Action Markov
 Decision Process* (MIT licence): 40 people, 360 episodes each. A score is 5 x the fuel left (the file's `tank`, as a
-fraction of 360 frames) on success and -1 otherwise. Shares are fractions of episodes. People chose their boat at every
+fraction of 360 ticks) on success and -1 otherwise. Shares are fractions of episodes. People chose their boat at every
 episode, so their figures with one boat are those of the episodes in which they had chosen it.
 
 The figures have the names that they have in `metrics.csv`: `score`, `success`, `too_fast`, `out_of_bounds`,

@@ -48,7 +48,7 @@ TANK = 5.0
 EMPTY = 1e-6  # with no more fuel than this the tank is empty
 SUCCESS_REWARD = 10.0
 NO_KEYMAP = -1  # what the congruent boat observes
-_FRAME = 0.02  # seconds
+_TICK = 0.02  # seconds
 _COS30 = 0.866  # sic
 # Directions by key map (the congruent boat has only one) and key.
 DIRECTIONS = {
@@ -127,8 +127,8 @@ def is_within_30_degrees(points: Tensor) -> Tensor:
 
 def reach(seconds: Tensor) -> Tensor:
     """Return the px that a press moves the boat: forwards up to .3 s, beyond that further and further backwards."""
-    frames = seconds / _FRAME
-    return 10.0 * _FRAME * frames.square() * (10.0 - 0.6667 * frames)
+    ticks = seconds / _TICK
+    return 10.0 * _TICK * ticks.square() * (10.0 - 0.6667 * ticks)
 
 
 def press(state: ReleasedState, direction: Tensor, duration: Tensor, max_steps: int) -> tuple[ReleasedState, Tensor]:
