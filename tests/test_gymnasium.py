@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from gymnasium_players import TOY, action, make, reset_rows, step
-from omegaconf import OmegaConf
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 from toy_environments import ALL, FORMS, Toy, native_action
@@ -280,7 +279,7 @@ def test_the_time_limit_of_a_four_value_environment_is_a_truncation():
 
 
 def mistake_in(**options) -> str:
-    node = OmegaConf.create({"_target_": "hpamdp.env.gymnasium.environment.GymnasiumEnv", **options})
+    node = {"_target_": "hpamdp.env.gymnasium.environment.GymnasiumEnv", **options}
     with pytest.raises(ConfigError) as raised:
         component("env", "gymnasium", node).build(num_envs=2, device="cpu", seed=0)
     assert "\n" not in str(raised.value) and "GymnasiumEnv" in str(raised.value)
