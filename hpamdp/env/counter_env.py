@@ -343,6 +343,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         outcome = Categorical(len(self.outcomes), shape=(n,), device=device)
         knowledge = self._knowledge_specs()
         self._has_knowledge = bool(knowledge)
+        self._plain_keys = _PLAIN_KEYS.union(self.entry_names)
         self.observation_spec = Composite(
             {keys.OBSERVATION: observation, keys.OUTCOME: outcome, **entries, **knowledge}, shape=(n,), device=device
         )
@@ -471,7 +472,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         is_plain = self.rows is not None and not self._has_knowledge and tensordict.device == self.device
-        if not is_plain or not _PLAIN_KEYS.union(self.entry_names).issuperset(tensordict.keys()):
+        if not is_plain or not self._plain_keys.issuperset(tensordict.keys()):
             return super()._step_and_maybe_reset(tensordict)
         leaves = self._action_leaves(tensordict)
         if self.rows is None:  # the parameters require gradients
