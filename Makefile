@@ -9,11 +9,12 @@ RAY := .venv-ray-launcher
 LOWEST := .venv-lowest
 DOCS := .venv-docs
 
+# Of all lines that Python executes: kernels run as machine code, which leaves no trace.
 COVERAGE := --cov=hpamdp --cov-report=term:skip-covered --cov-fail-under=90
 # The one slow test that needs the Ray launcher, which shares no environment with the others.
 RAY_TEST := test_a_killed_sweep_is_finished_by_the_same_command and ray
 
-.PHONY: play run test slow slow-tests ray-launcher wheel lowest report docs
+.PHONY: play run test slow coverage slow-tests ray-launcher wheel lowest report docs
 
 # Dock boats yourself, in the browser, beside agents. Ctrl-C ends it.
 play: $(VENV)/.installed
@@ -24,21 +25,26 @@ run: $(VENV)/.installed
 	$(PYTHON) run.py high=ucb low=hyar $(ARGS)
 
 # Each process of the tests has one core, and the threads of NumPy's matrix products would wait for one another.
-test slow-tests ray-launcher lowest: export OMP_NUM_THREADS = 1
+test coverage slow-tests ray-launcher lowest: export OMP_NUM_THREADS = 1
 
 # The gate: what every change has to pass.
 test: $(VENV)/.installed-dev
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m ruff format --check .
 	$(PYTHON) -m mypy hpamdp
-	$(PYTHON) -m pytest -n auto --dist worksteal $(COVERAGE) $(ARGS)
+	$(PYTHON) -m pytest -n auto --dist worksteal $(ARGS)
 
-# What takes longer, one after another: launchers, Ray, the wheel, the oldest dependencies.
+# What takes longer, one after another: coverage, launchers, Ray, the wheel, the oldest dependencies.
 slow:
+	$(MAKE) coverage
 	$(MAKE) slow-tests
 	$(MAKE) ray-launcher
 	$(MAKE) wheel
 	$(MAKE) lowest
+
+# The quick tests once more, under a tracer that doubles their time.
+coverage: $(VENV)/.installed-dev
+	$(PYTHON) -m pytest -n auto --dist worksteal $(COVERAGE) $(ARGS)
 
 # All slow tests, and those quick ones on sweeps that need a launcher. Those of the page of `make play` in a browser skip
 # where there is no Chromium; on Debian, `apt-get install chromium` brings one.

@@ -86,48 +86,6 @@ def global_generators_unmoved() -> Iterator[None]:
     assert states() == before
 
 
-# Coverage is not measured in these: they take whole programs, or many steps, through lines that other tests reach.
-WITHOUT_COVERAGE = {
-    "test_architecture",
-    "test_bandits",
-    "test_boats",
-    "test_checkpoint",
-    "test_command_line",
-    "test_config",
-    "test_counter_kernels",
-    "test_decisions",
-    "test_extending",
-    "test_figures",
-    "test_following_options",
-    "test_grid",
-    "test_human_file",
-    "test_hyar",
-    "test_learners_of_options",
-    "test_linear_bandits",
-    "test_masks",
-    "test_offline",
-    "test_option_ends",
-    "test_pages",
-    "test_pdqn",
-    "test_physics",
-    "test_planner",
-    "test_play_replay",
-    "test_reliability",
-    "test_resume",
-    "test_selectors",
-}
-
-
-def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
-    """Measure coverage in the first case alone of a test with several: the tracer takes half as long as the tests."""
-    seen = set()
-    for item in items:
-        name = item.nodeid.partition("[")[0]
-        if name in seen or item.path.stem in WITHOUT_COVERAGE:
-            item.add_marker(pytest.mark.no_cover)
-        seen.add(name)
-
-
 @pytest.fixture(scope="session", autouse=True)
 def draw_all() -> Iterator[Callable[..., object]]:
     """Have runs draw no figures, which takes longer than the runs of most tests."""
