@@ -107,7 +107,7 @@ def test_losses_and_their_gradients_stay_on_their_device(name):
     if name.startswith("hyar"):
         rows[LATENT] = torch.rand(8, test_hyar.OPTIONS["embedding_dim"] + test_hyar.OPTIONS["latent_dim"])
     rows = on_meta(rows)
-    losses = {"critics": (learner._critic_loss, rows), "actor": (learner._actor_loss, rows["state"], None)}
+    losses = {"critics": (learner.critic_loss, rows), "actor": (learner.actor_loss, rows["state"], None)}
     for part, (loss_of, *inputs) in losses.items():
         with Answers():
             _, gradients = gradients_of(loss_of, list(getattr(learner, part).parameters()), *inputs)

@@ -96,7 +96,7 @@ def test_the_actor_loss_equals_one_computed_by_hand_and_leaves_the_critics_alone
     expected = -soft_value_by_hand(learner, learner.critics, state)
     before = {name: value.clone() for name, value in learner.state_dict().items()}
     torch.manual_seed(4)
-    loss = learner.gradient_step("actor", learner._actor_loss, state, None)["actor"]
+    loss = learner.gradient_step("actor", learner.actor_loss, state, None)["actor"]
     assert loss.item() == pytest.approx(expected, rel=1e-4, abs=1e-5)
     moved = {name for name, value in learner.state_dict().items() if not torch.equal(value, before[name])}
     assert moved and all(name.startswith(("actor.", "policy.actor.")) for name in moved)
@@ -122,7 +122,7 @@ def test_only_the_executed_actions_own_parameters_count_in_the_entropy(discrete)
 @pytest.mark.parametrize("is_tuned", [True, False])
 def test_a_temperature_falls_above_its_target_rises_below_and_stays_if_fixed(excess, is_tuned):
     learner = make(tune_parameter_temperature=is_tuned)
-    learner.gradient_step("temperatures", learner._temperature_loss, torch.tensor(-excess), torch.tensor(excess))
+    learner.gradient_step("temperatures", learner.temperature_loss, torch.tensor(-excess), torch.tensor(excess))
     discrete_weight, parameter_weight = (weight.item() for weight in learner.temperatures())
     assert (discrete_weight > OPTIONS["discrete_temperature"]) == (excess > 0.0)
     change = parameter_weight / OPTIONS["parameter_temperature"] - 1.0

@@ -241,7 +241,7 @@ def test_the_search_brings_z_to_a_higher_hill_that_the_gradient_does_not_see(dis
         learner.actor.net[-1].weight.zero_()
         learner.actor.net[-1].bias.fill_(0.5)
     for _ in range(300):
-        learner.gradient_step("actor", learner._actor_loss, state, None)
+        learner.gradient_step("actor", learner.actor_loss, state, None)
     z = learner.actor.proposals(learner.actor(state), learner.codec.embeddings)[..., 3:]
     torch.testing.assert_close(z, torch.full_like(z, expected), atol=0.1, rtol=0.0)
 
@@ -254,7 +254,7 @@ def test_the_search_tries_no_forbidden_action(discrete):
     asked = []
     learner.critics.register_forward_pre_hook(lambda _, inputs: asked.append(inputs[1]))
     state = torch.rand(64, 4) * 2 - 1
-    loss, _ = learner._actor_loss(state, allowed)
+    loss, _ = learner.actor_loss(state, allowed)
     gradient = torch.autograd.grad(loss, learner.actor.net[-1].bias)[0]
     if discrete == "greedy":
         assert (gradient.unflatten(0, (3, 3)) != 0.0).any(-1).tolist() == [True, False, True]
@@ -270,7 +270,7 @@ def test_the_penalty_brings_the_actor_back_from_the_bounds():
         learner.actor.net[-1].bias.fill_(8.0)
     state = torch.rand(64, 4) * 2 - 1
     for _ in range(300):
-        learner.gradient_step("actor", learner._actor_loss, state, None)
+        learner.gradient_step("actor", learner.actor_loss, state, None)
     assert learner.actor.raw(state).abs().max() < 3.0
 
 
@@ -358,7 +358,7 @@ def test_the_range_of_a_latent_dimension_that_the_codec_does_not_use_is_that_of_
     with torch.no_grad():
         for parameter in learner.codec.encoder[-1].parameters():
             parameter.zero_()  # mean 0 and variance 1 for every action
-    learner._fit_latent_range()
+    learner.fit_latent_range()
     assert (learner.codec.z_high > 1.8).all() and (learner.codec.z_low < -1.8).all()
 
 

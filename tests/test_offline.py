@@ -115,8 +115,8 @@ def test_the_meta_critic_makes_as_many_updates_offline_as_the_learners_and_keeps
     words = [*overrides(path, "iql", "meta_critic"), "offline.updates=7", "offline.eval_every=0", "high.batch_size=16"]
     parts = assemble(make_config(words), tmp_path)
     made = []
-    update = parts.agent.selector._update
-    parts.agent.selector._update = lambda rows: made.append(len(rows)) or update(rows)
+    update = parts.agent.selector.update_critics
+    parts.agent.selector.update_critics = lambda rows: made.append(len(rows)) or update(rows)
     assert not Trainer(make_config(words), parts, tmp_path).train()
     assert made == [16] * 7 == [16] * int(parts.agent.learners[0].updates)
     assert parts.agent.selector.num_decisions == 0 and parts.agent.selector.epsilon == 1.0

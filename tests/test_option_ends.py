@@ -152,7 +152,7 @@ def test_a_deliberation_cost_makes_options_last():
     agent = train(make_critic(deliberation_cost=0.02, termination_lr=1e-2), 25)
     assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
     place = torch.eye(SPECS.observation_dim)[[4, 20]]
-    beta = agent.selector._beta(place, torch.tensor([0, 1]), None)
+    beta = agent.selector.beta(place, torch.tensor([0, 1]), None)
     assert beta.max() < 0.2
 
 
@@ -168,7 +168,7 @@ def step_rows(critic: OptionCritic) -> TensorDict:
         keys.OPTION_ENDED: torch.tensor([[True], [False], [False]]),
     }
     rows = TensorDict({keys.OBSERVATION: state[:3], keys.OPTION: torch.tensor([0, 1, 1]), "next": after}, [3])
-    return critic._rows(rows)
+    return critic.replay_rows(rows)["buffer"]
 
 
 @pytest.mark.parametrize("decides", [True, False])
@@ -177,9 +177,9 @@ def test_the_targets_of_the_option_critic_equal_those_by_hand(decides):
     critic.decides_ends = decides
     rows = step_rows(critic)
     q = critic.target_critic(rows["next_state"])[0]
-    beta = critic._beta(rows["next_state"], rows["option"], None)[0] if decides else 1.0
+    beta = critic.beta(rows["next_state"], rows["option"], None)[0] if decides else 1.0
     expected = 1.0 + GAMMA * ((1.0 - beta) * q[0] + beta * q.max())
-    assert critic._target(rows).tolist() == pytest.approx([expected.item(), 2.0, 3.0])
+    assert critic.target(rows).tolist() == pytest.approx([expected.item(), 2.0, 3.0])
 
 
 def test_ends_that_are_sure_and_wrong_are_learned_anew():
@@ -198,8 +198,8 @@ def test_ends_that_are_sure_and_wrong_are_learned_anew():
         [64],
     )
     for _ in range(1000):
-        critic._update_termination(rows)
-    beta = critic._beta(rows["next_state"], rows["option"], None)
+        critic.update_termination(rows)
+    beta = critic.beta(rows["next_state"], rows["option"], None)
     assert (beta[0::2] > 0.9).all() and (beta[1::2] < 0.1).all()
 
 
@@ -216,7 +216,7 @@ def test_ends_are_not_learned_where_the_episode_is_over_or_the_option_forbidden(
         [64],
     )
     rows["next_option_mask"][:32] = True
-    critic._update_termination(rows)
+    critic.update_termination(rows)
     assert all(torch.equal(old, new) for old, new in zip(before, critic.termination.parameters(), strict=True))
 
 

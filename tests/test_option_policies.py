@@ -95,7 +95,7 @@ def test_the_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
         for layer in critic.target_critics.layers:
             layer.bias.normal_()
     decisions = mid_episode(critic)
-    rows = critic._rows(decisions)
+    rows = critic.replay_rows(decisions)["buffer"]
     torch.testing.assert_close(rows["discount"], torch.tensor([0.9**3, 0.0, 0.0]))
     torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.2, 0.3]]))
     q = critic.critics(rows["state"])[0].detach()
@@ -103,13 +103,13 @@ def test_the_targets_of_the_meta_critic_are_those_of_semi_mdp_q_learning():
     targets = [0.7 + 0.9**3 * next_value, 0.7, 0.7]
     chosen = decisions[keys.OPTION].tolist()
     expected = sum((q[i, chosen[i]].item() - targets[i]) ** 2 for i in range(3)) / 3
-    assert critic._update(rows).item() == pytest.approx(expected, rel=1e-5)
+    assert critic.update_critics(rows).item() == pytest.approx(expected, rel=1e-5)
 
 
 def test_only_the_chosen_option_has_a_target():
     critic = make(MetaCritic, num_members=1)
-    rows = critic._rows(mid_episode(critic).set(keys.OPTION, torch.ones(3, dtype=torch.long)))
-    critic._update(rows)
+    rows = critic.replay_rows(mid_episode(critic).set(keys.OPTION, torch.ones(3, dtype=torch.long)))["buffer"]
+    critic.update_critics(rows)
     gradient = critic.critics.layers[-1].bias.grad[0, 0]
     assert gradient[0] == 0.0 and gradient[1] != 0.0
 
@@ -124,7 +124,7 @@ def test_an_option_that_idles_until_the_time_limit_is_worth_what_it_paid():
     with torch.no_grad():
         actor.critic[-1].bias.fill_(5.0)
     decisions.update({LOG_PROB: torch.zeros(100), WEIGHT: torch.ones(100)})
-    assert actor._rows(decisions)["target"].tolist() == [3.0, 0.0] * 50
+    assert actor.rows(decisions)["target"].tolist() == [3.0, 0.0] * 50
 
 
 def test_the_probability_of_a_random_option_falls_from_1_after_the_warm_up():
@@ -174,9 +174,9 @@ def test_the_ratio_is_1_in_the_first_minibatch(monkeypatch):
     def loss(rows):
         log_prob = actor.logits(rows["state"]).log_softmax(-1).gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)
         seen.append((log_prob - rows["log_prob"]).abs().max().item())
-        return Actor._loss(actor, rows)
+        return Actor.loss(actor, rows)
 
-    monkeypatch.setattr(actor, "_loss", loss)
+    monkeypatch.setattr(actor, "loss", loss)
     play(actor, by_sign, 64, 64)
     assert len(seen) == 4 and seen[0] < 1e-6 and max(seen[1:]) > 1e-4
 
@@ -184,7 +184,7 @@ def test_the_ratio_is_1_in_the_first_minibatch(monkeypatch):
 def test_the_targets_of_the_actor_are_discounted_by_the_options_length_and_end_with_the_episode():
     actor = make(Actor, gamma=0.9)
     decisions = mid_episode(actor)
-    rows = actor._rows(decisions)
+    rows = actor.rows(decisions)
     next_value = actor.critic(torch.tensor([[0.5, 0.6]])).item()
     assert rows["target"].tolist() == pytest.approx([0.7 + 0.9**3 * next_value, 0.7, 0.7])
     torch.testing.assert_close(rows["state"], torch.tensor([[0.1, 0.2], [0.3, 0.4], [0.2, 0.3]]))

@@ -70,7 +70,7 @@ def test_the_value_of_a_given_action_is_that_of_the_full_pass(multipass):
 def test_the_actor_update_leaves_the_critics_alone():
     learner = make()
     before = {name: value.clone() for name, value in learner.state_dict().items()}
-    learner.gradient_step("actor", learner._actor_loss, torch.randn(32, 4), None)
+    learner.gradient_step("actor", learner.actor_loss, torch.randn(32, 4), None)
     moved = {name for name, value in learner.state_dict().items() if not torch.equal(value, before[name])}
     assert moved and all(name.startswith(("actor.", "policy.actor.")) for name in moved)
     assert all(p.grad is None and p.requires_grad for p in learner.critics.parameters())
@@ -281,7 +281,7 @@ def test_parameters_start_at_the_problems_initial_ones_and_can_move(bounding):
     expected = torch.stack([0.1 + 0.5 * state[:, 0], torch.full((50,), 0.8), torch.full((50,), -0.6)], -1)
     before = learner.actor(state)
     torch.testing.assert_close(before, expected, atol=0.02, rtol=0.0)
-    learner.gradient_step("actor", learner._actor_loss, state, None)
+    learner.gradient_step("actor", learner.actor_loss, state, None)
     assert (learner.actor(state) != before).any()
 
 
@@ -293,7 +293,7 @@ def test_a_penalty_on_preactivations_frees_parameters_that_tanh_holds_at_a_bound
     with torch.no_grad():
         learner.actor.net[-1].bias.fill_(20.0)  # the tanh of which is 1
     for _ in range(200):
-        learner.gradient_step("actor", learner._actor_loss, state, None)
+        learner.gradient_step("actor", learner.actor_loss, state, None)
     is_free = learner.actor(state) < 0.99
     assert is_free.all() if penalty > 0.0 else not is_free.any()
 
@@ -330,7 +330,7 @@ def test_the_search_brings_the_actor_to_a_higher_hill_that_its_gradient_does_not
         learner.actor.net[-1].weight.zero_()
         learner.actor.net[-1].bias.fill_(0.5)
     for _ in range(300):
-        learner.gradient_step("actor", learner._actor_loss, state, None)
+        learner.gradient_step("actor", learner.actor_loss, state, None)
     expected = TwoHills.high if search_samples else torch.full((3,), 0.6)
     torch.testing.assert_close(learner.actor(state), expected.expand(64, -1), atol=0.1, rtol=0.0)
 
@@ -340,7 +340,7 @@ def test_the_search_leaves_forbidden_actions_parameters_alone():
     learner = make(TWO_HILLS, search_samples=8)
     learner.critics = TwoHills()
     allowed = torch.tensor([True, False, True]).expand(64, -1)
-    loss, _ = learner._actor_loss(states(64)[keys.OBSERVATION], allowed)
+    loss, _ = learner.actor_loss(states(64)[keys.OBSERVATION], allowed)
     gradient = torch.autograd.grad(loss, learner.actor.net[-1].bias)[0]
     assert (gradient != 0.0).tolist() == [False, False, True]
 

@@ -99,7 +99,7 @@ def test_the_critics_step_is_that_of_plain_adam_after_a_backward_pass(name):
     learner.updates.fill_(2)  # the actor learns as well, HyAR's codec does not
     reference = copy.deepcopy(learner)
     plain = torch.optim.Adam(reference.critics.parameters(), lr=LR[name], fused=False)
-    reference._critic_loss(batch)[0].backward()
+    reference.critic_loss(batch)[0].backward()
     plain.step()
     learner.update_once(batch)
     for new, expected in zip(learner.critics.parameters(), reference.critics.parameters(), strict=True):
@@ -176,7 +176,7 @@ def test_updates_in_bfloat16_make_all_products_in_it_and_have_nearly_the_same_gr
     both = []
     for _ in range(2):
         with Dtypes() as products:
-            _, gradients = gradients_of(learner._critic_loss, parameters, batch, precision=learner.descent.precision)
+            _, gradients = gradients_of(learner.critic_loss, parameters, batch, precision=learner.descent.precision)
         both.append(torch.cat([gradient.flatten() for gradient in gradients]))
         learner.lower_precision()
     assert products.seen == {torch.bfloat16}

@@ -114,15 +114,15 @@ class Actor(OnPolicy, Selector):
 
     def learn(self, decisions: TensorDictBase) -> dict[str, float]:
         """Gather decisions; as soon as there is a minibatch of them, make `epochs` passes over them."""
-        rows = self.gather(self._rows(decisions))
+        rows = self.gather(self.rows(decisions))
         if rows is None:
             return {}
         rows["advantage"] = rows["target"] - self.critic(rows["state"]).squeeze(-1).detach()
         rows["advantage"] = normalised(rows["advantage"])
-        return mean_scalars([self.gradient_step(self._loss, minibatch) for minibatch in self.minibatches(rows)])
+        return mean_scalars([self.gradient_step(self.loss, minibatch) for minibatch in self.minibatches(rows)])
 
     @torch.no_grad()
-    def _rows(self, decisions: TensorDictBase) -> TensorDict:
+    def rows(self, decisions: TensorDictBase) -> TensorDict:
         """Return what an update needs of decisions `[N]`; `target` is that of the value."""
         after = decisions.get("next")
         next_value = self.critic(after.get(keys.OBSERVATION)).squeeze(-1)
@@ -138,7 +138,7 @@ class Actor(OnPolicy, Selector):
         return TensorDict(rows, batch_size=decisions.shape)
 
     def empty_rows(self) -> dict[str, Tensor]:
-        """Return the columns of `_rows`."""
+        """Return the columns of `rows`."""
         number = torch.zeros(0, dtype=torch.float32)
         columns = {"state": torch.zeros(0, self.specs.observation_dim, dtype=torch.float32), "option": number.long()}
         columns |= dict.fromkeys(("log_prob", "weight", "target"), number)
@@ -146,7 +146,7 @@ class Actor(OnPolicy, Selector):
             columns["allowed"] = torch.zeros(0, self.specs.num_options, dtype=torch.bool)
         return columns
 
-    def _loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, rows: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of policy and critic on decisions `[B]`, and scalars to log."""
         log_probs = masked_logits(self.logits(rows["state"]), rows.get("allowed", None)).log_softmax(-1)
         log_prob = log_probs.gather(-1, rows["option"].unsqueeze(-1)).squeeze(-1)

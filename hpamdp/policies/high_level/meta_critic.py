@@ -150,7 +150,7 @@ class MetaCritic(Selector):
 
     def update(self, num_updates: int) -> dict[str, float]:
         """Make updates from the stored decisions."""
-        losses = [self._update(self.buffer.sample(self.options.batch_size)) for _ in range(num_updates)]
+        losses = [self.update_critics(self.buffer.sample(self.options.batch_size)) for _ in range(num_updates)]
         return {"critic": torch.stack(losses).mean().item()} if losses else {}
 
     def _rows(self, decisions: TensorDictBase) -> TensorDict:
@@ -167,7 +167,7 @@ class MetaCritic(Selector):
             rows["next_option_mask"] = after.get(keys.OPTION_MASK)
         return TensorDict(rows, batch_size=decisions.shape)
 
-    def _update(self, rows: TensorDictBase) -> Tensor:
+    def update_critics(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the critics from decisions `[batch_size]`; return the loss."""
         q = self.critics(rows["state"])
         with torch.no_grad():

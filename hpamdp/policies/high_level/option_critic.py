@@ -132,7 +132,7 @@ class OptionCritic(Selector):
         # If one option never terminated, the others would collect no data. Their values would stay wrong, and so would
         # the terminations learned from them. Therefore beta counts only as much as Q does in the choice.
         random_probability = 0.0 if is_greedy() else 1.0 if self.is_uniform else self.epsilon
-        beta = self._beta(
+        beta = self.beta(
             td.get(keys.OBSERVATION), td.get(keys.OPTION), td.get(keys.OPTION_MASK, None), random_probability
         )
         return beta > 0.5 if is_greedy() else torch.rand_like(beta) < beta
@@ -157,9 +157,9 @@ class OptionCritic(Selector):
         history: dict[str, list[Tensor]] = {}
         for _ in range(min(due, self.options.max_updates)):
             sample = self.buffer.sample(self.options.batch_size)
-            history.setdefault("critic", []).append(self._update_critic(sample))
+            history.setdefault("critic", []).append(self.update_critic(sample))
             if self.decides_ends:
-                history.setdefault("termination", []).append(self._update_termination(sample))
+                history.setdefault("termination", []).append(self.update_termination(sample))
         scalars = {name: torch.stack(values).mean().item() for name, values in history.items()}
         return {**scalars, "epsilon": self.epsilon}
 
@@ -179,7 +179,7 @@ class OptionCritic(Selector):
             rows["next_option_mask"] = after.get(keys.OPTION_MASK)
         return TensorDict(rows, batch_size=batch.shape)
 
-    def _beta(self, state: Tensor, option: Tensor, mask: Tensor | None, random_probability: float = 0.0) -> Tensor:
+    def beta(self, state: Tensor, option: Tensor, mask: Tensor | None, random_probability: float = 0.0) -> Tensor:
         """Return the probabilities `[*B]` that options end in states; 1 for forbidden options.
 
         Args:
@@ -192,7 +192,7 @@ class OptionCritic(Selector):
         beta = (1.0 - random_probability) * beta + random_probability * self.options.initial_termination
         return beta if mask is None else torch.where(_of_option(mask, option), beta, 1.0)
 
-    def _target(self, rows: TensorDictBase) -> Tensor:
+    def target(self, rows: TensorDictBase) -> Tensor:
         """Return r + discount ((1 - beta) Q'(s', o) + beta max Q'(s', .)), `[B]`.
 
         If the selector does not decide when options end, beta is 1 if the option has ended, else 0.
@@ -203,21 +203,21 @@ class OptionCritic(Selector):
             mask = rows.get("next_option_mask", None)
             beta = rows["is_ended"].float()
             if self.decides_ends:
-                beta = self._beta(rows["next_state"], rows["option"], mask)
+                beta = self.beta(rows["next_state"], rows["option"], mask)
             next_value = held.lerp(masked_values(q, mask).amax(-1), beta)
             return rows["reward"] + rows["discount"] * next_value
 
-    def _update_critic(self, rows: TensorDictBase) -> Tensor:
+    def update_critic(self, rows: TensorDictBase) -> Tensor:
         """Make one update of Q from steps `[batch_size]`; return the loss."""
         q = _of_option(self.critic(rows["state"]), rows["option"])
-        loss = (q - self._target(rows)).square().mean()
+        loss = (q - self.target(rows)).square().mean()
         self.optimizers["critic"].zero_grad(set_to_none=True)
         loss.backward()
         self.optimizers["critic"].step()
         polyak_update(self.target_critic, self.critic, self.options.tau)
         return loss.detach()
 
-    def _update_termination(self, rows: TensorDictBase) -> Tensor:
+    def update_termination(self, rows: TensorDictBase) -> Tensor:
         """Make one update of the terminations from steps `[batch_size]`; return their mean probability.
 
         The loss is logistic: an option should end where going on has a negative advantage. Each row is weighted by the

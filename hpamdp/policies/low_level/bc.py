@@ -64,9 +64,9 @@ class BC(ReplayLearner):
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Make one step up the log-likelihood of transitions `[batch_size]`; return scalars."""
-        return self.gradient_step("actor", self._loss, sample, self.allowed(sample))
+        return self.gradient_step("actor", self.loss, sample, self.allowed(sample))
 
-    def _loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the negative log-likelihood of the data's actions, and scalars."""
         distribution: HybridDistribution = self.actor(sample["state"], allowed)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])

@@ -158,11 +158,11 @@ class HPPO(OnPolicy, Learner):
         # A tensor, since compiled code would be made anew for another number.
         left = 1.0 + progress * (options.entropy_final - 1.0)
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
-        steps = [self.gradient_step(self._loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
+        steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]
         self.actor.set_min_scale(options.min_scale * (options.min_scale_final / options.min_scale) ** progress)
         return mean_scalars(steps)
 
-    def _loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of actors and critic on a minibatch `[B]`, and scalars to log."""
         distribution = self._distribution(rows)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])

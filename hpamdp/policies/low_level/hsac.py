@@ -178,30 +178,30 @@ class HSAC(ReplayLearner):
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the temperatures. Return scalars."""
-        scalars = self.gradient_step("critics", self._critic_loss, sample)
+        scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["discrete_temperature"], scalars["parameter_temperature"] = self.temperatures()
         if self.updates % self.options.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.gradient_step("actor", self.actor_loss, sample["state"], self.allowed(sample))
             if self.tunes_temperatures:
                 excesses = scalars["discrete_excess"], scalars["parameter_excess"]
-                self.gradient_step("temperatures", self._temperature_loss, *excesses)
+                self.gradient_step("temperatures", self.temperature_loss, *excesses)
         polyak_update(self.target_critics, self.critics, self.options.tau)
         return scalars
 
-    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from r + discount V'(s'), and scalars."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
-    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the soft value, and the mean entropies minus their targets."""
         value, discrete_excess, parameter_excess = self.soft_value(self.critics, state, allowed)
         loss = -value.mean()
         excesses = {"discrete_excess": discrete_excess.mean(), "parameter_excess": parameter_excess.mean()}
         return loss, {"actor": loss, **excesses}
 
-    def _temperature_loss(self, discrete_excess: Tensor, parameter_excess: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def temperature_loss(self, discrete_excess: Tensor, parameter_excess: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that lowers a temperature whose entropy exceeds the target, and raises it otherwise."""
         discrete_loss = self.log_discrete_temperature * discrete_excess
         return discrete_loss + self.log_parameter_temperature * parameter_excess, {}

@@ -59,9 +59,9 @@ from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_critic import TargetRateOptions, set_learning_rates
 from hpamdp.policies.shared.actor_search import (
     SearchingActorOptions,
-    actor_loss,
     even_normal,
     in_pieces,
+    searching_actor_loss,
     with_variations,
 )
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
@@ -410,24 +410,24 @@ class HyAR(ReplayLearner):
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics and, less often, the actor, the target networks and the codec."""
-        scalars = self.gradient_step("critics", self._critic_loss, sample)
+        scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.gradient_step("actor", self.actor_loss, sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.options.tau)
             polyak_update(self.target_critics, self.critics, self.options.tau)
         if self.updates % self.options.codec_every == 0:
             scalars |= self._update_codec(sample)
             if self.updates % (100 * self.options.codec_every) == 0:
-                self._fit_latent_range()
+                self.fit_latent_range()
         return scalars
 
     def _update_codec(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        scalars = self.gradient_step("codec", self._codec_loss, sample)
+        scalars = self.gradient_step("codec", self.codec_loss, sample)
         self.dynamics_error.lerp_(scalars["dynamics"], 0.01)
         return scalars
 
-    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance of Q(s, e, z) from r + discount * V(s'), where V is `value`."""
         latent, is_corrected = self.corrected_latent(sample)
         q = self.critics(sample["state"], latent.unsqueeze(1)).squeeze(-1)
@@ -447,7 +447,7 @@ class HyAR(ReplayLearner):
             return self.target_critics(observation, self.codec.of_allowed(proposals, allowed)).amin(0).amax(-1)
         return masked_values(self.target_critics(observation, proposals).amin(0), allowed).amax(-1)
 
-    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the values of the actor's allowed proposals by the first critic."""
         raw = self.actor.raw(state)
         proposals = self.actor.proposals(raw.tanh(), self.codec.embeddings.detach())
@@ -455,7 +455,9 @@ class HyAR(ReplayLearner):
             proposals = self.codec.of_allowed(proposals, allowed)
         q = self.critics(state, proposals, num_members=1)
         value = (q if allowed is None or not self.actor.proposes_each else q * allowed).sum(-1)
-        loss = actor_loss(self.options, value, raw, partial(self._search, state, raw, proposals.detach(), allowed))
+        loss = searching_actor_loss(
+            self.options, value, raw, partial(self._search, state, raw, proposals.detach(), allowed)
+        )
         return loss, {"actor": -value.mean()}
 
     def _search(self, state: Tensor, raw: Tensor, proposals: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -534,7 +536,7 @@ class HyAR(ReplayLearner):
         error = ((unit - batch["unit"]) * self.codec.mask[discrete]).abs().amax(-1)
         return error <= self.options.parameter_tolerance
 
-    def _codec_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def codec_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the codec's loss and its parts."""
         state, discrete, executed = sample["state"], sample["discrete"], sample["unit"]
         mean, log_variance = self.codec.encode(state, discrete, executed)
@@ -552,7 +554,7 @@ class HyAR(ReplayLearner):
         self.codec.change_scale.copy_(scale_of(stored["next_state"] - stored["state"]))
         for _ in range(self.options.codec_pretrain_updates):
             self._update_codec(self.augmented(self.buffer.sample(self.options.batch_size)))
-        self._fit_latent_range()
+        self.fit_latent_range()
 
     def on_progress(self, steps: int) -> None:
         """Lower the probability of random actions, and the learning rates."""
@@ -561,7 +563,7 @@ class HyAR(ReplayLearner):
         fraction = linear_schedule(steps, options.lr_steps, options.lr_final)
         set_learning_rates(self.optimizers, self.learning_rates, fraction)
 
-    def _fit_latent_range(self) -> None:
+    def fit_latent_range(self) -> None:
         """Set the range of z to the central `latent_coverage` of the encoded stored actions."""
         sample = self.buffer.sample(4096)
         with torch.no_grad():

@@ -88,26 +88,24 @@ class IQL(ReplayLearner):
         """Update V, then Q, then the policy from transitions `[batch_size]`; return scalars."""
         with torch.no_grad():
             q = self.target_critics.of_discrete(sample["state"], sample["discrete"], sample["unit"]).amin(0)
-        of_value = self.gradient_step("state_value", self._value_loss, sample["state"], q)
-        scalars = self.gradient_step("critics", self._critic_loss, sample) | of_value | {"q": q.mean()}
+        of_value = self.gradient_step("state_value", self.value_loss, sample["state"], q)
+        scalars = self.gradient_step("critics", self.critic_loss, sample) | of_value | {"q": q.mean()}
         polyak_update(self.target_critics, self.critics, self.options.tau)
-        return scalars | self.gradient_step("actor", self._actor_loss, sample, self.allowed(sample), q)
+        return scalars | self.gradient_step("actor", self.actor_loss, sample, self.allowed(sample), q)
 
-    def _value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def value_loss(self, state: Tensor, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the distance of V from the expectile of the values `[B]` of the data's actions."""
         excess = q - self.value(state)
         loss = expectile_loss(excess, self.options.expectile)
         return loss, {"value": loss}
 
-    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from the targets."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         loss = F.mse_loss(q, self.target(sample).expand_as(q))
         return loss, {"critic": loss}
 
-    def _actor_loss(
-        self, sample: TensorDictBase, allowed: Tensor | None, q: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, sample: TensorDictBase, allowed: Tensor | None, q: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the negative log-likelihood of the data's actions, weighted by their advantages."""
         with torch.no_grad():
             advantage = q - self.value(sample["state"])

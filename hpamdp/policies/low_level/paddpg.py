@@ -168,21 +168,21 @@ class PADDPG(ReplayLearner):
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
-        scalars = self.gradient_step("critics", self._critic_loss, sample)
+        scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.gradient_step("actor", self.actor_loss, sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.options.tau)
             polyak_update(self.target_critics, self.critics, self.options.tau)
         return scalars
 
-    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from r + discount min Q'(s', a'), and scalars."""
         q = q_values(self.critics, sample["state"], torch.cat([sample[SCORES], sample["unit"]], -1))
         loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
-    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the value of the actor's output by the first critic."""
         loss = -q_values(self.critics, state, with_lowest_scores(self.actor(state), allowed))[0].mean()
         return loss, {"actor": loss}

@@ -50,9 +50,9 @@ from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import (
     SearchingActorOptions,
-    actor_loss,
     even_normal,
     in_pieces,
+    searching_actor_loss,
     with_variations,
 )
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
@@ -246,15 +246,15 @@ class PDQN(ReplayLearner):
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
-        scalars = self.gradient_step("critics", self._critic_loss, sample)
+        scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.options.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self._actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.gradient_step("actor", self.actor_loss, sample["state"], self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.options.actor_tau)
             polyak_update(self.target_critics, self.critics, self.options.critic_tau)
         return scalars
 
-    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance of Q(s, k, x) from r + discount * V(s'), where V is `value`."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         loss = (q - self.target(sample)).square().mean(-1).sum()
@@ -273,12 +273,12 @@ class PDQN(ReplayLearner):
         choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
         return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
 
-    def _actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls with the sum of the allowed discrete actions' values."""
         raw = self.actor.raw(state)
         q = self.critics(state, self.actor.bounded(raw)).amin(0)
         value = (q if allowed is None else q * allowed).sum(-1)
-        loss = actor_loss(self.options, value, raw, partial(self._search, state, raw, q, allowed))
+        loss = searching_actor_loss(self.options, value, raw, partial(self._search, state, raw, q, allowed))
         return loss, {"actor": -value.mean()}
 
     def _search(self, state: Tensor, raw: Tensor, q: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:

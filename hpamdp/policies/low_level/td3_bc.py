@@ -158,26 +158,26 @@ class TD3BC(ReplayLearner):
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update critics and behaviour; every `policy_delay` updates, also actor and targets. Return scalars."""
         allowed = self.allowed(sample)
-        scalars = self.gradient_step("critics", self._critic_loss, sample)
-        scalars |= self.gradient_step("behaviour", self._behaviour_loss, sample, allowed)
+        scalars = self.gradient_step("critics", self.critic_loss, sample)
+        scalars |= self.gradient_step("behaviour", self.behaviour_loss, sample, allowed)
         if self.updates % self.options.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self._actor_loss, sample, allowed)
+            scalars |= self.gradient_step("actor", self.actor_loss, sample, allowed)
             polyak_update(self.target_actor, self.actor, self.options.tau)
             polyak_update(self.target_critics, self.critics, self.options.tau)
         return scalars
 
-    def _critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from the targets, and scalars."""
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         loss = F.mse_loss(q, self.target(sample).expand_as(q))
         return loss, {"critic": loss, "q": q.mean()}
 
-    def _behaviour_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def behaviour_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the negative log-likelihood of the data's discrete actions."""
         loss = F.cross_entropy(masked_logits(self.behaviour(sample["state"]), allowed), sample["discrete"])
         return loss, {"behaviour": loss}
 
-    def _actor_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def actor_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls towards higher values and towards the data."""
         state = sample["state"]
         unit = self.actor(state)

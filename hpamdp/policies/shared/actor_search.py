@@ -43,7 +43,7 @@ class SearchingActorOptions(EpsilonOptions, AnnealedRateOptions, TwinCriticOptio
     """Standard deviation of these variations, in units where the bounds are [-1, 1]."""
 
 
-def actor_loss(
+def searching_actor_loss(
     options: SearchingActorOptions, value: Tensor, raw: Tensor, search: Callable[[], tuple[Tensor, Tensor]]
 ) -> Tensor:
     """Return the loss of an actor, a scalar.

@@ -133,13 +133,13 @@ class DLPA(ReplayLearner):
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """Update the model from windows `[batch_size, horizon]`, and the values from the first step of each."""
-        scalars = self.gradient_step("model", self._loss, sample.select(*_STORED, "terminated", "valid"))
+        scalars = self.gradient_step("model", self.loss, sample.select(*_STORED, "terminated", "valid"))
         if self.end_values is not None:
             first = sample[:, 0]
             scalars |= self.end_values.update(self, first, first["state"], first["next_state"])
         return scalars
 
-    def _loss(self, windows: Mapping[str, Tensor] | TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, windows: Mapping[str, Tensor] | TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the weighted sum of the parts of the H-step loss, and the parts."""
         parts = self.losses(windows)
         loss = torch.zeros((), device=self.frames.device, dtype=torch.float32)

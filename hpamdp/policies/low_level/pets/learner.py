@@ -111,7 +111,7 @@ class PETS(ReplayLearner):
 
         Then update the values, if they are learned, from as many steps, mapped by no symmetry.
         """
-        scalars = self.gradient_step("model", self._loss, sample)
+        scalars = self.gradient_step("model", self.loss, sample)
         if self.end_values is not None:
             rows = self.buffer.sample(sample.numel())
             state, next_state = rows["state"], rows["next_state"]
@@ -119,7 +119,7 @@ class PETS(ReplayLearner):
             scalars |= self.end_values.update(self, rows, state, next_state)
         return scalars
 
-    def _loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the sum of the members' losses, and the mean of each part of it."""
         ends = sample["terminated"]
         transition, outcome = self.model.in_frame(sample["turned"], sample["action"])
