@@ -108,15 +108,13 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
 
 
 def check_built(config: Config, env: PAMDPEnv) -> None:
-    """Check the rules about the problem, if they had to wait for the environment; warn of a ceiling out of reach.
+    """Check the rules about the problem, some of which had to wait for the environment; warn of a ceiling out of reach.
 
     Raises:
         ConfigError: settings that do not go with the problem.
     """
-    facts = compatibility.facts_of(config)
-    if facts is None:
-        facts = _facts_of_built(env)
-        compatibility.check_problem(config, facts)
+    facts = compatibility.facts_of(config) or _facts_of_built(env)
+    compatibility.check_problem(config, facts)
     if facts.plans_change_options and config.run.agent.termination == "episode":
         warn(
             f"{config.env}: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; "
