@@ -69,6 +69,7 @@ SELECTORS = {
 # Options are uniform for half of the steps: a learner that is not chosen does not learn, and then is never chosen.
 # Replay learners: small networks and fast targets, for a problem of 104 cells.
 REPLAY = [
+    "num_envs=256",
     "total_frames=200000",
     "agent.uniform_option_steps=120000",
     "low.hidden_dims=[64,64]",
@@ -134,6 +135,7 @@ LEARNERS = {
         "low.parameter_target_entropy=-1.0",
     ],
     "dlpa": [
+        "num_envs=64",
         "total_frames=100000",
         "agent.uniform_option_steps=60000",
         "low.hidden_dims=[64,64]",
