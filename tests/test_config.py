@@ -347,6 +347,12 @@ def test_a_selector_gets_what_it_needs_on_a_problem():
     assert make_config(["env=rooms", "high=fixed", "recipe/high=boatdock_fixed"]).high.settings["option"] == "congruent"
 
 
+def test_gymnasium_environments_are_evaluated_on_fewer_episodes():
+    words = ["env=gymnasium", "env.id=hpamdp/Goal-v0", "high=none"]
+    assert make_config(words).run.eval.layouts == 100 < make_config(["env=goal", "high=none"]).run.eval.layouts
+    assert make_config([*words, "eval.layouts=7"]).run.eval.layouts == 7
+
+
 @pytest.mark.parametrize(("group", "folder"), [("low", "recipe"), ("high", "recipe/high")])
 def test_every_recipe_is_of_a_problem_and_a_learner_or_a_selector(group, folder):
     pairs = {f"{env}_{name}" for env in choices("env") for name in choices(group)}

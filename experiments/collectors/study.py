@@ -22,7 +22,7 @@ HERE = Path(__file__).resolve().parent
 RUN = HERE.parents[1] / "run.py"
 COLLECTORS = ("single", "multi", "ray")
 SEEDS = (0, 1, 2)
-COMMON = ["high=none", "low=hppo", "eval.every=0", "log_every=0"]
+COMMON = ["high=none", "low=hppo", "eval.every=0", "eval.layouts=1000", "log_every=0"]
 TASKS = {
     "cheap steps": ["env.controller=congruent", "total_frames=300000"],
     # The same boat as a Gymnasium environment, whose copies Python steps one after another.

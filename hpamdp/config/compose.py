@@ -89,10 +89,16 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
         scheme, _, folder = str(path).rpartition("://")
         if scheme in ("", "file") and not Path(folder).is_dir():
             raise ConfigError(f"hydra.searchpath={path}: there is no such folder")
-    for group, level in ((RECIPE, "low"), (f"{RECIPE}/high", "high")):
+    env = names["env"]
+    own_recipes = {
+        RECIPE: f"{env}_{names['low']}",
+        f"{RECIPE}/high": f"{env}_{names['high']}",
+        f"{RECIPE}/env": env,
+    }
+    for group, own_recipe in own_recipes.items():
         recipe = names.get(group)
         is_said = any(word.startswith(f"{group}=") for word in _words_of(node))
-        if recipe is None or (recipe == f"{names['env']}_{names[level]}" and not is_said):
+        if recipe is None or (recipe == own_recipe and not is_said):
             continue
         if recipe not in names_of(group):
             raise ConfigError(f"{group}={recipe}: {no_such(f'file in conf/{group}', recipe, names_of(group))}")
