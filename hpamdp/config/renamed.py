@@ -26,15 +26,17 @@ _NEW_VALUES: dict[tuple[str, Any], Any] = {("rl", "td3"): True, ("rl", "ddpg"): 
 
 
 def renamed(key: str, known: Iterable[str]) -> str | None:
-    """Return in words the new name of a setting, if it was renamed and `known` has the new one.
+    """Return in words the new name of a setting, if it was renamed.
 
     Args:
         key: as on the command line, such as `low.warmup_frames`.
-        known: the names of the settings beside it.
+        known: the names of the settings beside it, one of which must be the new name of a setting of any group.
     """
-    new = _NEW_NAMES.get(key) or _NEW_NAMES.get(key.rpartition(".")[2])
-    if new is None or new not in known:
-        return None
+    new = _NEW_NAMES.get(key)
+    if new is None:
+        new = _NEW_NAMES.get(key.rpartition(".")[2])
+        if new is None or new not in known:
+            return None
     values = [
         f"{old}={value} is {new}={str(now).lower()}"
         for (old, value), now in _NEW_VALUES.items()

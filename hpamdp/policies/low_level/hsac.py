@@ -59,9 +59,9 @@ class HSACOptions(ActorCriticOptions, TargetRateOptions, ScaleOptions):
     """Initial means: `domain` takes the problem's own initial parameters, if it has any; `none` takes mid-range."""
     min_scale: PositiveFloat = 0.005
     """Smallest standard deviation of the parameters, before they are squashed to [-1, 1]."""
-    discrete_temperature: PositiveFloat = 0.05
+    discrete_temperature: PositiveFloat = 0.01
     """Weight of the discrete action's entropy in the return; if tuned, its value at the start."""
-    parameter_temperature: PositiveFloat = 0.05
+    parameter_temperature: PositiveFloat = 0.005
     """Weight of the parameters' entropy in the return; if tuned, its value at the start."""
     tune_discrete_temperature: bool = True
     """Learn the discrete temperature, so that the entropy meets `discrete_target_entropy`."""
