@@ -16,18 +16,18 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.policies.base import Learner
-from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.train import Trainer
 
 QUICK_CRITIC = ["high=meta_critic", "high.warmup_decisions=0", "high.updates_per_decision=0.2", "high.batch_size=16"]
 
 
-def make(config: Config, folder: Path) -> Parts:
+def make(config: Config, folder: Path) -> AssembledRun:
     torch.manual_seed(0)
     return assemble(config, folder)
 
 
-def train(config: Config, folder: Path) -> Parts:
+def train(config: Config, folder: Path) -> AssembledRun:
     """Train and leave the checkpoint in the folder."""
     folder.mkdir()
     parts = make(config, folder)

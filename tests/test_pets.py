@@ -11,7 +11,7 @@ from hpamdp.env.decisions import with_decisions
 from hpamdp.policies.low_level.pets.learner import PETS
 from hpamdp.policies.low_level.pets.policy import MEMBER
 from hpamdp.policies.shared.end_values import EndValueOptions, EndValues
-from hpamdp.policies.shared.planning import Found, Prediction, SequenceSearch, discounted_return, elite_weights
+from hpamdp.policies.shared.planning import PlannedAction, Prediction, SequenceSearch, discounted_return, elite_weights
 from hpamdp.policies.shared.scales import scale_of
 from hpamdp.specs import PAMDPSpecs
 
@@ -593,7 +593,7 @@ def test_a_share_epsilon_of_exploring_actions_is_random_and_no_greedy_one(monkey
     def plan(state, member=None, allowed=None):
         asked.append(len(state))
         own = torch.zeros(len(state), learner.policy.slots.shape[-1])
-        return Found(torch.full((len(state),), 2), own, torch.zeros(len(state)))
+        return PlannedAction(torch.full((len(state),), 2), own, torch.zeros(len(state)))
 
     monkeypatch.setattr(learner.policy, "plan", plan)
     td = TensorDict({keys.OBSERVATION: torch.randn(4000, 4)}, [4000])

@@ -16,7 +16,7 @@ from hydra import compose, initialize_config_dir
 from torchrl.collectors import Collector
 
 from hpamdp.config.compose import conf_dir, read
-from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.assemble import AssembledRun, assemble
 
 HERE = Path(__file__).resolve().parent
 PUBLISHED = ["low=pdqn", "low.twin=false", "low.target_smoothing=0", "low.policy_delay=1", "low.hidden_dims=[128]"]
@@ -85,7 +85,7 @@ def run_case(case: Case) -> tuple[float, float | None]:
     return speed, 1_000.0 * learning_s / updates if updates else None
 
 
-def build(overrides: list[str], folder: Path) -> tuple[Parts, int]:
+def build(overrides: list[str], folder: Path) -> tuple[AssembledRun, int]:
     """Return the parts of a run on the congruent boat, and the presses of a batch."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         words = ["high=none", "env.controller=congruent", "eval.layouts=10", *overrides]
@@ -94,7 +94,7 @@ def build(overrides: list[str], folder: Path) -> tuple[Parts, int]:
     return assemble(config, folder), config.run.num_envs * config.run.steps_per_batch
 
 
-def _updates(parts: Parts) -> int:
+def _updates(parts: AssembledRun) -> int:
     """Return the number of updates so far, 0 where the learner counts none."""
     return int(getattr(parts.agent.learners[0], "updates", 0))
 

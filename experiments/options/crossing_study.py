@@ -19,7 +19,7 @@ from study import DLPA_PLANS, PETS_PLANS, add, learned_values, make_config, tabu
 from tensordict import TensorDictBase
 
 from hpamdp import keys
-from hpamdp.run.assemble import Parts
+from hpamdp.run.assemble import AssembledRun
 
 HERE = Path(__file__).resolve().parent
 FILE = HERE / "crossing.csv"
@@ -141,7 +141,7 @@ def train(words: Sequence[str]) -> dict[str, object]:
     }
 
 
-def evaluate(parts: Parts, best: torch.Tensor) -> tuple[float, float, torch.Tensor]:
+def evaluate(parts: AssembledRun, best: torch.Tensor) -> tuple[float, float, torch.Tensor]:
     """Play the evaluation's episodes.
 
     Args:

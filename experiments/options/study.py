@@ -25,7 +25,7 @@ from hpamdp.config.schema import Config
 from hpamdp.env.rooms import rules
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.policies.agent import HierarchicalAgent
-from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.train import Trainer
 
 HERE = Path(__file__).resolve().parent
@@ -185,7 +185,7 @@ def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings
         return read(compose("config", [*common, *own, *words], return_hydra_config=True))
 
 
-def trained(config: Config) -> tuple[Parts, int, float]:
+def trained(config: Config) -> tuple[AssembledRun, int, float]:
     """Train an agent; return the parts of its run, its steps and the CPU seconds that it took."""
     cpu = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
@@ -235,7 +235,7 @@ def train(words: Sequence[str]) -> dict[str, object]:
     }
 
 
-def mean_over_starts(parts: Parts, values: torch.Tensor) -> float:
+def mean_over_starts(parts: AssembledRun, values: torch.Tensor) -> float:
     """Return the mean of values `[x, y]` over the cells in which the evaluation's episodes begin."""
     env = parts.evaluation.problem
     assert isinstance(env, RoomsEnv)
@@ -244,7 +244,7 @@ def mean_over_starts(parts: Parts, values: torch.Tensor) -> float:
     return values[env.state.x.long(), env.state.y.long()].mean().item()
 
 
-def evaluate(parts: Parts) -> tuple[dict[str, float], torch.Tensor]:
+def evaluate(parts: AssembledRun) -> tuple[dict[str, float], torch.Tensor]:
     """Play the evaluation's episodes; return their means, and how often an option was due in each cell, `[x, y]`."""
     env = parts.evaluation.problem
     assert isinstance(env, RoomsEnv)

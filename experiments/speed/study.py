@@ -27,7 +27,7 @@ from torchrl.collectors import Collector
 from hpamdp.analysis.study import Rows, read_csv, write_tables
 from hpamdp.config.compose import conf_dir, read
 from hpamdp.policies.base import Learner
-from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.assemble import AssembledRun, assemble
 
 HERE = Path(__file__).resolve().parent
 LEARNERS = ["hppo", "pdqn", "hyar", "hsac", "paddpg", "dlpa", "pets", "iql", "td3_bc"]
@@ -65,7 +65,7 @@ class Products(TorchDispatchMode):
         return self._same[place]
 
 
-def make(name: str, folder: Path) -> tuple[Parts, Learner, int]:
+def make(name: str, folder: Path) -> tuple[AssembledRun, Learner, int]:
     """Return the parts of a run on the congruent boat with its defaults, the learner, and the steps of a batch."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         words = ["high=none", f"low={name}", "env.controller=congruent", "eval.layouts=10"]

@@ -74,32 +74,32 @@ def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
     Raises:
         FilmError: another ending, no picture, or imageio is missing.
     """
-    frames = iter(pictures)
-    first = next(frames, None)
+    remaining = iter(pictures)
+    first = next(remaining, None)
     if first is None:
         raise FilmError(f"{path}: there is no picture to write")
-    frames = itertools.chain([first], frames)
+    remaining = itertools.chain([first], remaining)
     if path.suffix == ".gif":
-        _write_gif(path, frames, fps)
+        _write_gif(path, remaining, fps)
     elif path.suffix == ".mp4":
-        _write_mp4(path, frames, fps)
+        _write_mp4(path, remaining, fps)
     else:
         raise FilmError(f"{path}: must end in {' or '.join(SUFFIXES)}")
 
 
-def _write_gif(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
-    pictures = [Image.fromarray(frame) for frame in frames]
+def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
+    images = [Image.fromarray(picture) for picture in pictures]
     # One palette for all pictures, made from three of them: one for each would flicker.
-    samples = [np.asarray(pictures[i]) for i in (0, len(pictures) // 2, -1)]
+    samples = [np.asarray(images[i]) for i in (0, len(images) // 2, -1)]
     palette = Image.fromarray(np.concatenate(samples)).quantize(_GIF_COLOURS)
-    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     # A GIF counts in hundredths of a second, and viewers show a picture for a tenth of one if it says a hundredth.
     hundredths = round(100.0 / min(fps, GIF_FPS))
     with replacing(path) as partial:
         indexed[0].save(partial, save_all=True, append_images=indexed[1:], duration=10 * hundredths, loop=0)
 
 
-def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
+def _write_mp4(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401  (the encoder, which imageio misses only when it writes)
@@ -107,5 +107,5 @@ def _write_mp4(path: Path, frames: Iterator[np.ndarray], fps: float) -> None:
         raise FilmError(f"{path}: imageio is not installed; pip install 'hpamdp[video]', or write a .gif") from error
     encoding = {"fps": fps, "macro_block_size": 2, "codec": "libx264", "quality": 8}
     with replacing(path) as partial, imageio.get_writer(partial, **encoding) as writer:
-        for frame in frames:
-            writer.append_data(frame)
+        for picture in pictures:
+            writer.append_data(picture)

@@ -24,7 +24,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.shell import setting
 
-GRAMMAR = "not understood; write GROUP=CHOICE or KEY=VALUE"
+GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 _SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
 # Flags of Hydra, with their short forms and what argparse needs to know of them.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
@@ -171,9 +171,9 @@ def _text(value: Any) -> str:
 
 
 def as_text(word: str) -> str:
-    """Return `KEY=VALUE` quoted for the shell and Hydra, so that the value is a text."""
-    key, _, value = word.partition("=")
-    return setting(key, value)
+    """Return `SETTING=VALUE` quoted for the shell and Hydra, so that the value is a text."""
+    name, _, value = word.partition("=")
+    return setting(name, value)
 
 
 def choices_in(folder: Path) -> list[str]:

@@ -79,20 +79,20 @@ def _in_one_line(
     wrong: dict[str, dict[str, None]] = {}
     for problem in error.errors(include_url=False):
         path, value = _locate(problem["loc"], values)
-        key = prefix + ".".join(path)
+        setting = prefix + ".".join(path)
         if problem["type"] == "extra_forbidden":
             known = _fields(model, path[:-1])
-            unknown.append(f"{key}: {renamed(key, known) or no_such(what, path[-1], known)}")
+            unknown.append(f"{setting}: {renamed(setting, known) or no_such(what, path[-1], known)}")
         elif problem["type"] == "missing":
-            wrong[key] = {"missing": None}
+            wrong[setting] = {"missing": None}
         elif not path:  # a check of several fields, whose message names them
             wrong[prefix.replace(".", ": ") + _reworded(problem["msg"], value)] = {"": None}
         else:
             # A union complains once for each of its types.
-            wrong.setdefault(f"{key}={as_json(value)}", {})[_reworded(problem["msg"], value)] = None
+            wrong.setdefault(f"{setting}={as_json(value)}", {})[_reworded(problem["msg"], value)] = None
     complaints = [
-        f"{key}: {' or '.join(messages)} ({where})" if any(messages) else f"{key} ({where})"
-        for key, messages in wrong.items()
+        f"{setting}: {' or '.join(messages)} ({where})" if any(messages) else f"{setting} ({where})"
+        for setting, messages in wrong.items()
     ]
     return "; ".join([*_shortened(unknown), *complaints])
 
@@ -127,7 +127,7 @@ def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str,
 
 
 def _locate(location: tuple[int | str, ...], values: dict[str, Any]) -> tuple[list[str], Any]:
-    """Return the keys that lead to a problem, and the value there."""
+    """Return the names that lead to a problem, and the value there."""
     path: list[str] = []
     value: Any = values
     for part in location:

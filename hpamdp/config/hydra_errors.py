@@ -43,7 +43,7 @@ def explained(error: Exception, line: CommandLine, conf: Path) -> str:
         if override.is_sweep_override() and not line.is_multirun:
             several = f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
             return f"{several}; for one text write {as_text(override.input_line or '')}"
-    return _wrong_key(line.overrides, conf) or _first_lines(error, line.words)
+    return _wrong_setting(line.overrides, conf) or _first_lines(error, line.words)
 
 
 def not_understood(word: str) -> str:
@@ -81,8 +81,8 @@ def _first_lines(error: Exception, words: Sequence[str]) -> str:
     return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
 
 
-def _wrong_key(overrides: Sequence[Override], conf: Path) -> str | None:
-    """Return what is wrong with the first override whose key is not in the config, if there is one."""
+def _wrong_setting(overrides: Sequence[Override], conf: Path) -> str | None:
+    """Return what is wrong with the first override whose setting is not in the config, if there is one."""
     groups = [o for o in overrides if "/" in o.key_or_group or os.path.isdir(conf / o.key_or_group)]
     others = [o for o in overrides if o not in groups and not o.is_add() and not o.is_force_add()]
     for choices in itertools.product(*map(written_out, groups)):
@@ -92,27 +92,27 @@ def _wrong_key(overrides: Sequence[Override], conf: Path) -> str | None:
         except (HydraException, OmegaConfBaseException):
             return None
         for override in others:
-            wrong = _missing_key(cfg, override.key_or_group, conf)
+            wrong = _missing_setting(cfg, override.key_or_group, conf)
             if wrong is not None:
                 return wrong
     return None
 
 
-def _missing_key(cfg: DictConfig, key: str, conf: Path) -> str | None:
-    """Return what is wrong with a dotted key that is not in the config; None if it is there."""
+def _missing_setting(cfg: DictConfig, setting: str, conf: Path) -> str | None:
+    """Return what is wrong with a dotted name that is not in the config; None if it is there."""
     node: Any = OmegaConf.to_container(cfg)
-    names = key.split(".")
+    names = setting.split(".")
     for depth, name in enumerate(names):
         if not isinstance(node, dict):
             return None
         if name not in node:
             known = [each for each in node if each not in (TARGET, "budget")]
-            return f"{key}: {renamed(key, known) or _no_such_key(cfg, names[:depth], name, known, conf)}"
+            return f"{setting}: {renamed(setting, known) or _no_such_setting(cfg, names[:depth], name, known, conf)}"
         node = node[name]
     return None
 
 
-def _no_such_key(cfg: DictConfig, path: list[str], name: str, known: list[str], conf: Path) -> str:
+def _no_such_setting(cfg: DictConfig, path: list[str], name: str, known: list[str], conf: Path) -> str:
     if not path:
         folders = {folder.name for folder in conf.iterdir() if folder.is_dir()}
         return no_such(f"group or value of the run ({RUN_FILE})", name, {*known, *folders} - {"hydra"})

@@ -25,25 +25,25 @@ _NEW_NAMES = {
 _NEW_VALUES: dict[tuple[str, Any], Any] = {("rl", "td3"): True, ("rl", "ddpg"): False}
 
 
-def renamed(key: str, known: Iterable[str]) -> str | None:
+def renamed(setting: str, known: Iterable[str]) -> str | None:
     """Return in words the new name of a setting, if it was renamed.
 
     Args:
-        key: as on the command line, such as `low.warmup_frames`.
+        setting: as on the command line, such as `low.warmup_frames`.
         known: the names of the settings beside it, one of which must be the new name of a setting of any group.
     """
-    new = _NEW_NAMES.get(key)
+    new = _NEW_NAMES.get(setting)
     if new is None:
-        new = _NEW_NAMES.get(key.rpartition(".")[2])
+        new = _NEW_NAMES.get(setting.rpartition(".")[2])
         if new is None or new not in known:
             return None
     values = [
         f"{old}={value} is {new}={str(now).lower()}"
         for (old, value), now in _NEW_VALUES.items()
-        if key.endswith(f".{old}")
+        if setting.endswith(f".{old}")
     ]
     meaning = f" ({', '.join(values)})" if values else ""
-    return f"is called {key.rpartition('.')[0]}.{new} now{meaning}"
+    return f"is called {setting.rpartition('.')[0]}.{new} now{meaning}"
 
 
 def with_new_names(group: str, settings: Mapping[str, Any], known: Iterable[str]) -> dict[str, Any]:

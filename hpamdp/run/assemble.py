@@ -36,7 +36,7 @@ _UPDATES_THAT_PAY = 10_000
 
 
 @dataclass
-class Parts:
+class AssembledRun:
     """What a run is made of.
 
     Attributes:
@@ -56,7 +56,7 @@ class Parts:
     device: torch.device
 
 
-def assemble(config: Config, output_dir: Path) -> Parts:
+def assemble(config: Config, output_dir: Path) -> AssembledRun:
     """Build the parts of a run.
 
     Raises:
@@ -80,7 +80,7 @@ def assemble(config: Config, output_dir: Path) -> Parts:
         checkpoint.load_learners(checkpoint.find(run.low.checkpoint, "low.checkpoint"), agent, device)
     evaluation = make_evaluation(config, env)
     tracked, policy = acting(env, agent, config)
-    return Parts(tracked, policy, agent, evaluation, data, device)
+    return AssembledRun(tracked, policy, agent, evaluation, data, device)
 
 
 def make_env(config: Config, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:

@@ -69,13 +69,13 @@ def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     """Return in words where two configs differ, except in bookkeeping; empty if they agree."""
     # Through yaml, as the saved config.
     here, there = _flat(yaml.safe_load(wanted.to_yaml())), _flat(upgraded(saved) if saved else {})
-    keys = [key for key in {**here, **there} if here.get(key) != there.get(key)]
-    keys = [key for key in keys if key.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING]
-    if not keys:
+    names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
+    names = [name for name in names if name.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING]
+    if not names:
         return ""
-    more = f" and {len(keys) - 1} more" if keys[1:] else ""
-    values = [json.dumps(each.get(keys[0]), default=str) for each in (there, here)]
-    return f"{keys[0]}={values[0]} for {values[1]}{more}"
+    more = f" and {len(names) - 1} more" if names[1:] else ""
+    values = [json.dumps(each.get(names[0]), default=str) for each in (there, here)]
+    return f"{names[0]}={values[0]} for {values[1]}{more}"
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

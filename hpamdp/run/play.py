@@ -49,7 +49,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     parser.add_argument(
         "settings",
         nargs="*",
-        metavar="KEY=VALUE",
+        metavar="SETTING=VALUE",
         help="of the problem, such as env=NAME; trust=true trusts the files of agents",
     )
     parser.add_argument(
@@ -64,7 +64,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     options = parser.parse_intermixed_args(words)
     path, settings = split_words(options.settings)
     if path is not None:
-        raise ConfigError(f"{path}: not KEY=VALUE; give an agent as --agent {path}")
+        raise ConfigError(f"{path}: not SETTING=VALUE; give an agent as --agent {path}")
     config = read(compose_words(settings))
     page = _page(config, options.seed)
     agents = own_agents(config) if options.agent is None else given_agents(options.agent, config, settings)
@@ -133,9 +133,9 @@ def _permissions(name: str, config: Config, settings: Sequence[str]) -> list[str
     is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
     given = [word.partition("=") for word in settings]
     return [
-        f"{key}={value}"
-        for key, _, value in given
-        if key == "trust" or (is_same_problem and config.env.is_guarded(key.removeprefix("env."), value))
+        f"{setting}={value}"
+        for setting, _, value in given
+        if setting == "trust" or (is_same_problem and config.env.is_guarded(setting.removeprefix("env."), value))
     ]
 
 

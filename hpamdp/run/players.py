@@ -44,7 +44,7 @@ def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
     """
     paths = [word for word in words if "=" not in word or os.path.exists(word)]
     if len(paths) > 1:
-        raise ConfigError(f"{' '.join(paths)}: several agents; give one, and settings as KEY=VALUE")
+        raise ConfigError(f"{' '.join(paths)}: several agents; give one, and settings as SETTING=VALUE")
     return (paths[0] if paths else None), [word for word in words if word not in paths]
 
 

@@ -19,7 +19,7 @@ from hpamdp.config.schema import Config
 from hpamdp.files import replacing
 from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
 from hpamdp.policies.random_agent import random_agent
-from hpamdp.run.assemble import Parts
+from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.closing_table import SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
 from hpamdp.run.loggers import CSVLogger, EarlierRun, Guarded, Logger
 from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
@@ -45,7 +45,7 @@ class Recorder:
         output_dir: where `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures go.
     """
 
-    def __init__(self, config: Config, parts: Parts, output_dir: Path) -> None:
+    def __init__(self, config: Config, parts: AssembledRun, output_dir: Path) -> None:
         self.config = config
         self.parts = parts
         self.output_dir = output_dir

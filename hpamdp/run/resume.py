@@ -54,18 +54,18 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
             f"resume={source}: a run with mode={saved['mode']}; resume it so, or start one with "
             f"{setting('low.checkpoint', source)}"
         )
-    values = {key: cfg[key] for key in _BEGIN}
+    values = {name: cfg[name] for name in _BEGIN}
     if config.run.mode == "eval":
         values |= {group: _plain_value(cfg, group) for group in _NOT_EVALUATED}
-    keys = map(_key, _changes(overrides, saved, file, where))
-    values |= {key: _plain_value(cfg, key) for key in keys if not key.startswith("hydra")}
+    changed = map(_name, _changes(overrides, saved, file, where))
+    values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
     return read_saved(saved, values, names, trust=config.run.trust, file=file), file
 
 
-def _plain_value(cfg: DictConfig, key: str) -> Any:
-    value = OmegaConf.select(cfg, key)
-    return plain(value, key) if isinstance(value, DictConfig) else value
+def _plain_value(cfg: DictConfig, name: str) -> Any:
+    value = OmegaConf.select(cfg, name)
+    return plain(value, name) if isinstance(value, DictConfig) else value
 
 
 def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str, str]:
@@ -137,14 +137,14 @@ def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple
 def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
     """Return the words that change the saved run, without repeated choices of its groups."""
     choices = choices_of(saved)
-    changes = [word for word in overrides if _key(word) not in GROUPS or _choice(word) != choices[_key(word)]]
+    changes = [word for word in overrides if _name(word) not in GROUPS or _choice(word) != choices[_name(word)]]
     for word in changes:
-        if re.split(r"[./]", _key(word))[0] in _AGENT:
+        if re.split(r"[./]", _name(word))[0] in _AGENT:
             raise ConfigError(f"{word}: {where} takes the agent from {file}; leave this out")
     return changes
 
 
-def _key(override: str) -> str:
+def _name(override: str) -> str:
     return override.partition("=")[0].lstrip("+~")
 
 

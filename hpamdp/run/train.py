@@ -25,7 +25,7 @@ from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
-from hpamdp.run.assemble import Parts, assemble
+from hpamdp.run.assemble import AssembledRun, assemble
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import Collection, CollectionError
 from hpamdp.run.folder import check_no_link, check_no_training, check_unused, mark_unfinished, moved_aside
@@ -147,7 +147,7 @@ class Trainer:
         output_dir: the run's folder.
     """
 
-    def __init__(self, config: Config, parts: Parts, output_dir: Path) -> None:
+    def __init__(self, config: Config, parts: AssembledRun, output_dir: Path) -> None:
         self.config = config
         self.parts = parts
         self.output_dir = output_dir

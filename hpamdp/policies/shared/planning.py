@@ -141,7 +141,7 @@ class SequenceStep(NamedTuple):
 Returns = Callable[[Sequence[SequenceStep]], Tensor]
 
 
-class Found(NamedTuple):
+class PlannedAction(NamedTuple):
     """The first step of the best sequence for each of N states, and the sequence's predicted return."""
 
     discrete: Tensor  # int64 [N]
@@ -229,7 +229,7 @@ class SequenceSearch:
         first_returns: Returns | None = None,
         *,
         is_greedy: bool = False,
-    ) -> Found:
+    ) -> PlannedAction:
         """Search for `num_states` states at once.
 
         Args:
@@ -278,7 +278,7 @@ class SequenceSearch:
             value = returns([SequenceStep(discrete[..., h], unit[..., h, :]) for h in range(self.options.horizon)])
             value = _without_forbidden(value, is_allowed)
         best_value, place = value.amax(-1).max(-1)
-        return Found(discrete[row, place, 0], _best_samples(value, unit)[row, place, 0], best_value)
+        return PlannedAction(discrete[row, place, 0], _best_samples(value, unit)[row, place, 0], best_value)
 
     @staticmethod
     def _best_sequences(value: Tensor, num: int) -> Tensor:

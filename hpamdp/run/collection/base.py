@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.stored_rows import check_choices
-from hpamdp.run.assemble import Parts
+from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.state_checks import SavedPart, check_columns, check_generator, checked, example_steps
 
 
@@ -25,7 +25,7 @@ class CollectionState(SavedPart):
     coming: dict[str, Any] | None = None
 
 
-def checked_state(saved: Any, parts: Parts) -> CollectionState:
+def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
     """Return the state of a collection, checked.
 
     Raises:
@@ -50,7 +50,7 @@ def checked_state(saved: Any, parts: Parts) -> CollectionState:
     return state
 
 
-def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, parts: Parts) -> None:
+def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, parts: AssembledRun) -> None:
     """Refuse saved steps that cannot be steps `[N, *]` of the run.
 
     Raises:

@@ -11,7 +11,7 @@ from torchrl.collectors import MultiSyncCollector
 
 from hpamdp.config.schema import Config
 from hpamdp.messages import warn
-from hpamdp.run.assemble import Parts
+from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.limits import full_shared_memory
 from hpamdp.run.collection.worker import EnvShard, SharedMemoryCollector
 from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, children_without, modules_here_last
@@ -24,7 +24,7 @@ class MultiCollection(WorkerCollection):
     """Steps the environments in processes of TorchRL's MultiSyncCollector, which write into shared memory."""
 
     def __init__(
-        self, config: Config, parts: Parts, frames: int, options: WorkerOptions | None = None, **settings: Any
+        self, config: Config, parts: AssembledRun, frames: int, options: WorkerOptions | None = None, **settings: Any
     ) -> None:
         options = WorkerOptions.of(options, settings)
         num, num_cpus = options.num_workers, len(os.sched_getaffinity(0))

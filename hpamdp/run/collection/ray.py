@@ -16,7 +16,7 @@ from torchrl.collectors.distributed import RayCollector
 
 from hpamdp.config.schema import Config
 from hpamdp.messages import first_line, one_line, warn
-from hpamdp.run.assemble import Parts
+from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import CollectionError
 from hpamdp.run.collection.worker import EnvShard, RemoteShard, ShardCollector, WorkingDir
 from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, children_without
@@ -42,7 +42,7 @@ class RayCollection(WorkerCollection):
     guarded_settings: ClassVar[tuple[str, ...]] = ("address",)
 
     def __init__(
-        self, config: Config, parts: Parts, frames: int, options: RayOptions | None = None, **settings: Any
+        self, config: Config, parts: AssembledRun, frames: int, options: RayOptions | None = None, **settings: Any
     ) -> None:
         options = RayOptions.of(options, settings)
         # RayCollector warns that it has no weights to send; `collect` sends them.

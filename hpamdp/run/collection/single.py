@@ -14,14 +14,14 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.collectors import Collector
 
 from hpamdp.config.schema import Config
-from hpamdp.run.assemble import Parts
+from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, checked_state
 
 
 class SingleCollection(Collection):
     """Steps the environments in the learner's own process, between two updates."""
 
-    def __init__(self, config: Config, parts: Parts) -> None:
+    def __init__(self, config: Config, parts: AssembledRun) -> None:
         self._parts = parts
         self.env = parts.env
         selector = parts.agent.selector

@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
-from hpamdp.run.assemble import Parts
+from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state
 from hpamdp.run.collection.limits import limit_of
 from hpamdp.run.collection.worker import EnvShard, RemoteError, packed
@@ -62,7 +62,7 @@ class WorkerCollection(Collection):
     options: WorkerOptions
 
     def __init__(
-        self, config: Config, parts: Parts, frames: int, options: WorkerOptions | None = None, **settings: Any
+        self, config: Config, parts: AssembledRun, frames: int, options: WorkerOptions | None = None, **settings: Any
     ) -> None:
         self.options = self.Options.of(options, settings)
         num_workers = self.options.num_workers

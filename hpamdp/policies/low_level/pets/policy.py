@@ -16,7 +16,7 @@ from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
 from hpamdp.policies.shared.planning import (
-    Found,
+    PlannedAction,
     Prediction,
     Returns,
     SequenceSearch,
@@ -105,10 +105,10 @@ class PETSPolicy(PlanningPolicy):
         """Return the first action of each plan, see `PlanningPolicy.first_action`."""
         observation = observation[is_planned]
         member = td.get(MEMBER).flatten()[is_planned] if self._follows_member else None
-        found = self.plan(observation[:, self.entries], member, self._allowed(observation, mask))
-        own = found.own if is_greedy() else with_exploring_noise(found.own, self.options.parameter_noise)
+        planned = self.plan(observation[:, self.entries], member, self._allowed(observation, mask))
+        own = planned.own if is_greedy() else with_exploring_noise(planned.own, self.options.parameter_noise)
         unit = own.new_zeros(len(own), self.specs.num_parameters)
-        return found.discrete, unit.scatter(-1, self.slots[found.discrete], own)
+        return planned.discrete, unit.scatter(-1, self.slots[planned.discrete], own)
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
@@ -131,7 +131,7 @@ class PETSPolicy(PlanningPolicy):
     def _follows_member(self) -> bool:
         return self.samples_posterior and not is_greedy()
 
-    def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> Found:
+    def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> PlannedAction:
         """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all.
 
         Args:
@@ -152,9 +152,9 @@ class PETSPolicy(PlanningPolicy):
             of_members = allowed.new_ones(num_members, num_places, *allowed.shape[1:])
             of_members[member, place] = allowed
             allowed = of_members
-        found = self._plan(stacked, allowed, is_mean=False)
+        planned = self._plan(stacked, allowed, is_mean=False)
         row = member * num_places + place
-        return Found(*(part[row] for part in found))
+        return PlannedAction(*(part[row] for part in planned))
 
     def _allowed(self, observation: Tensor, action_mask: Tensor | None) -> Tensor | None:
         """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`; None: all.
@@ -168,7 +168,7 @@ class PETSPolicy(PlanningPolicy):
         later = torch.ones_like(first) if later is None else later
         return torch.stack([first] + [later] * (self.options.horizon - 1), 1)
 
-    def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> Found:
+    def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> PlannedAction:
         """Plan from states `[E, N, observation_dim]`: N plans by the mean of all members, or one for each state.
 
         In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time.
@@ -177,7 +177,7 @@ class PETSPolicy(PlanningPolicy):
         search = self.search
         num_sequences = min(self.options.num_kept, search.num_sequences) if is_mean else search.num_sequences
         size = max(1, _CHUNK_ROWS // (num_sequences * search.samples_of_a_sequence(is_greedy())))
-        found = []
+        parts = []
         for begin in range(0, state.shape[1], size):
             piece = state[:, begin : begin + size]
             own = allowed
@@ -187,9 +187,9 @@ class PETSPolicy(PlanningPolicy):
             first_returns = self._returns_of_single_members(piece[0]) if is_mean else None
             returns = self._returns(piece, is_mean)
             part = search(returns, num_plans, state.device, own, first_returns, is_greedy=is_greedy())
-            found.append(part if is_mean else Found(*(each.unflatten(0, piece.shape[:2]) for each in part)))
-        joined_found = Found(*(torch.cat(part, 0 if is_mean else 1) for part in zip(*found, strict=True)))
-        return joined_found if is_mean else Found(*(part.flatten(0, 1) for part in joined_found))
+            parts.append(part if is_mean else PlannedAction(*(each.unflatten(0, piece.shape[:2]) for each in part)))
+        joined_parts = PlannedAction(*(torch.cat(each, 0 if is_mean else 1) for each in zip(*parts, strict=True)))
+        return joined_parts if is_mean else PlannedAction(*(each.flatten(0, 1) for each in joined_parts))
 
     def _returns(self, state: Tensor, is_mean: bool) -> Returns:
         """Return a function from sequences to their predicted returns, from states `[E, N, observation_dim]`.
