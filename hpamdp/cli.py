@@ -1,4 +1,4 @@
-"""The command line: Hydra composes the config, `hpamdp.run.train` runs it, a user's mistake is told in one line."""
+"""Run the command line: Hydra composes the config, `hpamdp.run.train` runs it, and a mistake ends in one line."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ from hpamdp.search_path import protect_children, put_working_directory_last, unp
 from hpamdp.shell import program
 
 _MISTAKE, _INTERRUPTED = 2, 130
-# Commands beside that of a run, by the modules whose `main` gets the words that follow, and a parser.
+# Further commands, and the modules whose `main` gets the words that follow and a parser.
 _COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play"}
-# What Hydra raises for a wrong command line or yaml file.
+# Errors that Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
 # Errors that no other setting can avoid: a full disk, limits of the process, a medium that is read only.
 _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.EROFS)
@@ -57,7 +57,7 @@ _OF_THE_MACHINE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EMFILE, errno.
 def main() -> None:
     """Run the command line.
 
-    Exits with 0, 1 (a bug, with its traceback), 2 (a user's mistake, told in one line) or 130 (interrupted).
+    The exit code is 0, 1 (a bug, with its traceback), 2 (a user's mistake, in one line) or 130 (interrupted).
     """
     reopen_standard_streams()
     with lenient_streams():
@@ -65,9 +65,9 @@ def main() -> None:
 
 
 def _main() -> None:
-    # Classes of one's own may lie in the working directory, as with `python -m`.
+    # The user's own classes may lie in the working directory, as with `python -m`.
     put_working_directory_last()
-    # Hydra then raises what it would print, in several lines, itself.
+    # Then Hydra raises its errors. Otherwise it would print them in several lines.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     # TorchRL logs every replay buffer that it fills.
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
@@ -112,7 +112,7 @@ _NEEDS = {"files": "more open files, see ulimit -n", "memory": "more memory, see
 
 @contextmanager
 def _limits_explained() -> Iterator[None]:
-    """Exit with 1 and one line if the process runs out of files or memory, whichever library raises the error."""
+    """Exit with 1 and one line if the process runs out of files or memory, in whatever library."""
     try:
         yield
     except ConfigError:
@@ -128,7 +128,7 @@ def _limits_explained() -> Iterator[None]:
 
 
 def _check_surroundings() -> None:
-    """Refuse a working directory that is gone and words that are no text."""
+    """Refuse a deleted working directory and words that are not valid text."""
     try:
         os.getcwd()
     except OSError as error:
@@ -166,14 +166,14 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _LostOutputError(Exception):
-    """Some text that the user asked for was not written; the cause is the stream's error."""
+    """Raised if text that the user asked for was not written; the cause is the stream's error."""
 
 
 def _check_shown() -> None:
-    """Check that the text which the user asked for has been written.
+    """Check that all text for stdout has been written.
 
     Raises:
-        _LostOutputError: some of it has not.
+        _LostOutputError: some text was lost.
     """
     error = lost_output()
     if error is not None:
@@ -181,7 +181,7 @@ def _check_shown() -> None:
 
 
 def _run_hydra(line: CommandLine, conf: Path) -> None:
-    """Let Hydra run the job or the jobs of a sweep; report mistakes in the command line in one line."""
+    """Let Hydra run the job or the sweep, and report mistakes in the command line in one line."""
     has_started = False
     start = uuid.uuid4().hex
 
@@ -216,11 +216,11 @@ def _run_hydra(line: CommandLine, conf: Path) -> None:
     if sweep.has_begun(start):
         sys.exit(sweep.report(start))
     if line.is_multirun:
-        raise ConfigError(f"{' '.join(line.words)}: stands for no job; see that no sweep is empty")
+        raise ConfigError(f"{' '.join(line.words)}: no job to run; give every swept setting a value")
 
 
 def _run_job(cfg: DictConfig, start: str) -> float | None:
-    """Run one job; return its score if it is one of a sweep."""
+    """Run one job, and return its score if the job belongs to a sweep."""
     put_working_directory_last()  # in a worker of a launcher, too
     with suppress(OSError):  # its first user reports the error
         resource_tracker.ensure_running()  # a helper process of Python, started while children are protected
@@ -244,9 +244,9 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
             else:
                 code = train.run(cfg, output_dir, job_overrides())
     except ConfigError as error:
-        # Not raised any further: Hydra would announce it in a line of its own.
+        # If the error were raised further, Hydra would print another line about it.
         with suppress(OSError):
-            output_dir.rmdir()  # Hydra made it; it stays if there is something in it
+            output_dir.rmdir()  # Hydra made it; it stays if it is not empty
         _exit_with(str(error))
     except OSError as error:
         if not is_about_folder(error, output_dir):
@@ -258,7 +258,7 @@ def _run_job(cfg: DictConfig, start: str) -> float | None:
 
 
 def _go_on(cfg: DictConfig, output_dir: Path) -> int:
-    """Continue the run in its folder, or start it there; return the exit code.
+    """Continue the run in its folder, or start it there, and return the exit code.
 
     Raises:
         ConfigError: the folder holds the results of another run.
@@ -279,10 +279,10 @@ def _go_on(cfg: DictConfig, output_dir: Path) -> int:
 
 
 def _refuse_early(cfg: DictConfig) -> None:
-    """Refuse what is surely wrong before torch is imported. The run checks its config again, with the real classes.
+    """Refuse wrong settings before torch is imported. The run checks its config again, with the real classes.
 
     Raises:
-        ConfigError: a wrong value, or values that do not go together.
+        ConfigError: a value is wrong, or values do not go together.
     """
     if cfg.resume is not None or cfg.mode == "eval":  # the saved run has the config
         return
@@ -295,7 +295,7 @@ def _refuse_early(cfg: DictConfig) -> None:
 
 
 def _stay(directory: str) -> None:
-    """Go back to the working directory, from which all relative paths of a command line and its yaml files count."""
+    """Go back to the working directory, so that relative paths in the command line and yaml files stay right."""
     os.chdir(directory)
     warn(f"hydra.job.chdir=true: the run stays in {directory}, so that relative paths stay right")
 

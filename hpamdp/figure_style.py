@@ -1,4 +1,4 @@
-"""The style of all figures: colours, fonts, and labels at the ends of lines."""
+"""Define the style of all figures: colours, fonts, and labels at the ends of lines."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-# Colours of Okabe and Ito and of Tol that the colour-blind tell apart, each with one meaning in all figures.
+# Colours of Okabe and Ito and of Tol, which colour-blind people can tell apart. Each has one meaning in all figures.
 AGENT, INK, FAINT = "#0072B2", "#2b2b2b", "#8c8c8c"
 
-# Of each learner, in the order of legends and tables.
+# Colour of each learner, in the order of legends and tables.
 LEARNER_COLOURS = {
     "hppo": "#0072B2",
     "hsac": "#D55E00",
@@ -51,9 +51,9 @@ STYLE: Any = {
 
 
 def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1.0) -> None:
-    """Write labels (height, text, colour) right of the axes, a line's height apart at least.
+    """Write labels (height, text, colour) to the right of the axes, at least a line's height apart.
 
-    A thin leader joins a label to its line's end, `ends` of the way across the axes.
+    A thin leader joins each label to the end of its line. `ends` are the ends' places, as fractions of the axes' width.
     """
     low, high = axes.get_ylim()
     labels = sorted(labels)
@@ -72,7 +72,7 @@ def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1
 
 
 def _apart(heights: list[float], gap: float) -> list[float]:
-    """Move sorted heights to be at least `gap` apart, every cluster about its own mean, none above 1."""
+    """Move sorted heights at least `gap` apart. A cluster keeps its mean, and no height exceeds 1."""
     clusters: list[list[float]] = []
     for height in heights:
         clusters.append([height])

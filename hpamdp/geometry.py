@@ -1,4 +1,4 @@
-"""What a problem declares of its symmetry: the maps that change nothing, and where its actions point in the plane."""
+"""Declare a problem's symmetries: the maps that preserve dynamics and rewards, and the actions' directions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from torch.nn import functional as F
 
 @dataclass(frozen=True, eq=False)
 class Contexts:
-    """Which of several sets of discrete actions an observation belongs to, where actions mean different things in each.
+    """Contexts, on which the effects of the discrete actions depend.
 
-    Options are contexts: with each of them, the same discrete action may do something else.
+    Options are contexts: the same discrete action may have a different effect in each of them.
 
     Attributes:
-        num_contexts: how many there are; 1 where actions always mean the same.
-        context_entry: of the observation: the number of the context, negative while it is open; None: it has none.
-        one_hot_entry: of the observation: where the one-hot context begins; None: it has none.
+        num_contexts: number of contexts; 1 if the effects are always the same.
+        context_entry: entry of the observation with the context's number, negative while the context is open; None if
+            there is no such entry.
+        one_hot_entry: first entry of the one-hot context in the observation; None if there is none.
     """
 
     num_contexts: int = 1
@@ -28,7 +29,7 @@ class Contexts:
     one_hot_entry: int | None = None
 
     def context(self, observation: Tensor) -> Tensor:
-        """Return the contexts, int64 `[*B]`, of observations `[*B, observation_dim]`; 0 while they are open."""
+        """Return the contexts, int64 `[*B]`, of observations `[*B, observation_dim]`; 0 while the context is open."""
         if self.one_hot_entry is not None:
             end = self.one_hot_entry + self.num_contexts
             return observation[..., self.one_hot_entry : end].argmax(-1)
@@ -38,7 +39,7 @@ class Contexts:
 
     @property
     def entries_of_contexts(self) -> list[int]:
-        """The entries of the observation that say which of several contexts holds."""
+        """The entries of the observation that hold the context."""
         if self.num_contexts == 1:
             return []
         entries = [] if self.context_entry is None else [self.context_entry]
@@ -47,7 +48,7 @@ class Contexts:
         return entries
 
     def _entries_in(self, place: Mapping[int, int]) -> dict[str, Any]:
-        """Return where the context lies among other entries, by their places."""
+        """Return the context's new entries, given the new place of each entry."""
         names = ("context_entry", "one_hot_entry")
         entries = {name: getattr(self, name) for name in names}
         return {name: None if entry is None else place.get(entry) for name, entry in entries.items()}
@@ -55,21 +56,20 @@ class Contexts:
 
 @dataclass(frozen=True, eq=False)
 class PlaneGeometry(Contexts):
-    """Where vectors of the plane lie in an observation, and where the discrete actions point.
+    """The vectors of the plane in an observation, and the directions of the discrete actions.
 
-    Where actions point, it says more: discrete actions of one kind differ in their directions alone. A plane turned
-    until one of them points where the other did gives the same change, turned, and the same reward.
+    Discrete actions of one kind differ only in their directions. Turn the plane until one action points where another
+    of its kind did: then the change turns with it, and the reward stays the same.
 
     Attributes:
         vectors: pairs of entries of the observation, x and y.
-        origins: what a vector is measured from, for each of them; () if from zero.
-        directions: `[num_contexts, num_discrete, 2]`: unit vectors, zero where an action points nowhere; None where
-            none of them points anywhere.
-        kinds: the kind of each discrete action, `num_discrete` numbers from 0 on; () if each is a kind of its own.
-        has_mirror: whether a plane that is mirrored at an action's direction gives the same change, mirrored, and the
-            same reward.
-        redundant: entries of the observation that a model can do without: nothing that follows depends on them, or
-            other entries tell as much. None of them shares a vector with an entry that is not.
+        origins: origin of each vector; () if all are zero.
+        directions: `[num_contexts, num_discrete, 2]`: unit vectors, zero for an action without a direction; None if no
+            action has one.
+        kinds: the kind of each discrete action, `num_discrete` numbers from 0 on; () if all kinds differ.
+        has_mirror: whether mirroring the plane at an action's direction mirrors the change and keeps the reward.
+        redundant: entries of the observation that a model does not need: nothing later depends on them, or other
+            entries hold the same information. Both entries of a vector are redundant, or neither is.
     """
 
     vectors: tuple[tuple[int, int], ...] = ()
@@ -91,7 +91,7 @@ class PlaneGeometry(Contexts):
         return self if self.num_contexts == 1 else replace(self, one_hot_entry=observation_dim)
 
     def with_entries(self, entries: Sequence[int]) -> PlaneGeometry:
-        """Return the geometry of observations that have these entries alone."""
+        """Return the geometry of observations reduced to these entries."""
         place = {entry: number for number, entry in enumerate(entries)}
         kept = [number for number, pair in enumerate(self.vectors) if pair[0] in place and pair[1] in place]
         return replace(
@@ -122,7 +122,7 @@ class PlaneGeometry(Contexts):
             f"{len(self.kinds)} kinds, but must be {len(parameter_dims)}": (
                 len(self.kinds) not in (0, len(parameter_dims))
             ),
-            f"kinds {self.kinds} with {tuple(parameter_dims)} parameters, but those of a kind must have as many": (
+            f"kinds {self.kinds} with {tuple(parameter_dims)} parameters, but a kind must have one number of them": (
                 len(dims_of_kinds) > len(set(self.kinds))
             ),
             f"directions have shape {shape}, but must be {expected}": shape != expected,
@@ -134,19 +134,19 @@ class PlaneGeometry(Contexts):
 class Symmetries(Contexts):
     """Maps of (observation, discrete action, parameters) under which neither the dynamics nor the reward change.
 
-    If an action leads from one observation to the next, then the mapped action leads from the mapped observation to
-    the mapped next one, with the same reward and the same end; in noisy problems, with the same probability. Map 0 is
-    the identity. Parameters are in units where their bounds are [-1, 1].
+    If an action leads from one observation to the next, the mapped action leads from the mapped observation to the
+    mapped next one. Reward and end of the episode stay the same; in noisy problems, so does the probability. Map 0 is
+    the identity. Parameters are scaled to bounds of [-1, 1].
 
     Attributes:
         weight: `[G, observation_dim, observation_dim]`.
-        offset: `[G, observation_dim]`. Observation o becomes `weight @ o + offset`.
-        discrete: int64 `[G, num_contexts, num_discrete]`: what each discrete action becomes.
-        source: int64 `[G, num_contexts, num_parameters]`: which parameter takes each place.
-        sign: `[G, num_parameters]`: 1 or -1, of the parameter that takes the place.
-        shift: `[G, num_parameters]`: what is added to it then.
-        is_periodic: bool `[num_parameters]`: whether -1 and 1 are the same.
-        contexts: int64 `[G, num_contexts]`: what each context becomes; the maps of one option keep all columns.
+        offset: `[G, observation_dim]`. The map of observation o is `weight @ o + offset`.
+        discrete: int64 `[G, num_contexts, num_discrete]`: map of each discrete action.
+        source: int64 `[G, num_contexts, num_parameters]`: the parameter that moves to each place.
+        sign: `[G, num_parameters]`: factor 1 or -1 for the parameter at its new place.
+        shift: `[G, num_parameters]`: offset that is added after the factor.
+        is_periodic: bool `[num_parameters]`: whether -1 and 1 are the same value.
+        contexts: int64 `[G, num_contexts]`: map of each context; the maps of a single option keep all columns.
     """
 
     weight: Tensor
@@ -186,21 +186,21 @@ class Symmetries(Contexts):
         """Return discrete actions `[*B]` and parameters `[*B, num_parameters]` under the maps int64 `[*B]`.
 
         Args:
-            number: of the maps.
-            context: of the actions, `[*B]`.
+            number: numbers of the maps.
+            context: contexts of the actions, `[*B]`.
             discrete: the actions.
-            unit: their parameters in [-1, 1].
+            unit: parameters of the actions in [-1, 1].
         """
         moved = unit.gather(-1, self.source[number, context]) * self.sign[number] + self.shift[number]
         periodic = (moved + 1.0).remainder(2.0) - 1.0
         return self.discrete[number, context, discrete], torch.where(self.is_periodic, periodic, moved)
 
     def map_option(self, number: Tensor, option: Tensor) -> Tensor:
-        """Return options `[*B]` under the maps int64 `[*B]`; they stay as they are where they are no contexts."""
+        """Return options `[*B]` under the maps int64 `[*B]`; unchanged if options are not contexts."""
         return option if self.contexts.shape[-1] == 1 else self.contexts[number, option]
 
     def of_option(self, option: int) -> Symmetries:
-        """Return the maps of a learner that serves one option: those that keep it."""
+        """Return the maps that keep an option, for a learner of this option."""
         if self.num_contexts == 1:
             return self
         kept = self.contexts[:, option] == option
@@ -217,7 +217,7 @@ class Symmetries(Contexts):
         return replace(self, weight=weight, offset=F.pad(self.offset, (0, num_options)), one_hot_entry=entry)
 
     def with_entries(self, entries: Sequence[int]) -> Symmetries:
-        """Return the maps of observations that have these entries alone, which no map mixes with the others."""
+        """Return the maps of observations reduced to these entries, which no map may mix with the others."""
         kept = torch.tensor(entries)
         place = {entry: number for number, entry in enumerate(entries)}
         weight = self.weight[:, kept][:, :, kept]
@@ -256,9 +256,9 @@ def make_symmetries(
     context_entry: int | None = None,
     num_parameters: int,
 ) -> Symmetries:
-    """Return the symmetries with these tables; what is left out is the identity.
+    """Return the symmetries with these tables. An omitted table is the identity.
 
-    `discrete` and `source` may lack the dimension of the contexts where there is but one.
+    With a single context, `discrete` and `source` may lack the contexts' dimension.
     """
     num = len(weight)
     if discrete.ndim == 2:
@@ -284,7 +284,7 @@ def make_symmetries(
 
 
 def plane_maps(num_turns: int, *, has_mirror: bool = True) -> Tensor:
-    """Return the turns by multiples of a full turn / `num_turns`, then the same after a mirror x -> -x, `[G, 2, 2]`."""
+    """Return rotations `[G, 2, 2]` by multiples of 1 / `num_turns` of a turn, then the same after a mirror x -> -x."""
     angle = 2.0 * torch.pi * torch.arange(num_turns, dtype=torch.float64) / num_turns
     cos, sin = angle.cos(), angle.sin()
     turns = torch.stack([torch.stack([cos, -sin], -1), torch.stack([sin, cos], -1)], -2)
@@ -299,7 +299,7 @@ def on_observations(
     vectors: Sequence[tuple[int, int]],
     origins: Sequence[tuple[float, float]] = (),
 ) -> tuple[Tensor, Tensor]:
-    """Return weight and offset of the maps of observations that map vectors of the plane by `plane` `[G, 2, 2]`."""
+    """Return weight and offset of the observation maps that apply `plane` `[G, 2, 2]` to vectors of the plane."""
     weight = torch.eye(observation_dim, dtype=torch.float64).repeat(len(plane), 1, 1)
     offset = torch.zeros(len(plane), observation_dim, dtype=torch.float64)
     for place, pair in enumerate(vectors):
@@ -313,6 +313,6 @@ def on_observations(
 
 
 def as_directions(plane: Tensor, directions: Tensor, targets: Tensor) -> Tensor:
-    """Return which of `targets` `[K, 2]` the `directions` `[K, 2]` become under maps `[G, 2, 2]`, int64 `[G, K]`."""
+    """Return the index of the target `[K, 2]` to which each map `[G, 2, 2]` takes each direction, int64 `[G, K]`."""
     mapped = torch.einsum("gij,kj->gki", plane.to(directions), directions)
     return (mapped.unsqueeze(2) - targets).square().sum(-1).argmin(-1)

@@ -1,4 +1,4 @@
-"""Files with a JSON value in each line; lines may be damaged, for example cut short by a full disk."""
+"""Read files with a JSON value in each line, some of them damaged, for example cut short by a full disk."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _NUM_SHOWN = 3
 
 
 class LineError(ValueError):
-    """A line without a value; the message is one line."""
+    """Raised for a line without a value; the message is one line."""
 
 
 def read_json(line: bytes) -> Any:
@@ -33,14 +33,14 @@ def read_json(line: bytes) -> Any:
 
 
 def lines_of(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield the lines that are not blank with their numbers, from 1."""
+    """Yield the non-blank lines with their numbers, starting from 1."""
     for number, line in enumerate(data.split(b"\n"), 1):
         if line.strip():
             yield number, line
 
 
 def left_out(num_lines: int, problems: Mapping[int, str]) -> str:
-    """Return in one line how many lines were left out, and why the first ones were.
+    """Return a message of one line: how many lines were left out, and the problems of the first ones.
 
     Args:
         num_lines: number of all lines.

@@ -1,4 +1,4 @@
-"""The names of the entries of a tensordict, in one place."""
+"""Names of the entries of a tensordict."""
 
 OBSERVATION = "observation"
 OPTION = "option"
@@ -9,7 +9,7 @@ REWARD = "reward"
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 OUTCOME = "outcome"  # how the episode ended, in an environment's own codes
 
-# Written by an environment that forbids some choices at times: what may be chosen in its current state.
+# Written by an environment that forbids some choices: the allowed choices in its current state.
 ACTION_MASK = "action_mask"  # discrete actions
 OPTION_MASK = "option_mask"  # options
 
@@ -20,7 +20,7 @@ DECISION_OBSERVATION = "decision_observation"
 OPTION_ENDED = "option_ended"  # only where options may end inside their episodes
 EPISODE_RETURN, EPISODE_STEPS = "episode_return", "episode_steps"
 
-# Written by the agent for its learners, where there is `option_ended`: the option that holds in the next state.
+# Written by the agent for its learners if there is `option_ended`: the option that holds in the next state.
 NEXT_OPTION = ("next", "option")
 
 # Written by an environment that knows the best action; read by the `oracle` selector and the `planner` learner.
@@ -28,5 +28,5 @@ ORACLE_OPTION = ("oracle", "option")
 ORACLE_DISCRETE = ("oracle", "discrete")
 ORACLE_PARAMETERS = ("oracle", "parameters")
 
-# Written by an environment with human data: how often people choose each option; read by the `human` selector.
+# Written by an environment with human data: the probability that people choose each option. Read by `human`.
 HUMAN_OPTION = ("human", "option")

@@ -14,7 +14,7 @@ _CODES: dict[int, Limit] = {
     errno.EDQUOT: "space",
     errno.ENOMEM: "memory",
 }
-# What libraries say of these limits in errors without a number.
+# Messages of libraries about these limits, in errors without a number.
 _SIGNS: dict[str, Limit] = {
     "Too many open files": "files",
     "received 0 items of ancdata": "files",
@@ -27,7 +27,7 @@ _SIGNS: dict[str, Limit] = {
 
 
 def limit_in(error: BaseException) -> Limit | None:
-    """Return which limit an error is about; None if it is about no limit."""
+    """Return the limit that an error is about; None if it is about no limit."""
     if isinstance(error, MemoryError):
         return "memory"
     code = getattr(error, "errno", None)

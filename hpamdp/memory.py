@@ -1,4 +1,4 @@
-"""How much memory there is, and which errors say that it does not suffice."""
+"""Measure the memory of a device, and recognise errors about memory that does not suffice."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     import torch
 
-# Where Linux writes a container's limit, by the version of its control groups.
+# Files with a container's memory limit on Linux, for both versions of control groups.
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
-# What torch says of a tensor that is larger than memory, or than any number of bytes that it can count.
+# Messages of torch about a tensor that is larger than memory, or has more bytes than torch can count.
 _SIGNS = (
     "allocate memory",
     "out of memory",
@@ -28,7 +28,7 @@ _SIGNS = (
 
 
 def total_memory(device: torch.device) -> int:
-    """Return how many bytes the device has; of the CPU's memory, those that this process may use."""
+    """Return the device's memory in bytes; of the CPU's memory, as much as this process may use."""
     if device.type == "cuda":
         import torch
 
@@ -41,12 +41,12 @@ def total_memory(device: torch.device) -> int:
 
 
 def is_about_memory(error: BaseException) -> bool:
-    """Return whether an error says that something is larger than memory."""
+    """Return whether an error is about too little memory."""
     if isinstance(error, MemoryError):
         return True
     return isinstance(error, RuntimeError | OverflowError | ValueError) and any(sign in str(error) for sign in _SIGNS)
 
 
 def in_gigabytes(size: float) -> str:
-    """Return a number of bytes in words."""
+    """Return a number of bytes as text in gigabytes."""
     return f"{size / 1e9:,.1f} GB"

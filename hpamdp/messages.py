@@ -1,4 +1,4 @@
-"""Words for the user: one line each, on streams that may be gone."""
+"""Write messages of one line to the user, on streams that may be closed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, TextIO, cast
 def one_line(text: object) -> str:
     """Return a text or an error's message as one line, with a space in place of every line break.
 
-    Other characters that control a terminal, such as those of escape sequences, become question marks.
+    Other control characters, such as those of escape sequences, become question marks.
     """
     line = " ".join(line for line in map(str.strip, str(text).expandtabs().splitlines()) if line)
     return "".join(character if character.isprintable() else "?" for character in line)
@@ -24,10 +24,10 @@ def first_line(text: object) -> str:
 
 
 def reopen_standard_streams() -> None:
-    """Open the null device in the place of standard streams that are closed, as in `2>&-` and in some daemons.
+    """Open the null device in place of closed standard streams, as in `2>&-` and in some daemons.
 
-    Otherwise the next file that is opened gets the number of the closed stream, and libraries write their messages into
-    it. Call it before anything else is opened.
+    Otherwise the next file to be opened gets the number of the closed stream, and libraries write their messages into
+    that file. Call this function before anything else is opened.
     """
     for number, (name, mode) in enumerate({"stdin": "r", "stdout": "w", "stderr": "w"}.items()):
         try:
@@ -43,14 +43,14 @@ def reopen_standard_streams() -> None:
 class LenientStream:
     """A text stream on which writing never fails.
 
-    If the terminal was closed or the disk is full, only the text is lost. A letter that the stream cannot show is
+    If the terminal was closed or the disk is full, only the text is lost. A letter that the stream cannot encode is
     written as its number.
 
     Args:
-        stream: where the text goes. If None, as `sys.stderr` is if it was closed, the text goes nowhere.
+        stream: the stream to write to. If None, like a closed `sys.stderr`, the text is dropped.
 
     Attributes:
-        error: the last error that lost some text; None if all text was written.
+        error: the last error of a write; None if all text was written.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -97,7 +97,7 @@ class LenientStream:
 
 @contextmanager
 def lenient_streams() -> Iterator[None]:
-    """Let printing inside the block never fail, nor the interpreter's flush of stdout and stderr at its end."""
+    """Keep prints inside the block from failing, and the interpreter's last flush of stdout and stderr as well."""
     before = sys.stdout, sys.stderr
     out, err = (stream if stream is None else LenientStream(stream) for stream in before)
     sys.stdout, sys.stderr = cast(TextIO, out), cast(TextIO, err)
@@ -111,7 +111,7 @@ def lenient_streams() -> Iterator[None]:
 
 
 def _finish(stream: LenientStream) -> None:
-    """Flush a stream; if that fails, drop the rest of its text."""
+    """Flush a stream, or drop the rest of its text if that fails."""
     stream.error = None
     stream.flush()
     if stream.error is not None:
@@ -120,7 +120,7 @@ def _finish(stream: LenientStream) -> None:
 
 
 def lost_output() -> OSError | ValueError | None:
-    """Return the error that lost some of the text on stdout, if there was one."""
+    """Return the last error of a write to stdout, if there was one."""
     sys.stdout.flush()
     return getattr(sys.stdout, "error", None)
 
@@ -131,7 +131,7 @@ def say(text: str) -> None:
 
 
 def warn(message: str) -> None:
-    """Write one line to stderr, if it is still there; the logging module may be switched off."""
+    """Write one line to stderr, if it is still there. This works if logging is switched off."""
     _print(message, sys.stderr)
 
 
@@ -140,22 +140,22 @@ def _print(text: str, stream: TextIO | None) -> None:
     lenient.write(f"{text}\n")
     lenient.flush()
     if lenient.error is not None:
-        _finish(lenient)  # else the interpreter fails once more at its end
+        _finish(lenient)  # otherwise the interpreter fails again when it ends
 
 
 def reason_of(error: BaseException | None) -> str:
-    """Return in one line what went wrong, without the file that an `OSError` names."""
+    """Return an error's reason in one line, without the file that an `OSError` names."""
     return getattr(error, "strerror", None) or first_line(error)
 
 
 def file_and_reason(error: OSError) -> str:
-    """Return in one line the file that an error is about, if it names one, and what went wrong."""
+    """Return the file that an error names, if any, and its reason, in one line."""
     reason = reason_of(error)
     return reason if error.filename is None else f"{os.fsdecode(error.filename)}: {reason}"
 
 
 def duration(seconds: float) -> str:
-    """Return a time in words, as precise as its length calls for."""
+    """Return a duration as text, in hours and minutes, minutes and seconds, or seconds."""
     if seconds < 59.95:
         return f"{seconds:.1f} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -168,7 +168,7 @@ def invalid_action(row: int, values: Mapping[str, tuple[object, str]]) -> ValueE
 
     Args:
         row: number of the environment.
-        values: for each leaf of the action its value and what is allowed.
+        values: the value and the allowed values of each leaf of the action.
     """
     listed = ", ".join(f"{name}={value} ({allowed})" for name, (value, allowed) in values.items())
     return ValueError(f"step: environment {row} got {listed}")

@@ -1,4 +1,4 @@
-"""A run's numbers on disk: `metrics.csv`."""
+"""Read and write a run's metrics on disk, `metrics.csv`."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from hpamdp.files import replacing
 from hpamdp.messages import warn
 
 FRAMES, WALL_SECONDS = "frames", "wall_s"
-STOPPED = "stopped"  # 1 in the row that was written because the run was stopped
+STOPPED = "stopped"  # 1 in the last row of a stopped run
 EVALUATION = "eval/"
 
 
 def read_rows(path: Path) -> list[dict[str, float]]:
     """Read the rows of a `metrics.csv`, each with the columns that have a number.
 
-    A last line without its end was cut off during writing and is left out. A missing file has no rows. A file of
-    another kind has none either, and a warning names the file.
+    An incomplete last line, cut off during writing, is left out. A missing file has no rows. A file of another kind
+    has none either, and a warning names the file.
     """
     text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
     lines = text[: text.rfind("\n") + 1].splitlines()
@@ -36,20 +36,20 @@ def read_rows(path: Path) -> list[dict[str, float]]:
 def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:
     for column, cell in cells.items():
         try:
-            # A row longer than the header has its rest, a list, under None.
+            # If a row is longer than the header, its other cells are a list under None.
             yield str(column), float(cell)
         except (TypeError, ValueError):
             continue
 
 
 class MetricsFile:
-    """A csv file with one row for each log, complete on disk after every row. New columns may join.
+    """A csv file with one row for each log, complete on disk after every row. Later rows may add columns.
 
     Args:
-        path: the file. It does not change before the first row. A file of an earlier run is then kept as
+        path: the file. It does not change before the first row. Then a file of an earlier run is kept as
             `<name>.previous`.
-        resume_from: the metrics file of the run that is resumed, which may be `path` itself. Its rows come first.
-        up_to_frames: resumed rows past this many frames are left out, and so is the row of the stop.
+        resume_from: the metrics file of the resumed run, which may be `path` itself. Its rows come first.
+        up_to_frames: resumed rows past this many frames are left out, and so is the last row of a stopped run.
     """
 
     def __init__(self, path: Path, resume_from: Path | None = None, up_to_frames: float = math.inf) -> None:

@@ -1,4 +1,4 @@
-"""The files in the folder of a run: their names, and readers of its config and its summary."""
+"""Name the files in the folder of a run, and read its config and its summary."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CONFIG_NAME = "config.yaml"
 METRICS_NAME = "metrics.csv"
 # Folders that a run's logger writes to.
 TENSORBOARD_NAME, WANDB_NAME = "tensorboard", "wandb"
-# Names of the pictures in the folder, which the environment chooses.
+# Endings of the pictures in the folder. The environment chooses their names.
 FIGURES_NAME = ".figures"
 # All other files that a run writes.
 DIVERGED_NAME = "checkpoint.diverged.zip"

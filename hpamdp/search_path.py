@@ -18,9 +18,9 @@ def is_command_line() -> bool:
 
 
 def put_working_directory_last() -> None:
-    """Let no file of the working directory, such as `torch.py`, take the place of an installed package.
+    """Keep files of the working directory, such as `torch.py`, from replacing installed packages.
 
-    Classes of the user's own are still found there. If this package itself lies there, as in a clone, the order stays.
+    Python still finds the user's own classes there. If this package lies there, as in a clone, the order stays.
     """
     try:
         directory = os.getcwd()
@@ -33,13 +33,13 @@ def put_working_directory_last() -> None:
 
 
 def protect_children() -> None:
-    """Let Python processes that are started from now on look in the working directory last, too."""
+    """Make Python processes that are started from now on look in the working directory last as well."""
     if not _is_clone(os.getcwd()):
         os.environ.setdefault(_VARIABLE, _OURS)
 
 
 def unprotect_children() -> None:
-    """Undo `protect_children`, in this process or in one that it has started."""
+    """Undo `protect_children`, in this process or in a child process."""
     if os.environ.get(_VARIABLE) == _OURS:
         del os.environ[_VARIABLE]
 

@@ -1,4 +1,4 @@
-"""The base of every class's `Options`: the settings of a class, each with its type, bounds, default and meaning.
+"""Base class of every class's `Options`, which define each setting's type, bounds, default and meaning.
 
 A class lists its settings once, at the top of its file::
 
@@ -14,7 +14,7 @@ A class lists its settings once, at the top of its file::
             self.options = UCBOptions.of(options, settings)
 
 Then `UCB(specs)`, `UCB(specs, exploration=1.0)` and `UCB(specs, options=UCB.Options(exploration=1.0))` all work. The
-yaml file of the class names it and holds the values that differ from these defaults. The command line, its refusals,
+yaml file names the class and holds the values that differ from these defaults. The command line, its error messages,
 `--help` and the pages read the same model.
 """
 
@@ -38,17 +38,17 @@ def _check_rate(rate: float) -> float:
 
 
 LearningRate = Annotated[float, AfterValidator(_check_rate)]
-# A tuple, so that the model cannot change; from Python a list will do.
+# A tuple, so that the model cannot change. Python code may pass a list.
 Widths = Annotated[tuple[PositiveInt, ...], Strict(False)]
 Indices = Annotated[tuple[NonNegativeInt, ...], Strict(False)]
 
 
 class SettingError(ValueError):
-    """Raised by a constructor to refuse a setting; users see the message as one line, not as a traceback."""
+    """Raised by a constructor to refuse a setting. Users see the message in one line, without a traceback."""
 
 
 class Settings(BaseModel):
-    """Settings of a class: frozen, flat, without unknown names, infinite numbers or silent conversions."""
+    """Settings of a class. They are frozen and flat, and refuse unknown names, infinite numbers and other types."""
 
     model_config = ConfigDict(
         strict=True,
@@ -61,7 +61,7 @@ class Settings(BaseModel):
 
     @classmethod
     def of(cls, options: Self | None, settings: Mapping[str, Any]) -> Self:
-        """Return a constructor's options: the given ones or the defaults, changed by single settings.
+        """Return a constructor's options: the given options or the defaults, changed by single settings.
 
         Args:
             options: the constructor's argument `options`.

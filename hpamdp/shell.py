@@ -1,4 +1,4 @@
-"""Commands that a user can paste, quoted for the shell and for Hydra's grammar."""
+"""Quote commands for the shell and for Hydra's grammar, so that a user can paste them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shlex
 import sys
 from pathlib import Path
 
-# Texts that Hydra's grammar and a shell read as they are.
+# Texts that need no quotes in Hydra's grammar or in a shell.
 _PLAIN = re.compile(r"(?=.*/|[A-Za-z])[A-Za-z0-9_./-]+")
 _NO_TEXT = ("null", "true", "false", "inf", "nan")
 
@@ -23,18 +23,18 @@ def program() -> str:
 
 
 def setting(name: str, text: str) -> str:
-    """Return `name=text` as one word for the shell; the text may have any letters."""
+    """Return `name=text` as one word for the shell, whatever letters the text has."""
     is_plain = _PLAIN.fullmatch(text) and text.lower() not in _NO_TEXT
     return f"{name}={text}" if is_plain else for_shell(f"{name}={_for_hydra(text)}")
 
 
 def path_setting(name: str, path: Path) -> str:
-    """Return `name=path` as a word for the shell; a leading ~ is part of the name."""
+    """Return `name=path` as one word for the shell. A leading ~ is part of the path's name."""
     return setting(name, f"./{path}" if str(path).startswith("~") else str(path))
 
 
 def for_shell(word: str) -> str:
-    """Return a word in a POSIX shell's quotes, if it needs any, on one line."""
+    """Return a word on one line, in a POSIX shell's quotes if it needs them."""
     if word.isprintable():
         return shlex.quote(word)
     # ANSI-C quoting, which bash and zsh read.
@@ -43,7 +43,7 @@ def for_shell(word: str) -> str:
 
 
 def _for_hydra(text: str) -> str:
-    """Return a text in double quotes, where only quotes, `${` and backslashes before these have a meaning."""
+    """Return a text in double quotes, in which only quotes, `${` and backslashes before them are special."""
     text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
     text = re.sub(r'(\\*)"', r'\1\1\\"', text)
     return f'"{text}{_trailing_backslashes(text)}"'

@@ -1,4 +1,4 @@
-"""The sizes and bounds of a parameterised-action problem: all that learners and selectors get to know of it."""
+"""Describe a problem for learners and selectors: sizes and bounds, masks and symmetries."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ class PAMDPSpecs:
 
     Attributes:
         observation_dim: length of the observation.
-        option_names: the options that the agent chooses from at a decision; none where there is no choice.
-        parameter_dims: how many parameters each discrete action takes, `num_discrete` entries; they lie side by side.
+        option_names: the options that the agent chooses from at a decision; empty if there is no choice.
+        parameter_dims: number of parameters of each discrete action, `num_discrete` entries. The parameters of all
+            actions lie side by side.
         parameter_low, parameter_high: bounds of all parameters, `sum(parameter_dims)` entries.
-        initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the parameters
-            in [-1, 1] that the field starts this problem with; None where there is no such convention.
-        initial_bias: what it adds, `num_parameters` entries.
-        has_action_mask: whether the environment says which discrete actions may be taken, `action_mask`.
-        has_option_mask: whether it says which options may be chosen, `option_mask`.
-        option_actions: where options are sets of discrete actions: whether each option allows each of them,
-            `num_options` rows of `num_discrete` entries; else None.
-        held_option: of a learner that serves one option: its number; None: the observation ends in the one-hot option,
-            or there is none.
-        symmetries: maps under which neither dynamics nor reward change; None where the problem declares none.
-        geometry: which entries are vectors of the plane, and where the discrete actions point; None where the problem
+        initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the published
+            initial parameters in [-1, 1]; None if the problem has none.
+        initial_bias: bias of this map, `num_parameters` entries.
+        has_action_mask: whether the environment writes the allowed discrete actions, `action_mask`.
+        has_option_mask: whether the environment writes the allowed options, `option_mask`.
+        option_actions: whether each option allows each discrete action, `num_options` rows of `num_discrete` entries;
+            None if options are not sets of discrete actions.
+        held_option: number of the option that the learner serves; None if the observation ends in the one-hot option,
+            or if there is no option.
+        symmetries: maps under which neither dynamics nor reward change; None if the problem declares none.
+        geometry: vectors of the plane in the observation and directions of the discrete actions; None if the problem
             declares none.
     """
 
@@ -51,17 +52,17 @@ class PAMDPSpecs:
 
     @property
     def num_options(self) -> int:
-        """How many options there are."""
+        """Number of options."""
         return len(self.option_names)
 
     @property
     def num_discrete(self) -> int:
-        """How many discrete actions there are."""
+        """Number of discrete actions."""
         return len(self.parameter_dims)
 
     @property
     def num_parameters(self) -> int:
-        """How many parameters all discrete actions take together."""
+        """Number of parameters of all discrete actions together."""
         return sum(self.parameter_dims)
 
     @property
@@ -76,9 +77,9 @@ class PAMDPSpecs:
 
     @property
     def parameter_slots(self) -> Tensor:
-        """Return int64 `[num_discrete, max(parameter_dims)]`: where each discrete action's own parameters lie.
+        """Return int64 `[num_discrete, max(parameter_dims)]`: the indices of each discrete action's own parameters.
 
-        Where it has fewer than the maximum, slots of other actions follow.
+        If an action has fewer than the maximum, indices of other actions' parameters follow.
         """
         return (~self.parameter_mask).to(torch.int8).argsort(dim=-1, stable=True)[:, : max(self.parameter_dims)]
 
@@ -93,11 +94,11 @@ class PAMDPSpecs:
         return low + (unit + 1.0) * 0.5 * (high - low)
 
     def allowed(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor | None:
-        """Return which discrete actions a learner may take, bool `[*B, num_discrete]`; None: all of them.
+        """Return whether a learner may take each discrete action, bool `[*B, num_discrete]`; None if all are allowed.
 
         Args:
-            observation: as the learner sees it, `[*B, observation_dim]`.
-            action_mask: what the environment allows, `[*B, num_discrete]`; None: everything.
+            observation: the learner's observation, `[*B, observation_dim]`.
+            action_mask: the actions that the environment allows, `[*B, num_discrete]`; None if it allows all.
         """
         if self.option_actions is None:
             return action_mask
@@ -135,12 +136,12 @@ class PAMDPSpecs:
 
     @property
     def telling_entries(self) -> list[int]:
-        """The entries of the observation that are not redundant, all of them where nothing is declared."""
+        """The entries of the observation that are not redundant; all entries if the problem declares no geometry."""
         redundant = () if self.geometry is None else self.geometry.redundant
         return [entry for entry in range(self.observation_dim) if entry not in redundant]
 
     def with_telling_entries(self) -> PAMDPSpecs:
-        """Return the specs of observations that have the `telling_entries` alone."""
+        """Return the specs of observations reduced to the `telling_entries`."""
         entries = self.telling_entries
         symmetries, geometry = self.symmetries, self.geometry
         weight = self.initial_weight
@@ -154,10 +155,10 @@ class PAMDPSpecs:
 
     @classmethod
     def from_env(cls, env: EnvBase) -> PAMDPSpecs:
-        """Read the sizes off a `PAMDPEnv`.
+        """Return the specs of a `PAMDPEnv`.
 
         Raises:
-            ValueError: its initial parameters, symmetries or geometry do not fit its observation and action.
+            ValueError: the initial parameters, symmetries or geometry do not fit the observation and the action.
         """
         action = env.full_action_spec_unbatched
         parameters = action[keys.PARAMETERS]

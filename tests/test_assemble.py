@@ -142,7 +142,13 @@ def trained(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "words", ["low=random", "low=pdqn", "low=hppo low.hidden_dims=[8]", "low=hppo agent.sharing=shared"]
+    "words",
+    [
+        "low=random",
+        " ".join(["low=pdqn", *SHORT["pdqn"]]),
+        "low=hppo low.hidden_dims=[8]",
+        "low=hppo agent.sharing=shared",
+    ],
 )
 def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained, tmp_path):
     with pytest.raises(ConfigError) as error:

@@ -75,7 +75,7 @@ MISTAKES = [
     ),
     (["-m", "low.lrr=1,2"], "low.lrr: no such setting of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
     (["-m", "seed=-1"], "seed=-1: seed=-1: must be greater than or equal to 0 (conf/config.yaml)"),
-    (["-m", "seed=range(0,0)"], "seed=range(0,0): stands for no job"),
+    (["-m", "seed=range(0,0)"], "seed=range(0,0): no job to run"),
     (["-m", "seed=range(1"], "seed=range(1: not understood"),
     (["seed=1", "-m", "low=random"], "low=random: settings on both sides of a flag; write all of them after the flags"),
 ]

@@ -242,7 +242,9 @@ def test_a_logger_that_fails_is_switched_off_with_one_warning(where, tmp_path, m
 
     monkeypatch.setattr(TensorboardLogger, where, broken)
     assert start(tmp_path, "logger=tensorboard") == 0
-    warning = "logger=tensorboard: BrokenPipeError: the other end; the run goes on without this logger, and metrics.csv"
+    warning = (
+        "logger=tensorboard: BrokenPipeError: the other end; the run continues without this logger, and metrics.csv"
+    )
     assert capsys.readouterr().err.count(warning) == 1
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 6
 
@@ -323,19 +325,19 @@ def test_a_run_outlives_wandbs_service_and_the_next_run_starts_another(
     with monkeypatch.context() as patch:
         after_batches(patch, 2, kill_wandb)
         assert start(tmp_path / "a", "logger=wandb", "logger.mode=offline") == 0
-    assert capsys.readouterr().err.count("the run goes on without this logger") == 1
+    assert capsys.readouterr().err.count("the run continues without this logger") == 1
     assert len(read_rows(tmp_path / "a/metrics.csv")) == 5
     assert start(tmp_path / "b", "logger=wandb", "logger.mode=offline") == 0
     wandb.teardown()
     ((*_, last),) = wandb_curves(tmp_path / "b").values()
-    assert last[0] == 128 and "goes on without" not in capsys.readouterr().err
+    assert last[0] == 128 and "continues without" not in capsys.readouterr().err
 
 
 def test_a_run_outlives_the_folder_of_its_tensorboard_events(tmp_path, monkeypatch, capsys):
     after_batches(monkeypatch, 2, lambda: (tmp_path / "tensorboard").rename(tmp_path / "moved"))
     assert start(tmp_path, "logger=tensorboard") == 0
     err = capsys.readouterr().err
-    assert err.count("the run goes on without this logger") == 1 and "Traceback" not in err
+    assert err.count("the run continues without this logger") == 1 and "Traceback" not in err
     assert len(read_rows(tmp_path / "metrics.csv")) == 5
 
 

@@ -1,1 +1,1 @@
-"""What a user may set: read by `compose`, checked by `schema` and `components`, refused in the words of `errors`."""
+"""Settings of a run: `compose` reads them, `schema` and `components` check them, `errors` words the mistakes."""

@@ -1,4 +1,4 @@
-"""The words of a command line: parsed once, checked, and completed by what they stand for."""
+"""Parse, check and complete the words of a command line."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hpamdp.shell import setting
 
 GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
 _SAVED_RUNS = ("resume", "checkpoint", "low.checkpoint")
-# Flags of Hydra, with their short forms and what argparse needs to know of them.
+# Flags of Hydra, with their short forms and their arguments for argparse.
 _SWITCH: dict[str, Any] = {"action": "store_true"}
 _INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -43,7 +43,7 @@ _FLAGS: dict[str, tuple[str, dict[str, Any]]] = {
     "config-dir": ("-cd", {}),
     "info": ("-i", {"nargs": "?", "const": "all", "choices": _INFO}),
 }
-# Flags of which a command line has one at most.
+# A command line has at most one of these flags.
 _EXCLUSIVE = ("run", "multirun", "cfg", "info", "shell-completion")
 
 
@@ -52,7 +52,7 @@ class CommandLine:
     """A command line in Hydra's grammar.
 
     Attributes:
-        flags: the values of `--multirun`, `--config-dir` and so on, by their names.
+        flags: the values of flags such as `--multirun` and `--config-dir`, by their names.
         overrides: the settings.
     """
 
@@ -75,7 +75,7 @@ class CommandLine:
         return any(self.flags[name] for name in ("cfg", "info", "hydra-help", "shell-completion"))
 
     def argv(self) -> list[str]:
-        """Return the words as a program gets them."""
+        """Return the words of the whole command line."""
         flags = []
         for name, value in self.flags.items():
             if value:
@@ -83,16 +83,16 @@ class CommandLine:
         return [*flags, *self.words]
 
     def given(self) -> dict[str, Override]:
-        """Return the settings by what they set."""
+        """Return the settings by their names."""
         return {override.key_or_group: override for override in self.overrides}
 
     def with_words(self, words: Sequence[str]) -> CommandLine:
-        """Return the command line with these words in front of its settings."""
+        """Return the command line with more words in front of its settings."""
         return replace(self, overrides=(*_parsed(words), *self.overrides))
 
 
 def parse(argv: Sequence[str], conf: Path) -> CommandLine:
-    """Parse the words of a command line, and refuse what Hydra refuses with a traceback or a page of text.
+    """Parse the words of a command line, and refuse mistakes that Hydra would not report in one line.
 
     Args:
         argv: the words after the program's name.
@@ -126,7 +126,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _refuse(message: str) -> NoReturn:
-    # argparse takes the settings on one side of a flag for all of them.
+    # argparse finds settings on one side of a flag only.
     split = re.fullmatch(r"unrecognized arguments: ([^-].*=.*)", message)
     if split:
         raise ConfigError(f"{split.group(1)}: settings on both sides of a flag; write all of them after the flags")
@@ -142,7 +142,7 @@ def _parsed(words: Sequence[str]) -> tuple[Override, ...]:
 
 
 def _check_groups(line: CommandLine, conf: Path) -> None:
-    """Refuse a choice that is no name, such as `low=3`, on which Hydra ends in a traceback."""
+    """Refuse a choice that is no name, such as `low=3`, for which Hydra prints a traceback."""
     for override in line.overrides:
         if not override.key_or_group or override.key_or_group == "hydra":
             raise ConfigError(f"{override.input_line}: {GRAMMAR}")
@@ -177,14 +177,14 @@ def as_text(word: str) -> str:
 
 
 def choices_in(folder: Path) -> list[str]:
-    """Return the choices in a group's folder. Experiments may lie in folders there, which stand for all in them."""
+    """Return the choices in a group's folder. A folder of experiments stands for all experiments in it."""
     files = folder.rglob("*.yaml") if folder.name == "experiment" else folder.glob("*.yaml")
     names = [file.relative_to(folder).with_suffix("") for file in files]
     return sorted({str(choice) for name in names for choice in (name, *name.parents[:-1])})
 
 
 def completed(line: CommandLine, conf: Path) -> CommandLine:
-    """Complete the command line: the choices of a saved run, the experiments of a folder, the folder of their sweep.
+    """Add what the words stand for: a saved run's choices, a folder's experiments and their sweep's folder.
 
     Raises:
         ConfigError: there is no such run, or the experiments of a sweep have different folders.
@@ -195,7 +195,7 @@ def completed(line: CommandLine, conf: Path) -> CommandLine:
 
 
 def _saved_choices(line: CommandLine, conf: Path) -> list[str]:
-    """Return the choices of the run that this one starts from, as words of the command line, without those given."""
+    """Return the saved run's choices as words, except the choices that the command line makes."""
     values = {o.key_or_group: o.value() for o in line.overrides if not o.is_sweep_override() and not o.is_delete()}
     where = "resume" if values.get("resume") else "checkpoint"
     source = values.get(where)
@@ -231,9 +231,9 @@ def _with_experiments_of_a_folder(line: CommandLine, conf: Path) -> CommandLine:
 
 
 def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:
-    """Return the word with the folder that all experiments of a sweep over experiments name, if there is one.
+    """Return the word that sets the sweep's folder, if all experiments of the sweep name the same one.
 
-    Hydra takes a sweep's folder from the config without swept groups, in which no experiment is chosen.
+    Hydra reads a sweep's folder from the config without swept groups, so from none of the experiments.
 
     Raises:
         ConfigError: they name different ones.
@@ -265,7 +265,7 @@ def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:
 
 
 def written_out(override: Override) -> Iterator[str]:
-    """Yield the overrides, each with a single value, that one with a sweep stands for."""
+    """Yield an override for each value of a swept one."""
     if not override.is_discrete_sweep():
         yield override.input_line or ""
         return

@@ -1,7 +1,6 @@
-"""The classes that are chosen for the groups of conf/, each with its checked settings.
+"""Check and build the classes that are chosen for the groups of conf/.
 
-A class lists its settings in a model, `Options`. If it has none, its constructor's arguments are the settings: their
-names, types and defaults.
+A class lists its settings in a model, `Options`. If it has none, its constructor's arguments define the settings.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "collector": ("config", "parts", "frames"),
 }
 TARGET = "_target_"
-# Entries of a group that are values of the run, not settings of its class.
+# Entries of a group that belong to the run, not to the group's class.
 RUN_ENTRIES: dict[str, tuple[str, ...]] = {
     "low": ("budget", "checkpoint", "freeze", "per_option"),
     "env": ("grouping",),
@@ -52,8 +51,8 @@ class Component:
     """A class that was chosen for a group, with its settings.
 
     Attributes:
-        group: such as `low`.
-        name: of its yaml, such as `hyar`.
+        group: the group, such as `low`.
+        name: name of the yaml file, such as `hyar`.
         cls: the class; None for `high=none` and `data=none`.
         settings: checked values by name.
     """
@@ -74,22 +73,22 @@ class Component:
         return options_model(self.cls)(**self.settings)
 
     def is_guarded(self, name: str, value: object) -> bool:
-        """Return whether a saved config may give a setting this value only if the user says so.
+        """Return whether a saved config needs the user's permission to give a setting this value.
 
-        The class lists such settings in `guarded_settings`, as `name`, or as `name=value` if only that value is
-        guarded.
+        The class lists such settings in `guarded_settings`, as `name`, or as `name=value` if only that value needs
+        permission.
         """
         guarded = getattr(self.cls, "guarded_settings", ())
         return name in guarded or f"{name}={value}" in guarded
 
     def build(self, **context: Any) -> Any:
-        """Build the object; None where there is no class.
+        """Build the object, or return None if there is no class.
 
         Args:
-            context: what the program supplies; each goes to a constructor that has an argument of that name.
+            context: objects that the program supplies. The constructor gets those among its arguments.
 
         Raises:
-            ConfigError: the constructor refuses its settings with a `SettingError`, or memory does not suffice.
+            ConfigError: the constructor raises a `SettingError`, or memory does not suffice.
         """
         if self.cls is None:
             return None
@@ -108,22 +107,22 @@ class Component:
             raise ConfigError(f"{self.largest_sizes()}: takes more memory than there is") from error
 
     def largest_sizes(self) -> str:
-        """Return in words the settings that may have made this component too large."""
+        """Return the settings that may have made this component too large, as text."""
         sizes = {name: value for name, value in self.settings.items() if _is_size(value)}
         largest = sorted(sizes, key=lambda name: _size(sizes[name]))[-2:]
         return ", ".join(f"{self.group}.{name}={as_json(sizes[name])}" for name in reversed(largest)) or str(self)
 
 
 def component(group: str, name: str, given: Mapping[str, Any]) -> Component:
-    """Check the class and the settings of a group; build nothing.
+    """Check the class and the settings of a group without building the object.
 
     Args:
-        group: such as `low`.
-        name: of the yaml that was chosen.
+        group: the group, such as `low`.
+        name: name of the chosen yaml file.
         given: the group's part of the config as plain values, with its `_target_`.
 
     Raises:
-        ConfigError: all that is wrong with this group, in one line.
+        ConfigError: a class or a setting is wrong; the message lists all mistakes in one line.
     """
     own = RUN_ENTRIES.get(group, ())
     settings = {setting: value for setting, value in given.items() if setting not in (TARGET, *own)}
@@ -150,7 +149,7 @@ def check_kind(group: str, name: str, target: object) -> None:
     """Refuse a class that does not fit the group, or that is abstract.
 
     Raises:
-        ConfigError: with what the class lacks.
+        ConfigError: the message names what the class lacks.
     """
     if target is None and group in _CAN_BE_NONE:
         return
@@ -183,7 +182,7 @@ def load_class(dotted: str) -> type:
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        # A module that is there but lacks something it imports is no mistake of the user's.
+        # If the module exists but one of its own imports fails, the user has made no mistake.
         if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
             raise
         raise ConfigError(f"{dotted}: there is no module {error.name}") from error
@@ -216,10 +215,10 @@ def options_model(cls: type, supplied: Iterable[str] = ()) -> type[BaseModel]:
 
     Args:
         cls: the class.
-        supplied: arguments of its constructor that are no settings.
+        supplied: arguments of the constructor that are no settings.
 
     Raises:
-        ConfigError: there is no such model.
+        ConfigError: `Options` is no settings model, or an argument has a type that yaml cannot hold.
     """
     if takes_options(cls):
         model = cls.Options  # type: ignore[attr-defined]
@@ -240,7 +239,7 @@ def options_model(cls: type, supplied: Iterable[str] = ()) -> type[BaseModel]:
 
 
 def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the default of each setting as yaml holds it; `???` for settings that have none."""
+    """Return the default of each setting in its yaml form; `???` if it has none."""
     defaults = model.model_construct().model_dump(mode="json", warnings=False)
     for name, field in model.model_fields.items():
         inner = field.annotation
@@ -252,7 +251,7 @@ def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
 
 
 def file_of(group: str, name: str) -> str:
-    """Return the yaml file of a choice, as messages name it."""
+    """Return the path of a choice's yaml file for messages."""
     return f"conf/{group}/{name}.yaml"
 
 

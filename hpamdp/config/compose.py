@@ -1,4 +1,4 @@
-"""Configs as Hydra composes them from yaml files and words of a command line."""
+"""Compose configs by Hydra from yaml files and a command line, and check them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NESTED = "a yaml file names itself among its defaults, or a value nests too deep
 RECIPE = "recipe"
 _LONGEST_NAME = 200  # letters of a yaml file's name
 _SHOWN = 200  # letters of a command line in an error
-# Entries of a learner that the learner of a single option cannot have, and what to do instead.
+# Entries that the learner of a single option cannot have, and the advice in the error.
 _NOT_PER_OPTION = {
     TARGET: "a yaml file names the class; give the name of the file",
     "budget": "a run has one budget; set total_frames, num_envs, steps_per_batch or eval.every",
@@ -45,7 +45,7 @@ def conf_dir() -> Path:
 
 
 def package_dir(name: str) -> Path | None:
-    """Return a folder that lies inside the package where it is installed, and beside it in a clone; None: neither."""
+    """Return a folder inside the installed package, or beside the package in a clone; None if there is neither."""
     folders = (_package() / name, _package().parent / name)
     return next((folder for folder in folders if folder.is_dir()), None)
 
@@ -59,10 +59,10 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
 
     Args:
         cfg: as Hydra composes conf/config.yaml, with or without its `hydra` part.
-        choices: the name that was chosen for each group; None: those that Hydra knows.
+        choices: the name that was chosen for each group. If None, Hydra's choices.
 
     Raises:
-        ConfigError: a wrong value, or a group for which nothing is chosen.
+        ConfigError: a value is wrong, or nothing is chosen for a group.
     """
     names = chosen_names(cfg) if choices is None else choices
     for group in GROUPS:
@@ -79,7 +79,7 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
 
 
 def _check_found(node: Any, names: Mapping[str, str]) -> None:
-    """Refuse a recipe or a folder of yaml files that does not exist; Hydra leaves it out without a message.
+    """Refuse a missing recipe or folder of yaml files, which Hydra leaves out without a message.
 
     Args:
         node: the config's `hydra` part.
@@ -105,21 +105,21 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
 
 
 def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
-    """Check the config as plain values, in which no text is resolved.
+    """Check the config as plain values, without resolving text.
 
     Args:
-        given: the values of the run; for each group a mapping of `_target_` and the settings.
+        given: the values of the run, and for each group a mapping of `_target_` and the settings.
         names: the name that was chosen for each group.
 
     Raises:
-        ConfigError: a wrong value.
+        ConfigError: a value is wrong.
     """
     run = check_run(given, names)
     return checked_config(run, given, names, _learners_of_options(run, names["env"]))
 
 
 def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[str, Any]]]:
-    """Return each learner in `low.per_option`: its name, and its yaml and its recipe with the given settings."""
+    """Return each learner in `low.per_option`: its name, and its yaml file and recipe with the given settings."""
     learners = {}
     for option, choice in (run.low.per_option or {}).items():
         given = {"name": choice} if isinstance(choice, str) else dict(choice)
@@ -139,10 +139,10 @@ def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[
 
 
 def compose(overrides: list[str]) -> DictConfig:
-    """Return the config of these words, in the folders that the running job searches for yaml files.
+    """Return the config of these words, from the folders that the running job searches for yaml files.
 
     Raises:
-        MissingChoiceError: a word chooses a yaml file that is in none of these folders.
+        MissingChoiceError: no folder has the yaml file that a word chooses.
     """
     if HydraConfig.initialized():
         given = HydraConfig.get().overrides.hydra
@@ -157,7 +157,7 @@ def compose(overrides: list[str]) -> DictConfig:
 
 
 def compose_words(words: list[str]) -> DictConfig:
-    """Return the config of a command line's words, with its `hydra` part, outside of Hydra's own command line.
+    """Return the config of a command line's words with its `hydra` part, without running a job.
 
     Raises:
         ConfigError: the words cannot be composed.
@@ -175,18 +175,18 @@ def compose_words(words: list[str]) -> DictConfig:
 
 
 def beginning_of(words: Sequence[str]) -> str:
-    """Return the words of a command line, or as much of them as fits before an error."""
+    """Return the words of a command line for an error, cut short if they are long."""
     return f"{' '.join(words)[:_SHOWN]}: "
 
 
 def chosen_names(cfg: DictConfig) -> Mapping[str, str]:
-    """Return the name that was chosen for each group, from the config's `hydra` part or else from the running job."""
+    """Return the name that was chosen for each group, from the config's `hydra` part or from the running job."""
     node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
     return node.runtime.choices
 
 
 def job_overrides() -> list[str]:
-    """Return the words of the running job's command line, as they were written."""
+    """Return the words of the running job's command line, as the user wrote them."""
     return _words_of(HydraConfig.get())
 
 
@@ -197,7 +197,7 @@ def _words_of(node: Any) -> list[str]:
 
 
 def names_of(group: str) -> tuple[str, ...]:
-    """Return the names of a group's yaml files in all folders that are searched."""
+    """Return the names of a group's yaml files in all searched folders."""
     try:
         compose([f"+{group}@__none__=__none__"])  # added to the group's own choice, which may be optional
     except MissingChoiceError as error:  # Hydra lists the names only here.
@@ -208,7 +208,7 @@ def names_of(group: str) -> tuple[str, ...]:
 def plain_groups(cfg: DictConfig, run: Mapping[str, Any], groups: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return these groups of a composed config as plain values.
 
-    Settings that refer to a number of the run, such as `${total_frames}`, get it from `run`. Text of `run` is not used.
+    Settings that refer to a number of the run, such as `${total_frames}`, take it from `run`, but never text.
     """
     cfg = cfg.copy()
     for name in RunConfig.model_fields:
@@ -234,12 +234,12 @@ def plain(node: Any, where: str = "the config") -> dict[str, Any]:
 
 
 def is_name(name: object) -> TypeGuard[str]:
-    """Return whether this can be the name of a group's yaml file: words and slashes, but no way out of the folder."""
+    """Return whether a value can name a group's yaml file: words and slashes, but no way out of the folder."""
     if not isinstance(name, str) or len(name) > _LONGEST_NAME:
         return False
     return re.fullmatch(r"\w[\w.+-]*(/\w[\w.+-]*)*", name) is not None
 
 
 def choosing(group: str, name: str) -> str:
-    """Return the word that chooses a yaml file for a group; in quotes even `null` and `3` are names."""
+    """Return the word that chooses a yaml file for a group. The quotes make names of `null` and `3`."""
     return f"{group}='{name}'"

@@ -1,4 +1,4 @@
-"""The wording of a user's mistakes: one line that names what was given, what is allowed and where it was set."""
+"""Word a user's mistakes in one line: the given value, the allowed values and the place of the setting."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class ConfigError(ValueError):
-    """A user's mistake; the message is one line."""
+    """Raised for a user's mistake; the message is one line."""
 
 
 class MissingChoiceError(ConfigError):
-    """A choice whose yaml file is in none of the searched folders.
+    """Raised if a choice has no yaml file in the searched folders.
 
     Attributes:
         known: the names that exist in the group.
@@ -43,7 +43,7 @@ def as_json(value: object) -> str:
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:
-    """Return that there is no such thing, the likely spelling first, then all that there is."""
+    """Return a message that a name does not exist, with the likely spelling and all known names."""
     known = sorted(known)
     close = difflib.get_close_matches(name, known, n=1)
     guess = f"did you mean {close[0]}? It" if close else "it"
@@ -56,12 +56,12 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
     Args:
         model: the pydantic model.
         values: plain values by name.
-        prefix: what stands before a name on the command line, such as `low.`.
-        what: the values are, such as `setting of HPPO`.
-        where: they are set.
+        prefix: the names' prefix on the command line, such as `low.`.
+        what: kind of the values, such as `setting of HPPO`.
+        where: class and file that define the values.
 
     Raises:
-        ConfigError: all that is wrong with the values, in one line.
+        ConfigError: some values are wrong; the message lists all of them in one line.
     """
     try:
         # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
@@ -107,13 +107,13 @@ def _reworded(message: str, value: Any) -> str:
 
 
 def _shortened(complaints: list[str]) -> list[str]:
-    """Return the first complaints, and how many more there are: the settings of another class may all be wrong."""
+    """Return the first complaints, and the number of the others; all settings may be wrong if the class is."""
     num_more = len(complaints) - _MOST_COMPLAINTS
     return complaints if num_more <= 0 else [*complaints[:_MOST_COMPLAINTS], f"and {num_more} more like this"]
 
 
 def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: str) -> None:
-    """Refuse numbers that no computation can hold, in a model's own fields and in lists there."""
+    """Refuse numbers that are too large to compute with, in a model's fields and in lists there."""
     for name in model.model_fields:
         value = values.get(name)
         for number in value if isinstance(value, list) else [value]:
@@ -127,7 +127,7 @@ def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str,
 
 
 def _locate(location: tuple[int | str, ...], values: dict[str, Any]) -> tuple[list[str], Any]:
-    """Return the names that lead to a problem, and the value there."""
+    """Return the path of names to a wrong value, and the value."""
     path: list[str] = []
     value: Any = values
     for part in location:

@@ -1,4 +1,4 @@
-"""The page of `--help`, made of the yaml files and the settings models."""
+"""Write the page of `--help` from the yaml files and the settings models."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ Examples
 
 
 def help_page(line: CommandLine, conf: Path) -> str:
-    """Return the text of `--help`; it explains the settings of every choice that the command line names.
+    """Return the text of `--help`, which explains the settings of each choice on the command line.
 
     Raises:
         ConfigError: the command line cannot be composed.

@@ -1,4 +1,4 @@
-"""What Hydra says of a wrong command line or yaml file, in one line."""
+"""Explain Hydra's errors about a command line or a yaml file in one line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from hpamdp.config.renamed import renamed
 from hpamdp.config.schema import RUN_FILE
 from hpamdp.messages import file_and_reason, first_line
 
-# Launchers and sweepers of packages of their own, and the extra of pyproject.toml that brings each.
+# Launchers and sweepers in separate packages, and the extra of pyproject.toml that installs each.
 _EXTRAS = {
     "hydra/launcher": {"joblib": "joblib", "submitit_local": "slurm", "submitit_slurm": "slurm", "ray": "ray-launcher"},
     "hydra/sweeper": {"optuna": "optuna"},
@@ -32,7 +32,7 @@ _EXTRAS = {
 
 
 def explained(error: Exception, line: CommandLine, conf: Path) -> str:
-    """Return in one line what is wrong with the command line or the yaml files, given what Hydra says."""
+    """Return the mistake in the command line or the yaml files in one line, given Hydra's error."""
     if isinstance(error, OverrideParseException):
         return not_understood(error.override)
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
@@ -47,7 +47,7 @@ def explained(error: Exception, line: CommandLine, conf: Path) -> str:
 
 
 def not_understood(word: str) -> str:
-    """Return that a word is not in Hydra's grammar, and how to write it if its value is a text."""
+    """Return a message that a word is not in Hydra's grammar, with the right form if its value is a text."""
     if re.match(r"[+~]*[A-Za-z_@][\w.@/]*=.", word):
         return f"{word}: {GRAMMAR}, and a text with special characters as {as_text(word)}"
     return f"{word}: {GRAMMAR}"
@@ -65,7 +65,7 @@ def _missing_choice(file: str, there: Sequence[str], conf: Path) -> str:
 
 
 def _first_lines(error: Exception, words: Sequence[str]) -> str:
-    """Return in one line the place of an error in a yaml file, or the messages of an error and its cause."""
+    """Return the place of an error in a yaml file, or the messages of an error and its cause, in one line."""
     if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
         return f"{error.problem_mark.name}, line {error.problem_mark.line + 1}: {error.problem}"
     if isinstance(error, UnicodeDecodeError):  # which does not name the file
@@ -82,7 +82,7 @@ def _first_lines(error: Exception, words: Sequence[str]) -> str:
 
 
 def _wrong_setting(overrides: Sequence[Override], conf: Path) -> str | None:
-    """Return what is wrong with the first override whose setting is not in the config, if there is one."""
+    """Return a message about the first override of a setting that is not in the config; None if there is none."""
     groups = [o for o in overrides if "/" in o.key_or_group or os.path.isdir(conf / o.key_or_group)]
     others = [o for o in overrides if o not in groups and not o.is_add() and not o.is_force_add()]
     for choices in itertools.product(*map(written_out, groups)):
@@ -99,7 +99,7 @@ def _wrong_setting(overrides: Sequence[Override], conf: Path) -> str | None:
 
 
 def _missing_setting(cfg: DictConfig, setting: str, conf: Path) -> str | None:
-    """Return what is wrong with a dotted name that is not in the config; None if it is there."""
+    """Return a message that a setting with a dotted name is not in the config; None if it is."""
     node: Any = OmegaConf.to_container(cfg)
     names = setting.split(".")
     for depth, name in enumerate(names):

@@ -1,11 +1,11 @@
-"""Settings that had other names in earlier versions: refused with the new name, and read from saved runs."""
+"""Refuse old names of settings with the new name, and read settings with old names from saved runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-# Old names of settings and the new ones. A dotted name is the setting of a group, a plain one that of any group.
+# Old names of settings and the new ones. A dotted name belongs to one group, a plain name to any group.
 _NEW_NAMES = {
     "agent.uniform_option_frames": "uniform_option_steps",
     "env.options": "grouping",
@@ -26,11 +26,11 @@ _NEW_VALUES: dict[tuple[str, Any], Any] = {("rl", "td3"): True, ("rl", "ddpg"): 
 
 
 def renamed(setting: str, known: Iterable[str]) -> str | None:
-    """Return in words the new name of a setting, if it was renamed.
+    """Return a message with the new name of a setting; None if it was not renamed.
 
     Args:
-        setting: as on the command line, such as `low.warmup_frames`.
-        known: the names of the settings beside it, one of which must be the new name of a setting of any group.
+        setting: the old name as on the command line, such as `low.warmup_frames`.
+        known: names of the group's settings. The new name of a setting of any group must be among them.
     """
     new = _NEW_NAMES.get(setting)
     if new is None:
@@ -51,7 +51,7 @@ def with_new_names(group: str, settings: Mapping[str, Any], known: Iterable[str]
 
     Args:
         group: such as `low`.
-        settings: by their names at the time.
+        settings: the saved values by their names at the time.
         known: today's names of the group's settings.
     """
     known = set(known)

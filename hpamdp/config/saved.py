@@ -1,6 +1,6 @@
-"""Read the config of a saved run, which may be somebody else's: its values are text and numbers, and nothing runs.
+"""Read the config of a saved run without running code from it, since somebody else may have written it.
 
-Classes come from today's yaml files alone. No text of a saved config is resolved, so `${oc.env:HOME}` stays as it is.
+Values are text and numbers. Classes come from today's yaml files only. Text such as `${oc.env:HOME}` is not resolved.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hpamdp.config.schema import AgentConfig, Config, EnvConfig
 from hpamdp.settings import Settings
 
 _CHOICES = "choices"
-# Values of the run that earlier versions did not save, as they were at the time.
+# Values of the run that earlier versions did not save, with the defaults of the time.
 _BEFORE = {"film": True, "compile_updates": False, "update_precision": "float32"}
 _RUN_GROUPS: dict[str, type[Settings]] = {"agent": AgentConfig, "env": EnvConfig}
 
@@ -47,11 +47,11 @@ def read_saved(
             settings and its class.
         names: the names of the groups in `given`.
         trust: whether the saved config may set the `guarded_settings` of a class.
-        file: where the config was read from.
+        file: the file of the config.
 
     Raises:
-        ConfigError: a value is wrong, a name has no yaml file in the searched folders, or a guarded setting has its
-            value from `saved` alone.
+        ConfigError: a value is wrong, a name has no yaml file in the searched folders, or only `saved` sets a
+            guarded setting.
     """
     given, names = given or {}, names or {}
     saved = upgraded(saved)
@@ -85,7 +85,7 @@ def needs_trust(config: Config) -> bool:
 def _guarded(
     config: Config, saved: Mapping[str, Any], today: Mapping[str, Mapping[str, Any]], given: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the guarded settings whose values come from a saved config alone."""
+    """Return the guarded settings that only the saved config sets."""
     found = {}
     for group, ours in today.items():
         for name, value in saved[group].items():
@@ -108,7 +108,7 @@ def upgraded(saved: Mapping[str, Any]) -> dict[str, Any]:
     """
     for group in GROUPS:
         if not isinstance(saved.get(group), Mapping):
-            raise ConfigError(f"the saved config has no {group}; it is damaged, or not of this program")
+            raise ConfigError(f"the saved config has no {group}; it is damaged, or another program wrote it")
     values = dict(saved) if _CHOICES in saved else _from_first_form(saved)
     choices = values[_CHOICES]
     for group in GROUPS:
@@ -123,9 +123,9 @@ def upgraded(saved: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _from_first_form(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the config of an earlier version, where a group's entry `name` is its choice, in today's form.
+    """Return the config of an earlier version, in which a group's entry `name` is its choice, in today's form.
 
-    A class with a setting `name` put its value in the place of the choice. Such a choice is found by its settings.
+    If the class has a setting `name`, that value replaced the choice. Then the group's other settings identify it.
     """
     choices, groups = {}, {}
     for group in GROUPS:
@@ -142,7 +142,7 @@ def _from_first_form(saved: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settings_of(choices: Mapping[str, Any]) -> dict[str, set[str]]:
-    """Return the entries that each group can have: those of its yaml file, if there is one, and the run's own ones."""
+    """Return the possible entries of each group: the settings of its yaml file and the values of the run."""
     of_any = {group: {*RUN_ENTRIES.get(group, ())} for group in choices}
     try:
         if all(map(is_name, choices.values())):
@@ -156,7 +156,7 @@ def _settings_of(choices: Mapping[str, Any]) -> dict[str, set[str]]:
 
 
 def _set(values: dict[str, Any], path: Sequence[str], value: Any) -> None:
-    """Set a nested value; mappings on the way are copied."""
+    """Set a nested value, and copy the mappings that contain it."""
     *outer, last = path
     for name in outer:
         inner = values.get(name)

@@ -1,4 +1,4 @@
-"""The values of a run, and the config of a run as one checked object."""
+"""Define the values of a run, and hold the checked config of a run in one object."""
 
 from __future__ import annotations
 
@@ -32,41 +32,41 @@ def _check_device(name: str) -> str:
 
 
 class AgentConfig(Settings):
-    """How the two levels are put together."""
+    """Settings of how selector and learners act together."""
 
     sharing: Literal["per_option", "shared"] = "per_option"
     """`per_option`: one learner for each option. `shared`: one learner for all options, which observes the option."""
     termination: Literal["episode", "steps", "learned"] = "episode"
-    """Where options end: with the episode, after `option_length` steps, or where the selector decides, at any step."""
+    """When options end: with the episode, after `option_length` steps, or at any step if the selector decides so."""
     option_length: PositiveInt | None = None
     """Steps of an option, with `termination=steps` only."""
     uniform_option_steps: NonNegativeInt = 0
     """Steps at the start of training in which options are chosen uniformly, so that each option's learner gets data.
 
-    Otherwise a selector may settle early on the option whose learner improves first.
+    Without them, a selector may settle early on the option whose learner improves first.
     """
 
 
 class EnvConfig(Settings):
-    """What can be made of any problem."""
+    """Settings that every problem has."""
 
     grouping: Literal["default"] | dict[str, list[int | str]] | None = None
-    """Options made of the discrete actions: `{NAME: [ACTION, ...], ...}`, or `default` for the problem's suggestion."""
+    """Options as sets of discrete actions: `{NAME: [ACTION, ...], ...}`, or `default` for the problem's suggestion."""
 
 
 class StartConfig(Settings):
-    """The learners that a run starts with, and which of them are of another class than `low`."""
+    """Settings of the learners at the start of a run, and of single options' learners."""
 
     checkpoint: str | None = None
-    """An earlier run whose learners' networks this run starts with: its output folder, or the checkpoint in it."""
+    """Earlier run from which the learners' networks are loaded: its output folder, or the checkpoint in it."""
     freeze: bool = False
-    """Keep the learners as they are and train only the selector; frames are then counted in decisions."""
+    """Keep the learners as they are and train only the selector. Frames are then decisions."""
     per_option: dict[str, str | dict[str, Any]] | None = None
     """Learners of single options: `{OPTION: LEARNER}`, or `{OPTION: {name: LEARNER, SETTING: VALUE, ...}}`."""
 
 
 class BudgetConfig(Settings):
-    """What a learner's yaml recommends; the values of a run take what is there."""
+    """Values of the run that a learner's yaml recommends."""
 
     num_envs: PositiveInt | None = None
     steps_per_batch: PositiveInt | None = None
@@ -75,29 +75,29 @@ class BudgetConfig(Settings):
 
 
 class OfflineConfig(Settings):
-    """How much is learned from a data set alone."""
+    """Settings of training from a data set alone."""
 
     updates: PositiveInt = 5000
     """Updates of each learner, and of a selector that learns by updates, with `mode=offline`."""
     eval_every: NonNegativeInt = 500
-    """Updates between two evaluations; 0: only at the start and at the end."""
+    """Updates between two evaluations. If 0, only at the start and at the end."""
 
 
 class EvalConfig(Settings):
-    """How agents are scored."""
+    """Settings of evaluations."""
 
     every: NonNegativeInt
-    """Steps between two evaluations; 0: only at the start and at the end. By default the learner's recommendation."""
+    """Steps between two evaluations. If 0, only at the start and at the end. Default: the learner's recommendation."""
     layouts: PositiveInt = 1000
-    """Episodes to score the agent on, greedily; the same ones at every evaluation."""
+    """Number of episodes of an evaluation. The agent acts greedily, and every evaluation has the same episodes."""
     seed: Seed = 0
     """Seed of these episodes."""
     stop_score: float | None = None
-    """End training at the first evaluation that reaches this score; null: train to the end."""
+    """Score at which training ends, as soon as an evaluation reaches it. If null, training goes to its full length."""
 
 
 class RunConfig(Settings):
-    """The run's own values."""
+    """Values of the run as a whole."""
 
     mode: Literal["train", "offline", "eval"] = "train"
     """`train`: learn from the agent's own steps. `offline`: from a data set alone. `eval`: only score a checkpoint."""
@@ -108,34 +108,34 @@ class RunConfig(Settings):
     threads: Annotated[int, Field(ge=1, le=1024)] = 1
     """CPU threads of the learner. Small networks train fastest with one."""
     compile_updates: bool | Literal["auto"] = "auto"
-    """Compile the learners' updates by `torch.compile`; `auto`: if there is a compiler and the run is long enough."""
+    """Compile the learners' updates by `torch.compile`. If `auto`, only with a compiler and in a long enough run."""
     update_precision: Literal["float32", "bfloat16"] = "float32"
     """Precision of the matrix products in updates. bfloat16 is faster only with hardware support and large networks."""
     agent: AgentConfig = AgentConfig()
     env: EnvConfig = EnvConfig()
     low: StartConfig = StartConfig()
     total_frames: PositiveInt
-    """Steps to train for, over all environments. By default the learner's recommendation."""
+    """Steps of training, over all environments. Default: the learner's recommendation."""
     num_envs: PositiveInt
-    """Environments that run in parallel. By default the learner's recommendation."""
+    """Number of parallel environments. Default: the learner's recommendation."""
     steps_per_batch: PositiveInt
-    """Steps of each environment in a batch, after which the agent learns. By default the learner's recommendation."""
+    """Steps of each environment in a batch, after which the agent learns. Default: the learner's recommendation."""
     log_every: NonNegativeInt = 5000
-    """Steps between two rows of metrics.csv; 0: only with an evaluation."""
+    """Steps between two rows of metrics.csv. If 0, rows are written only with evaluations."""
     offline: OfflineConfig = OfflineConfig()
     eval: EvalConfig
     checkpoint_every: NonNegativeInt = 0
-    """Steps between two checkpoints; 0: none by steps."""
+    """Steps between two checkpoints. If 0, steps trigger no checkpoint."""
     checkpoint_minutes: Annotated[float, Field(ge=0.0)] = 5.0
-    """Minutes between two checkpoints; 0: none by time. A killed run loses no more than that."""
+    """Minutes between two checkpoints, the most that a killed run loses. If 0, time triggers no checkpoint."""
     checkpoint_replay: bool = True
-    """Save the replay buffers in checkpoints. A learner that is resumed without them begins with empty ones."""
+    """Save the replay buffers in checkpoints. Without them, a resumed learner starts with an empty buffer."""
     checkpoint: str | None = None
-    """The agent to score with `mode=eval`: the output folder of a run, or the checkpoint in it."""
+    """Agent to score with `mode=eval`: the output folder of a run, or the checkpoint in it."""
     resume: str | None = None
-    """The run to continue: its output folder, or the checkpoint in it.
+    """Run to continue: its output folder, or the checkpoint in it.
 
-    `auto` continues the run in `hydra.run.dir` if it is this very run, or starts a new run if the folder holds none.
+    `auto` continues the run in `hydra.run.dir` if it has the same config, or starts a new run if the folder holds none.
     """
     trust: bool = False
     """Let the file of `resume` or `checkpoint` give settings that can run code, read files or reach servers.
@@ -143,25 +143,25 @@ class RunConfig(Settings):
     If false, such settings (`env.entry_point`, for example) must be on the command line, too.
     """
     overwrite: bool = False
-    """Delete another run in the output folder as a whole, right before this one writes its first file."""
+    """Delete another run in the output folder, right before this one writes its first file."""
     film: bool = True
-    """Leave episodes.gif in the folder, in which the agent plays three episodes of its last evaluation."""
+    """Write episodes.gif, which shows three episodes of the agent's last evaluation."""
 
     @property
     def num_frames(self) -> int:
-        """Length of the training: in updates with mode=offline, else in steps or decisions."""
+        """Length of training: updates with `mode=offline`, decisions with frozen learners, otherwise steps."""
         return self.offline.updates if self.mode == "offline" else self.total_frames
 
     @property
     def eval_every(self) -> int:
-        """Distance between two evaluations, in the same unit; 0: only at the start and at the end."""
+        """Distance between two evaluations, in the unit of `num_frames`; 0 if only at the start and at the end."""
         return self.offline.eval_every if self.mode == "offline" else self.eval.every
 
     def resolve_device(self) -> torch.device:
         """Return the device to run on.
 
         Raises:
-            ConfigError: this machine does not have it.
+            ConfigError: this machine does not have the device.
         """
         import torch
 
@@ -177,7 +177,7 @@ class RunConfig(Settings):
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that was set for a run, checked."""
+    """The checked config of a run."""
 
     run: RunConfig
     env: Component
@@ -190,14 +190,14 @@ class Config:
 
     @property
     def learners(self) -> list[Component]:
-        """The learner that was chosen and those of single options."""
+        """The learner `low` and the learners of single options."""
         return [self.low, *self.low_of.values()]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the config as plain values: what a run saves and is resumed from.
+        """Return the config as plain values, the form in which a run saves it.
 
-        A value has its name on the command line, such as `low` / `lr`. `choices` has the name that was chosen for each
-        group, so that a class may have a setting of any name.
+        Values are nested as on the command line, such as `low` / `lr`. `choices` holds the choice of each group, so
+        that a class may have a setting of any name.
         """
         values = self.run.model_dump(mode="json", exclude={"trust"})
         values["choices"] = {group: getattr(self, group).name for group in GROUPS}
@@ -208,7 +208,7 @@ class Config:
         return values
 
     def to_yaml(self) -> str:
-        """Return `to_dict` as yaml; a reader must not resolve text that looks like an interpolation."""
+        """Return `to_dict` as yaml. A reader must not resolve text that looks like an interpolation."""
         return yaml.safe_dump(self.to_dict(), sort_keys=False, allow_unicode=True)
 
 
@@ -216,7 +216,7 @@ def check_run(given: Mapping[str, Any], names: Mapping[str, str]) -> RunConfig:
     """Check the values of the run.
 
     Args:
-        given: its values; of the groups `env` and `low`, too.
+        given: the values of the run, including its values in the groups `env` and `low`.
         names: the name that was chosen for each group.
 
     Raises:
@@ -242,9 +242,9 @@ def checked_config(
 
     Args:
         run: the checked values of the run.
-        given: for each group a mapping of `_target_` and the settings, plain values in which no text is resolved.
+        given: a mapping of `_target_` and the settings for each group. Text in it is not resolved.
         names: the name that was chosen for each group.
-        learners: of single options, by the option's name: the learner's name, and a mapping as for a group.
+        learners: for single options, by the option's name: the learner's name, and a mapping as for a group.
 
     Raises:
         ConfigError: a wrong value.

@@ -1,8 +1,8 @@
 """Import the classes of this package in a fraction of a second, with stand-ins for libraries that take seconds.
 
-A wrong setting is refused by the settings models and the attributes of classes. They stand in files that also import
-torch. Inside `quick_imports` a stand-in takes the place of torch and other slow libraries, so that the files can be
-read, but nothing in them can be run. Outside of it none of these modules is seen.
+Settings models and attributes of classes suffice to refuse a wrong setting, but their files also import torch. Inside
+`quick_imports`, stand-ins replace torch and other slow libraries. The files can then be imported, but their code cannot
+run. After the block, all modules with stand-ins are gone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _SLOW = frozenset(
     | {"tensordict", "torch", "torchrl", "tqdm", "wandb"}
 )
 _PACKAGE = __name__.partition(".")[0]
-# The modules of this package that were imported with stand-ins, and the stand-ins.
+# Modules of this package that were imported with stand-ins, and the stand-ins themselves.
 _modules: dict[str, ModuleType] = {}
 
 
@@ -55,7 +55,7 @@ def quick_imports() -> Iterator[None]:
             if name.partition(".")[0] in _SLOW | {_PACKAGE}:
                 _modules[name] = sys.modules.pop(name)
                 parent, _, child = name.rpartition(".")
-                if parent in before:  # else `from parent import child` would find the module there
+                if parent in before:  # otherwise `from parent import child` would find the module there
                     vars(sys.modules[parent]).pop(child, None)
 
 
@@ -77,7 +77,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
 
 class _Module(ModuleType):
-    """A module that has every name: that of a class to derive from, to call and to calculate with."""
+    """A module in which every name is a class to derive from, to call and to calculate with."""
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -88,7 +88,7 @@ class _Module(ModuleType):
 
 
 class _Anything(type):
-    """The class of stand-ins. What is done with one gives another; a class derived from one is an ordinary class."""
+    """The class of stand-ins. Every operation on one returns another. A class derived from one is an ordinary class."""
 
     def __getattr__(cls, name: str) -> Any:
         if name.startswith("__") or not _is_stand_in(cls):

@@ -1,4 +1,4 @@
-"""What happens to yaml files when Hydra reads them: they are checked, and completed by their classes' settings."""
+"""Check yaml files when Hydra reads them, and add the default settings of their classes."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 def complete_yaml_files() -> None:
     """Have Hydra's reader refuse files that would fill the memory, and add the defaults of missing settings.
 
-    So the composed config has all settings: the command line can override them, `--cfg job` shows them, and other yaml
-    files can refer to them.
+    The composed config then has all settings. The command line can override them, `--cfg job` shows them, and other
+    yaml files can refer to them.
     """
     readers: list[Any] = [each for each in Plugins.instance().discover(ConfigSource) if each.scheme() == "file"]  # type: ignore[attr-defined]
     for reader in readers:
@@ -34,7 +34,7 @@ def complete_yaml_files() -> None:
 
 
 def _load_complete(reader: Any, config_path: str) -> ConfigResult:
-    """Read a yaml file; takes the place of the method `load_config` of Hydra's reader."""
+    """Read a yaml file; replaces the method `load_config` of Hydra's reader."""
     check_size(Path(reader.path, reader._normalize_file_name(config_path)))
     result: ConfigResult = reader.load_alone(config_path)
     if isinstance(result.config, DictConfig):
@@ -43,7 +43,7 @@ def _load_complete(reader: Any, config_path: str) -> ConfigResult:
 
 
 def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
-    """Return the defaults of the settings that a yaml file can have: those of its class, or of the run."""
+    """Return the default settings of a yaml file's class, or of the run."""
     if config_path.removesuffix(".yaml") == "config":
         return defaults_of(RunConfig)
     group = config_path.partition("/")[0]
@@ -58,7 +58,7 @@ def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
 
 
 def check_size(file: Path) -> None:
-    """Refuse a file that a few aliases make huge, or that nests too deep. Aliases are counted, not expanded.
+    """Refuse a file that nests too deep or holds too many values; aliases are counted, not expanded.
 
     Raises:
         ConfigError: the message names the file.
@@ -77,7 +77,7 @@ def check_size(file: Path) -> None:
 
 
 def _counted(stream: Any) -> Iterator[tuple[int, int]]:
-    """Yield the numbers of values so far and of open levels after each event of a yaml file.
+    """Yield the number of values so far and the number of open levels after each event of a yaml file.
 
     Raises:
         KeyError: an alias refers to nothing, or to a value that contains it.

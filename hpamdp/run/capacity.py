@@ -1,4 +1,4 @@
-"""Refuse runs that memory is too small for, or whose budget is too small for a first update."""
+"""Refuse runs that need too much memory, or whose budget is too small for a first update."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.policies.base import Learner
 from hpamdp.specs import PAMDPSpecs
 
-# Fewer steps or episodes than this need no estimate of their memory, for which an environment is built.
+# Fewer steps or episodes than this need no estimate of their memory, which takes building an environment.
 _MANY = 1_000_000
-# A weight is there four times: itself, its gradient and two moments of Adam.
+# Each weight takes four numbers: itself, its gradient and two moments of Adam.
 _BYTES_A_WEIGHT = 16
 
 
@@ -29,12 +29,12 @@ def check_run(run: RunConfig, device: torch.device, build_one: Callable[[], PAMD
     The estimate counts the tensors of a step and the paths that an evaluation records.
 
     Args:
-        run: its values.
-        device: of the tensors.
+        run: the values of the run.
+        device: device of the tensors.
         build_one: builds a single environment; called only if the numbers are large.
 
     Raises:
-        ConfigError: with the bytes that are surely needed.
+        ConfigError: memory does not suffice; the message names the least number of bytes.
     """
     num_steps = 0 if run.mode != "train" else run.num_envs * run.steps_per_batch
     if max(run.num_envs, num_steps, run.eval.layouts) < _MANY:
@@ -52,19 +52,19 @@ def check_run(run: RunConfig, device: torch.device, build_one: Callable[[], PAMD
 
 
 def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component], device: torch.device) -> None:
-    """Refuse replay buffers, batches and layers that there is no memory for, before any of them is built.
+    """Refuse replay buffers, batches and layers that are too large for memory, before any of them is built.
 
-    They are known by the names of their settings: `buffer_size`, `batch_size`, `minibatch_size` and those that end in
-    `hidden_dims`.
+    They are recognised by the names of their settings: `buffer_size`, `batch_size`, `minibatch_size`, and names that
+    end in `hidden_dims`.
 
     Args:
-        config: of the run.
-        specs: of its problem.
+        config: config of the run.
+        specs: specs of its problem.
         learners: the component of each learner.
-        device: of the tensors.
+        device: device of the tensors.
 
     Raises:
-        ConfigError: with the bytes that are surely needed.
+        ConfigError: memory does not suffice; the message names the least number of bytes.
     """
     # Two observations, the action, reward and flags.
     row = 4 * (2 * specs.observation_dim + specs.num_parameters + 2)
@@ -84,7 +84,7 @@ def check_agent(config: Config, specs: PAMDPSpecs, learners: Sequence[Component]
 
 
 def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
-    """Refuse settings that together need more bytes than there are; the error names the one that needs most."""
+    """Refuse settings that together need more bytes than there are; the error names the largest one."""
     if not needs:
         return
     available = total_memory(device)
@@ -98,10 +98,10 @@ def _check_memory(needs: Mapping[str, int], device: torch.device) -> None:
 
 @contextmanager
 def memory_errors_explained(config: Config) -> Iterator[None]:
-    """Turn the errors of what does not fit into memory into one line that names the largest sizes.
+    """Turn an error about memory into one line that names the largest sizes.
 
     Raises:
-        ConfigError: there was such an error.
+        ConfigError: memory did not suffice.
     """
     try:
         yield
@@ -118,9 +118,9 @@ def check_length(config: Config, agent: HierarchicalAgent, learners: Iterable[tu
     """Refuse a training run that must end before the first update of the selector or of a learner.
 
     Args:
-        config: of the run.
-        agent: with its selector.
-        learners: of the agent, each with its component.
+        config: config of the run.
+        agent: the agent with its selector.
+        learners: the agent's learners, each with its component.
 
     Raises:
         ConfigError: the message names the setting that requires the most steps, and the number of steps of the run.

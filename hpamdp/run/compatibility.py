@@ -1,7 +1,7 @@
-"""What goes together in a run and what does not: two lists of rules, checked before anything is built.
+"""Check that the parts of a run go together, by two lists of rules, before anything is built.
 
-A rule returns one line with the settings to change, or None if it has nothing against the run. Rules read settings and
-attributes of classes alone, so they can be checked without torch.
+A rule returns one line with the settings to change, or None if the run satisfies it. Rules read only settings and
+attributes of classes, so they can be checked without torch.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.facts import ProblemFacts
 
-# The choice of a selector by itself, and the selector where there are options.
+# The choice that picks a selector automatically, and the selector that it picks if there are options.
 AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
 
 Rule: TypeAlias = Callable[[Config], "str | None"]
@@ -27,7 +27,7 @@ def check(config: Config) -> None:
     """Refuse settings that do not go together, as far as they can be compared before the environment is built.
 
     Raises:
-        ConfigError: with the settings to change.
+        ConfigError: a rule is broken; the message names the settings to change.
     """
     check_rules(config, RULES)
     facts = facts_of(config)
@@ -39,7 +39,7 @@ def check_rules(config: Config, rules: Sequence[Rule]) -> None:
     """Check some of the rules.
 
     Raises:
-        ConfigError: with the settings to change.
+        ConfigError: a rule is broken; the message names the settings to change.
     """
     _check(rule(config) for rule in rules)
 
@@ -48,28 +48,28 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
     """Refuse settings that do not go with the problem.
 
     Raises:
-        ConfigError: with the settings to change.
+        ConfigError: a rule is broken; the message names the settings to change.
     """
     _check(rule(config, facts) for rule in PROBLEM_RULES)
 
 
 def facts_of(config: Config) -> ProblemFacts | None:
-    """Return what the settings tell of the problem; None if only a built environment knows it."""
+    """Return the facts about the problem that follow from its settings; None if only a built environment has them."""
     facts = getattr(config.env.cls, "facts", None)
     options = config.env.options
     return None if facts is None or options is None else facts(options)
 
 
 def with_selector(config: Config, problem: ProblemFacts, words: Sequence[str] = ()) -> Config:
-    """Return the config with a selector in the place of `high=auto`: none if there is no option to choose.
+    """Return the config with `high=auto` replaced by a selector, or by none if there is no option to choose.
 
     Args:
-        config: of the run.
+        config: config of the run.
         problem: the facts about its problem.
-        words: of the command line.
+        words: words of the command line.
 
     Raises:
-        ConfigError: a word sets something of a selector, but there is none.
+        ConfigError: a word is a selector's setting, but there is no selector.
     """
     if config.high.name != AUTO_SELECTOR:
         return config
@@ -99,7 +99,7 @@ def _needs(component: Component) -> tuple[str, ...]:
 
 
 def option_length_goes_with_steps(config: Config) -> str | None:
-    """`agent.option_length` is there with `agent.termination=steps`, and only then."""
+    """Require `agent.option_length` with `agent.termination=steps`, and refuse it otherwise."""
     termination, length = config.run.agent.termination, config.run.agent.option_length
     if termination == "steps" and length is None:
         return "agent.option_length: missing; agent.termination=steps needs the number of steps of an option"
@@ -109,7 +109,7 @@ def option_length_goes_with_steps(config: Config) -> str | None:
 
 
 def saved_runs_are_named(config: Config) -> str | None:
-    """Settings that name a saved run are not empty, and go with the mode."""
+    """Require a mode in which the saved run is used, and refuse an empty name of a saved run."""
     run = config.run
     for name, value in (("resume", run.resume), ("checkpoint", run.checkpoint), ("low.checkpoint", run.low.checkpoint)):
         if value == "":
@@ -124,7 +124,7 @@ def saved_runs_are_named(config: Config) -> str | None:
 
 
 def stop_score_needs_evaluations(config: Config) -> str | None:
-    """Training is evaluated where a score is to end it."""
+    """Require evaluations during training if a score is to end it."""
     run = config.run
     if run.mode == "eval" or run.eval.stop_score is None or run.eval_every > 0:
         return None
@@ -132,18 +132,18 @@ def stop_score_needs_evaluations(config: Config) -> str | None:
     return f"eval.stop_score={run.eval.stop_score}: needs evaluations during training; set {every} above 0"
 
 
-# Rules about what the agent learns from.
+# Rules about the data that the agent learns from.
 
 
 def offline_runs_have_data(config: Config) -> str | None:
-    """With `mode=offline` there is a data set, and there are learners to train."""
+    """Require a data set and learners to train with `mode=offline`."""
     if config.run.mode == "offline" and config.data.cls is None:
         return "mode=offline: data=none leaves nothing to learn from; choose a data set"
     return None
 
 
 def levels_learn_from_what_there_is(config: Config) -> str | None:
-    """Learners and selector can learn from the run's own steps, or from its data set."""
+    """Require learners and a selector that can learn from the run's own steps or data set."""
     mode, has_data = config.run.mode, config.data.cls is not None
     sources = {"train": "its own steps", "offline": "data sets"}
     for low in config.learners:
@@ -161,7 +161,7 @@ def levels_learn_from_what_there_is(config: Config) -> str | None:
 
 
 def sums_of_rewards_fit_a_batch(config: Config) -> str | None:
-    """`low.n_step` is at most the length of a batch."""
+    """Require `low.n_step` to be at most the length of a batch."""
     n_step = max(low.settings.get("n_step", 1) for low in config.learners)
     if config.run.mode == "train" and n_step > config.run.steps_per_batch:
         return (
@@ -172,7 +172,7 @@ def sums_of_rewards_fit_a_batch(config: Config) -> str | None:
 
 
 def learners_have_the_values_that_are_compared(config: Config) -> str | None:
-    """A selector that compares the learners' values gets learners that have some."""
+    """Require learners with values if the selector compares them."""
     if not getattr(config.high.cls, "asks_learners", False):
         return None
     for low in config.learners:
@@ -188,7 +188,7 @@ def learners_have_the_values_that_are_compared(config: Config) -> str | None:
 
 
 def workers_share_the_environments(config: Config) -> str | None:
-    """A collector with workers is installed, has a run that takes steps, and gives all workers as many environments."""
+    """Require of a collector with workers its package, a mode with steps, and an equal share for each worker."""
     collector, run = config.collector, config.run
     if run.mode == "eval":  # which collects nothing
         return None
@@ -207,7 +207,7 @@ def workers_share_the_environments(config: Config) -> str | None:
 
 
 def workers_need_nothing_of_one_another(config: Config, problem: ProblemFacts) -> str | None:
-    """Environments that learn a common scale are in one process."""
+    """Require a single process for environments that learn a common scale."""
     if config.run.mode == "eval" or config.collector.settings.get("num_workers", 1) == 1 or problem.is_shardable:
         return None
     return (
@@ -220,7 +220,7 @@ def workers_need_nothing_of_one_another(config: Config, problem: ProblemFacts) -
 
 
 def the_problem_has_what_levels_need(config: Config) -> str | None:
-    """A level that asks a planner or human data gets a problem whose constructor has an argument for it."""
+    """Require a problem with a planner or human data if a level needs one."""
     assert config.env.cls is not None
     there = constructor_arguments(config.env.cls)
     lacks = {"oracle": "has no planner to ask", "human": "has no human data"}
@@ -232,7 +232,7 @@ def the_problem_has_what_levels_need(config: Config) -> str | None:
 
 
 def actions_are_grouped_once(config: Config, problem: ProblemFacts) -> str | None:
-    """`env.grouping` makes options for levels that know nothing of other ones."""
+    """Refuse `env.grouping` with levels that need the problem's own options."""
     if config.run.env.grouping is None:
         return None
     if config.run.env.grouping == "default" and not problem.default_options:
@@ -244,7 +244,7 @@ def actions_are_grouped_once(config: Config, problem: ProblemFacts) -> str | Non
 
 
 def a_choice_has_a_selector(config: Config, problem: ProblemFacts) -> str | None:
-    """There is a selector where the agent chooses options, and only there."""
+    """Require a selector if the agent chooses options, and refuse one otherwise."""
     has_selector, has_choice = config.high.cls is not None, _has_choice(config, problem)
     if has_selector and not has_choice:
         if not problem.option_names:
@@ -261,7 +261,7 @@ def a_choice_has_a_selector(config: Config, problem: ProblemFacts) -> str | None
 
 
 def plans_keep_the_option(config: Config, problem: ProblemFacts) -> str | None:
-    """Plans that change options are not asked for where an option lasts for its episode."""
+    """Refuse plans that change options if an option lasts for its episode."""
     if config.run.agent.termination != "episode" or not problem.plans_change_options:
         return None
     for low in config.learners:
@@ -274,7 +274,7 @@ def plans_keep_the_option(config: Config, problem: ProblemFacts) -> str | None:
 
 
 def options_end_where_they_may(config: Config, problem: ProblemFacts) -> str | None:
-    """Options end inside their episodes only if the problem, the selector and the run have a use for it."""
+    """Refuse options that end inside their episodes if the problem, the selector or the run has no use for it."""
     termination, high = config.run.agent.termination, config.high
     if termination == "episode":
         return None
@@ -300,7 +300,7 @@ def options_end_where_they_may(config: Config, problem: ProblemFacts) -> str | N
 
 
 def learners_of_options_have_an_option(config: Config, problem: ProblemFacts) -> str | None:
-    """`low.per_option` names options that exist and do not share a learner."""
+    """Require existing options with separate learners in `low.per_option`."""
     names = _option_names(config, problem) if _has_choice(config, problem) else ()
     unknown = [name for name in config.low_of if name not in names]
     if unknown:
@@ -312,7 +312,7 @@ def learners_of_options_have_an_option(config: Config, problem: ProblemFacts) ->
 
 
 def _overrides(cls: type | None, method: str, base: str) -> bool:
-    """Return whether a class has a method that is not the one of a class in the module `base`."""
+    """Return whether a class overrides a method of the module `base`."""
     owner = next((each for each in getattr(cls, "__mro__", ()) if method in vars(each)), None)
     return owner is not None and owner.__module__ != base
 

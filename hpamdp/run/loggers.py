@@ -1,4 +1,4 @@
-"""Loggers, which send a run's numbers and figures to other places than its own files."""
+"""Send a run's numbers and figures to TensorBoard, Weights & Biases or a logger of the user."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hpamdp.settings import SettingError, Settings
 
 
 class EarlierRun(NamedTuple):
-    """The run that is continued: its folder and its rows of metrics up to the checkpoint."""
+    """The folder of the continued run, and its rows of metrics up to the checkpoint."""
 
     folder: Path
     rows: Sequence[Mapping[str, float]]
@@ -34,7 +34,7 @@ _WANDB_START, _WANDB_FINISH = 20.0, 60.0
 
 Name = Annotated[str, Field(min_length=1)]
 WandbMode = Literal["offline", "online", "disabled"]
-# What WANDB_MODE may say; two names are wandb's older ones.
+# Values of WANDB_MODE, with two older names of wandb.
 _WANDB_MODES: dict[str, WandbMode] = {
     "online": "online",
     "offline": "offline",
@@ -52,7 +52,7 @@ class Logger(Protocol):
     """
 
     def log(self, row: dict[str, float], step: int) -> None:
-        """Take one row of metrics after `step` frames; steps never go down."""
+        """Take one row of metrics after `step` frames. `step` never decreases."""
 
     def images(self, paths: Iterable[Path]) -> None:
         """Take figures, under their file names."""
@@ -61,18 +61,18 @@ class Logger(Protocol):
         """Take a GIF of episodes, under its file name."""
 
     def summary(self, figures: dict[str, Any]) -> None:
-        """Take what closes the run; entries may be mappings."""
+        """Take the figures of the run's summary; entries may be mappings."""
 
     def close(self) -> None:
         """Finish; nothing is logged afterwards."""
 
 
 class Guarded:
-    """Passes every call on to a logger. After its first error, warns once and drops all later calls.
+    """Pass every call on to a logger. After its first error, warn once and drop all later calls.
 
     Args:
         name: the logger's name, for the warning.
-        start: a function that makes the logger. Its `ValueError` is a user's mistake and is raised.
+        start: a function that builds the logger. Its `ValueError` is a user's mistake and is raised.
     """
 
     def __init__(self, name: str, start: Callable[[], Logger]) -> None:
@@ -95,7 +95,7 @@ class Guarded:
 
     def _give_up(self, error: Exception) -> None:
         warn(
-            f"logger={self._name}: {type(error).__name__}: {first_line(error)}; the run goes on without this logger, "
+            f"logger={self._name}: {type(error).__name__}: {first_line(error)}; the run continues without this logger, "
             "and metrics.csv has all numbers"
         )
         with suppress(Exception):
@@ -127,7 +127,7 @@ class CSVLogger:
     """Log nothing beyond the files that every run writes.
 
     Args:
-        output_dir: the run's folder, where they are.
+        output_dir: the run's folder, which has these files.
     """
 
     def __init__(self, output_dir: Path) -> None:
@@ -152,10 +152,10 @@ class CSVLogger:
 class TensorboardLogger:
     """Log to a TensorBoard event file.
 
-    The file is complete after each row, and has the times of training. A resumed run deletes the old events, which may
-    go past its checkpoint, and writes its earlier rows again.
+    The file is complete after each row, and holds the times of training. A resumed run deletes the old events, since
+    they may go past its checkpoint, and writes its earlier rows again.
 
-    torch's `SummaryWriter` is not used, since it writes in a thread and prints its errors with a traceback.
+    torch's `SummaryWriter` is not used, because it writes in a thread and prints its errors with a traceback.
 
     Args:
         output_dir: the run's folder; the events go to `tensorboard` in it.
@@ -197,13 +197,13 @@ class TensorboardLogger:
                 self._write([image(path.stem, np.asarray(picture.convert("RGB")), dataformats="HWC")])
 
     def film(self, path: Path) -> None:
-        """Write the GIF as it is, which TensorBoard shows moving."""
+        """Write the GIF unchanged; TensorBoard plays it."""
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary
 
         with Image.open(path) as image:
             width, height = image.size
-        # torch's `video` would encode the pictures once more, and wants moviepy for it.
+        # torch's `video` would encode the pictures again, and needs moviepy.
         encoded = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=path.read_bytes())
         self._write([Summary(value=[Summary.Value(tag=path.stem, image=encoded)])])
 
@@ -233,7 +233,7 @@ class TensorboardLogger:
 
 
 class WandbOptions(Settings):
-    """Settings of `WandbLogger`; `project`, `entity`, `group` and `name` are those of `wandb.init`."""
+    """Settings of `WandbLogger`. `project`, `entity`, `group` and `name` go to `wandb.init`."""
 
     project: Name | None = "hpamdp"
     """Project of the run. If None, wandb chooses."""
@@ -244,19 +244,19 @@ class WandbOptions(Settings):
     name: Name | None = None
     """Name of the run. If None, wandb chooses."""
     mode: Literal["auto", "offline", "online", "disabled"] = "auto"
-    """With `auto`, `WANDB_MODE` decides; if it is not set, online if an API key is configured, else offline."""
+    """If `auto`, `WANDB_MODE` decides. If that is not set, the mode is online with an API key and offline without."""
 
 
 class WandbLogger:
-    """Log to Weights & Biases. It asks for no input and never keeps a run from starting.
+    """Log to Weights & Biases, without asking for input or keeping a run from starting.
 
-    With the mode `online` it goes offline, with a warning, if there is no API key (`WANDB_API_KEY` or netrc) or no
-    answer. Offline runs lie in `wandb` in the run's folder, ready for `wandb sync`.
+    With the mode `online`, it warns and goes offline if there is no API key (`WANDB_API_KEY` or netrc) or no answer.
+    Offline runs lie in `wandb` in the run's folder, ready for `wandb sync`.
 
     Args:
         output_dir: the run's folder.
         config: the run's settings, to show beside its numbers.
-        earlier: the run that is continued, if any; its id is kept.
+        earlier: the run that is continued, if any; the new run keeps its id.
     """
 
     Options = WandbOptions
@@ -318,7 +318,7 @@ class WandbLogger:
         except wandb.errors.Error as error:
             if chosen != "online":
                 raise
-            warn(f"wandb could not start online, the run is logged offline: {first_line(error)}")
+            warn(f"wandb could not start online, so the run is logged offline: {first_line(error)}")
             self._run = start("offline")
         self._image, self._video = wandb.Image, wandb.Video
         self._step = 0
@@ -326,9 +326,9 @@ class WandbLogger:
             self._take_over(earlier.rows, output_dir)
 
     def _take_over(self, rows: Sequence[Mapping[str, float]], output_dir: Path) -> None:
-        """Log the rows of the run that is continued, so that one offline run holds the whole curve.
+        """Log the rows of the continued run, so that one offline run holds the whole curve.
 
-        If the run is online, the server may know these rows. wandb drops the steps that the server knows.
+        If the run is online, wandb drops the rows that the server already has.
         """
         for row in rows:
             self.log(dict(row), int(row[FRAMES]))
@@ -356,11 +356,11 @@ class WandbLogger:
         self._run.log({path.stem: self._video(str(path), format="gif")}, step=self._step)
 
     def summary(self, figures: dict[str, Any]) -> None:
-        """Send what closes the run."""
+        """Send the figures of the run's summary."""
         self._run.summary.update(figures)
 
     def close(self) -> None:
-        """Wait, for a minute at most, until everything is sent."""
+        """Wait until everything is sent, for a minute at most."""
         self._run.finish()
 
     def abandon(self) -> None:
@@ -400,7 +400,7 @@ def _wandb_mode(mode: str, server: str) -> WandbMode:
         given = os.environ.get("WANDB_MODE") or ("online" if _has_wandb_key(server) else "offline")
     chosen = _WANDB_MODES[given]
     if chosen == "online" and not _has_wandb_key(server):
-        warn("wandb has no API key (WANDB_API_KEY or netrc), the run is logged offline")
+        warn("wandb has no API key (WANDB_API_KEY or netrc), so the run is logged offline")
         return "offline"
     return chosen
 

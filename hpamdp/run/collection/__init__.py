@@ -1,1 +1,1 @@
-"""Where batches come from: this process, worker processes or Ray actors."""
+"""Collect batches in this process, in worker processes or in Ray actors."""

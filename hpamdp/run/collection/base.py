@@ -1,4 +1,4 @@
-"""The contract of collections, which step a run's environments, in this process or in others, and give batches."""
+"""Define collections, which step a run's environments in this process or in others, and return batches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hpamdp.run.state_checks import SavedPart, check_columns, check_generator, c
 
 
 class CollectionState(SavedPart):
-    """The state that `Collection.state` returns."""
+    """State of a collection, as `Collection.state` returns it."""
 
     env: dict[str, Tensor]
     root: dict[str, Any] | None = None
@@ -26,7 +26,7 @@ class CollectionState(SavedPart):
 
 
 def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
-    """Return the state of a collection, checked.
+    """Check and return the state of a collection.
 
     Raises:
         ValueError: the state is of another run, or holds invalid numbers.
@@ -41,7 +41,7 @@ def checked_state(saved: Any, parts: AssembledRun) -> CollectionState:
         check_columns("env", state.env, own)
         env.check_env_state(state.env)
         if env.keeps_episodes and state.root is None:
-            raise ValueError("root is missing, from which the episodes in env go on")
+            raise ValueError("root is missing, from which the episodes in env continue")
     for generator in state.generators:
         check_generator(generator)
     for name, steps in (("root", state.root), ("coming", state.coming)):
@@ -54,7 +54,7 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
     """Refuse saved steps that cannot be steps `[N, *]` of the run.
 
     Raises:
-        ValueError: the message names the first wrong entry.
+        ValueError: an entry is wrong; the message names the first one.
     """
     if where == "coming":
         next_steps = saved.get("next")
@@ -80,19 +80,19 @@ def _check_steps(where: str, saved: Mapping[str, Any], example: TensorDictBase, 
 
 
 class CollectionError(Exception):
-    """Other processes cannot start or go on; the message is one line."""
+    """Raised if other processes cannot start or continue; the message is one line."""
 
 
 class WorkerDiedError(CollectionError):
-    """A worker process that ended before the run did."""
+    """Raised if a worker process ends before the run does."""
 
 
 class Collection:
-    """Gives batches of the agent acting in the run's environments, until it is closed.
+    """Let the agent act in the run's environments and return batches, until the collection is closed.
 
     A subclass's `__init__` takes any of `config`, `parts` and `frames` (steps so far), which the program supplies, and
-    its settings as `options`. Every collection gives batches of the same keys and shape, with the environments in the
-    same order. It uses the current policy, or the policy of the batch before if it collects ahead.
+    its settings as `options`. Batches of all collections have the same keys, shape and order of environments. A
+    collection uses the current policy, or the policy of the previous batch if it collects ahead.
     """
 
     package: ClassVar[str | None] = None  # an optional package that it needs; also the name of the extra
@@ -105,20 +105,20 @@ class Collection:
         """Collect a batch `[num_envs, steps_per_batch]`.
 
         Raises:
-            CollectionError: another process died, or a limit of this machine stops it.
+            CollectionError: another process died, or this machine reached a limit.
         """
         raise NotImplementedError
 
     def notices(self) -> list[str]:
-        """Return the messages for the user since the last call, such as about a replaced worker."""
+        """Return the messages for the user since the last call, for example about a replaced worker."""
         return []
 
     @abstractmethod
     def state(self) -> dict[str, Any]:
         """Return the state of the collection for a checkpoint.
 
-        `env` is the environments' `env_state`, first dimension `num_envs`. If that holds their episodes, `root` is the
-        tensordict `[num_envs]` from which the next step is made, as a nested dictionary.
+        `env` is the environments' `env_state`, with first dimension `num_envs`. If that holds the current episodes,
+        `root` is the tensordict `[num_envs]` from which the next step is made, as a nested dictionary.
         """
         raise NotImplementedError
 

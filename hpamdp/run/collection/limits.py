@@ -1,4 +1,4 @@
-"""Explain which limit of this machine keeps other processes from starting or from sharing memory."""
+"""Name the limit of this machine that keeps other processes from starting or from sharing memory."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _SHARED_MEMORY = "/dev/shm"  # where Linux keeps it
 
 
 def limit_of(error: BaseException) -> str | None:
-    """Return in words which limit an error is about and how to raise it; None if it is about no such limit."""
+    """Return the limit that an error is about and how to raise it, as text; None if it is about no such limit."""
     limit = limit_in(error)
     if limit == "files":
         return f"too many open files (ulimit -n is {_soft(resource.RLIMIT_NOFILE)}; raise it, or use fewer workers)"
@@ -21,7 +21,7 @@ def limit_of(error: BaseException) -> str | None:
 
 
 def full_shared_memory() -> str:
-    """Return a message that shared memory is full, and how to get more."""
+    """Return a message that shared memory is full and how to get more."""
     size = ""
     if os.path.isdir(_SHARED_MEMORY):
         disk = os.statvfs(_SHARED_MEMORY)

@@ -1,4 +1,4 @@
-"""Collection in worker processes on this machine."""
+"""Collect batches in worker processes on this machine."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class MultiCollection(WorkerCollection):
         super().__init__(config, parts, frames, options)
 
     def _start(self, shard: EnvShard) -> MultiSyncCollector:
-        # A terminal sends its Ctrl-C, and a cluster its stop, to every process of a run.
+        # A terminal sends Ctrl-C, and a cluster its stop signal, to every process of a run.
         with children_without(*STOP_SIGNALS):
             return MultiSyncCollector(
                 [shard.make_env],

@@ -1,4 +1,4 @@
-"""Collection in Ray actors, on this machine or on a cluster."""
+"""Collect batches in Ray actors, on this machine or on a cluster."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RayOptions(WorkerOptions):
     """Settings of `RayCollection`; the workers are Ray actors, each with a CPU."""
 
     address: str | None = None
-    """A running cluster, as `ray.init` takes it. If None, Ray runs on this machine for the time of the run."""
+    """Address of a running cluster, as for `ray.init`. If None, Ray runs on this machine for the time of the run."""
 
 
 class RayCollection(WorkerCollection):
@@ -45,7 +45,7 @@ class RayCollection(WorkerCollection):
         self, config: Config, parts: AssembledRun, frames: int, options: RayOptions | None = None, **settings: Any
     ) -> None:
         options = RayOptions.of(options, settings)
-        # RayCollector warns that it has no weights to send; `collect` sends them.
+        # RayCollector warns that it sends no weights, since `collect` sends them instead.
         for warning in ("RayCollector iteration started before weight", "The policy is not an nn.Module"):
             warnings.filterwarnings("ignore", message=warning)
         _connect(options.address, options.num_workers)
@@ -79,7 +79,7 @@ class RayCollection(WorkerCollection):
     def _raise_explained(self, number: int, error: Exception) -> NoReturn:
         from ray.exceptions import RayTaskError
 
-        # Ray wraps an actor's error into one whose text is a traceback.
+        # Ray wraps an actor's error into another one, whose text is a traceback.
         super()._raise_explained(number, error.cause if isinstance(error, RayTaskError) else error)
 
     def _death(self, worker: RayCollector | None, error: Exception) -> str | None:

@@ -1,4 +1,4 @@
-"""Collection in the learner's own process.
+"""Collect batches in the learner's own process.
 
 TorchRL resets all environments when a collector is built, and its `Collector.state_dict` holds only the policy and the
 environment's modules. So this module saves and restores a collector's root, the tensordict from which it makes the next
@@ -34,7 +34,7 @@ class SingleCollection(Collection):
             auto_register_policy_transforms=False,
         )
         if selector is not None and pending is not None:
-            selector.pending.copy_(pending)  # TorchRL has just tried the policy; these were no decisions
+            selector.pending.copy_(pending)  # TorchRL has just tried the policy, which made no real decisions
         self._batches = iter(self._collector)
         self._is_idle = True
 
@@ -48,8 +48,8 @@ class SingleCollection(Collection):
     def state(self) -> dict[str, Any]:
         """Return the environments' state and the root of the next step.
 
-        An error in the middle of a batch closes TorchRL's collector, so there are no episodes to continue. Then only
-        the rest of the environments' state is returned, such as the scale of observations.
+        An error in the middle of a batch closes TorchRL's collector, so there are no episodes to continue. Then the
+        state holds only the rest, such as the scale of observations.
         """
         if not self._is_idle:
             return {"env": {} if self.env.keeps_episodes else self.env.env_state()}
@@ -65,7 +65,7 @@ class SingleCollection(Collection):
             ValueError: the state is of another run, for example with another number of environments.
         """
         saved = checked_state(state, self._parts)
-        if saved.env:  # else the collector continues the episodes that it has just begun
+        if saved.env:  # otherwise the collector continues the episodes that it has just begun
             self.env.set_env_state(saved.env)
         if saved.root is not None and self.env.keeps_episodes:
             root = self._collector._carrier

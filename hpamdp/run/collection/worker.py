@@ -1,4 +1,4 @@
-"""The parts that a worker process builds: its shard of the run's environments, and a copy of the policy."""
+"""Build the parts of a worker process: its shard of the run's environments, and a copy of the policy."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _CPU = torch.device("cpu")
 
 
 def packed(module: nn.Module) -> bytes:
-    """Return a module's state as bytes, which unlike tensors share no memory between processes."""
+    """Return a module's state as bytes. Unlike tensors, bytes share no memory between processes."""
     file = io.BytesIO()
     torch.save(module.state_dict(), file)
     return file.getvalue()
 
 
 def unpack(module: nn.Module, state: bytes) -> None:
-    """Load a `packed` state into a module on the CPU, whatever device it was packed on."""
+    """Load a `packed` state of any device into a module on the CPU."""
     module.load_state_dict(torch.load(io.BytesIO(state), map_location=_CPU, weights_only=True))
 
 
@@ -57,7 +57,7 @@ class PolicyCopy(TensorDictModuleBase):
         return self.policy(td)
 
     def receive(self, state: bytes) -> float:
-        """Load the `packed` state of the learner's policy; return this process's CPU seconds so far."""
+        """Load the `packed` state of the learner's policy, and return this process's CPU seconds so far."""
         unpack(self.policy, state)
         return time.process_time() - self._cpu_before
 
@@ -71,14 +71,14 @@ class PolicyCopy(TensorDictModuleBase):
 
 
 class RemoteError(RuntimeError):
-    """An error in a worker, with its traceback in the text."""
+    """Raised for an error in a worker, with its traceback in the text."""
 
 
 class ShardCollector(Collector):
     """TorchRL's collector of a worker's shard."""
 
     def __bool__(self) -> bool:
-        """Return True; without this method Ray would ask for the length, which an endless collector does not have."""
+        """Return True. Without this method, Ray would ask for the length, which an endless collector lacks."""
         return True
 
     def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
@@ -89,8 +89,8 @@ class ShardCollector(Collector):
 
         Raises:
             ProblemError: the problem broke its contract.
-            MemoryError: the memory is too small.
-            RemoteError: any other error of the environment.
+            MemoryError: memory does not suffice.
+            RemoteError: the environment raised any other error.
         """
         try:
             return self.policy.receive(policy), self.next()
@@ -107,7 +107,7 @@ class SharedMemoryCollector(ShardCollector):
     _is_shared = False
 
     def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
-        """Collect as a `ShardCollector`; return None after the first batch, whose memory holds all later batches."""
+        """Collect a batch; return it the first time, then None, since its memory holds all later batches."""
         cpu_s, batch = super().collect(policy)
         if self._is_shared or batch is None:
             return cpu_s, None
@@ -120,11 +120,12 @@ class EnvShard:
     """The environments of one worker, with everything needed to build them in its process.
 
     Attributes:
-        config: of the run.
-        specs: of the problem.
-        first_env, num_envs: which of the run's environments.
-        env_seed: of the environments.
-        exploration_seed: of the worker's global generator.
+        config: config of the run.
+        specs: specs of the problem.
+        first_env: number of the shard's first environment in the run.
+        num_envs: number of its environments.
+        env_seed: seed of the environments.
+        exploration_seed: seed of the worker's global generator.
         low: the `packed` low level of a run with `low.freeze`, whose environments play whole episodes with it.
     """
 
@@ -148,7 +149,7 @@ class EnvShard:
         return acting(env, agent, self.config)[0]
 
     def make_policy(self) -> PolicyCopy:
-        """Build the policy; its weights are yet to come."""
+        """Build the policy; `receive` loads its weights later."""
         agent = self._make_agent()
         torch.manual_seed(self.exploration_seed)
         return PolicyCopy(agent.policy if self.low is None else agent.selector)
@@ -160,8 +161,8 @@ class EnvShard:
 class WorkingDir:
     """A working directory, which a process enters by unpickling this object.
 
-    The process then finds the user's own classes there, after all installed packages, as the run's process does. The
-    directory may be missing on another machine.
+    Like the run's process, it then finds the user's own classes there, after all installed packages. The directory may
+    be missing on another machine.
     """
 
     def __init__(self, path: str) -> None:
@@ -181,10 +182,11 @@ def _entered(path: str) -> WorkingDir:
 
 @dataclass(frozen=True)
 class RemoteShard:
-    """An `EnvShard` for a process that does not share this one's working directory and search path.
+    """An `EnvShard` for a process with another working directory and search path.
 
     Attributes:
-        working_dir: the first attribute, so that the process enters it before it imports the classes of the shard.
+        working_dir: working directory of the run. It comes first, so that the process enters it before it imports the
+            classes of the shard.
         shard: the environments.
     """
 
@@ -201,9 +203,9 @@ class RemoteShard:
 
 
 def _end_with_parent() -> None:
-    """End this process when the run's own process is killed, also in the middle of a step.
+    """End this process if the run's own process is killed, even in the middle of a step.
 
-    TorchRL's worker would notice that only at its next command. Ray ends its actors itself.
+    TorchRL's worker would notice only at its next command. Ray ends its actors itself.
     """
     parent = multiprocessing.parent_process()
     if parent is None:

@@ -1,4 +1,4 @@
-"""What collections in several processes share."""
+"""Base class of collections in several processes."""
 
 from __future__ import annotations
 
@@ -36,20 +36,20 @@ class WorkerOptions(Settings):
     num_workers: PositiveInt = 2
     """Number of processes, each with an equal part of `num_envs` and a CPU thread."""
     ahead: bool = False
-    """Collect the next batch, by the earlier policy, while the agent learns from the last one."""
+    """Collect the next batch, with the earlier policy, while the agent learns from the last batch."""
     max_restarts: NonNegativeInt = 0
-    """How many dead workers are replaced over the whole run. If another one dies, the run ends."""
+    """Number of dead workers that are replaced over the whole run. If another worker dies, the run ends."""
 
 
 class WorkerCollection(Collection):
     """Steps an equal part of the environments in each of `num_workers` processes, on the CPU with one thread.
 
-    Environment `i` has the same episodes as in a single process. Only exploration uses other random numbers, with one
-    stream for each worker. Before each batch, all workers get the policy's weights and buffers. They wait for one
-    another and for the learner.
+    Environment `i` has the same episodes as in a single process. Only exploration uses other random numbers, and each
+    worker has its own generator. Before each batch, all workers get the policy's weights and buffers. They wait for
+    each other and for the learner.
 
-    With `ahead`, workers begin the next batch as soon as they have handed one out. They use the policy from before the
-    agent learned from that batch, so the data does not depend on timing. A checkpoint includes the batch on its way.
+    With `ahead`, workers begin the next batch as soon as they have returned one. They use the policy from before the
+    agent learned from that batch, so the data does not depend on timing. A checkpoint includes the unfinished batch.
 
     Each worker has a TorchRL collector and a thread that waits for it. If a worker dies, the others keep their episodes
     and their part of the batch. Its replacement begins new episodes, with new seeds, and collects the missing part.
@@ -109,11 +109,11 @@ class WorkerCollection(Collection):
 
     @abstractmethod
     def _death(self, worker: Any | None, error: Exception) -> str | None:
-        """Return in words how a worker died; None if an error of a call to it has another cause.
+        """Return as text how a worker died; None if the error of a call to it has another cause.
 
         Args:
             worker: the worker's TorchRL collector; None while it starts.
-            error: the error that was raised.
+            error: the error of the call.
         """
         raise NotImplementedError
 
@@ -125,7 +125,7 @@ class WorkerCollection(Collection):
             restart: 0 for a first worker; the number of the restart for a replacement.
         """
         seed, first = self._config.run.seed, worker * self._size
-        # Each worker has its own random numbers, and other ones if a run is resumed.
+        # Each worker has its own random numbers, which change if a run is resumed.
         source = (seed, first, self._frames, restart) if restart else (seed, first, self._frames)
         exploration_seed, env_seed = map(int, np.random.SeedSequence(source).generate_state(2))
         return EnvShard(
@@ -139,11 +139,11 @@ class WorkerCollection(Collection):
             self._raise_explained(number, error)
 
     def _raise_explained(self, number: int, error: Exception) -> NoReturn:
-        """Raise an error of a worker; a death or a limit of the machine gets a message of one line.
+        """Raise an error of a worker, with a message of one line if it died or the machine reached a limit.
 
         Raises:
             WorkerDiedError: the worker died.
-            CollectionError: a limit of the machine stops the worker.
+            CollectionError: the machine reached a limit.
         """
         if isinstance(error, ProblemError | MemoryError | RemoteError):
             raise error
@@ -156,10 +156,10 @@ class WorkerCollection(Collection):
         raise error
 
     def _on(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
-        """Return what a call to a worker returns; if the worker dies, replace it and call again.
+        """Return the result of a call to a worker. If the worker dies, replace it and call again.
 
         Raises:
-            CollectionError: the worker died and is not replaced, or a limit of this machine stops it.
+            CollectionError: the worker died and is not replaced, or this machine reached a limit.
         """
         while True:
             try:
@@ -177,7 +177,7 @@ class WorkerCollection(Collection):
             self._raise_explained(number, error)
 
     def _count_restart(self, number: int, death: WorkerDiedError) -> None:
-        """Count the restart of a worker that died, and remove its remains.
+        """Count the restart of a dead worker, and remove its remains.
 
         Raises:
             WorkerDiedError: no more restarts are allowed.
@@ -193,7 +193,7 @@ class WorkerCollection(Collection):
         self._cpu_s[number] = 0.0
 
     def _on_all(self, call: Callable[[int], _Returned]) -> list[_Returned]:
-        """Call a function with the number of every worker at the same time; return its results in their order."""
+        """Call a function with the number of every worker in parallel, and return the results in the workers' order."""
         futures = [self._threads.submit(call, number) for number in range(len(self._workers))]
         wait(futures)
         return [future.result() for future in futures]
@@ -204,10 +204,10 @@ class WorkerCollection(Collection):
         return notices
 
     def next(self) -> TensorDictBase:
-        """Send the policy's state, then collect a batch; with `ahead`, hand out the one on its way and begin another.
+        """Send the policy's state and collect a batch. With `ahead`, return the batch that was begun and begin another.
 
         Raises:
-            CollectionError: a worker died and is not replaced, or a limit of this machine stops it.
+            CollectionError: a worker died and is not replaced, or this machine reached a limit.
         """
         self._is_idle = False
         policy = packed(self._policy)
@@ -222,7 +222,7 @@ class WorkerCollection(Collection):
         return [self._threads.submit(self._collect, number, policy) for number in range(len(self._workers))]
 
     def _finished(self) -> TensorDictBase:
-        """Wait for the parts of the batch on its way and return a copy of all of them, in the workers' order."""
+        """Wait for all parts of the batch, and return a copy of them in the workers' order."""
         return torch.cat([part.result() for part in self._coming])
 
     def _collect(self, number: int, policy: bytes) -> TensorDictBase:
@@ -235,10 +235,10 @@ class WorkerCollection(Collection):
         return collected
 
     def state(self) -> dict[str, Any]:
-        """Return the workers' states side by side; if one failed, the last ones that are known.
+        """Return the concatenated states of the workers. If a worker fails, return the last known states.
 
-        `generators` holds the state of each worker's random generator, `coming` the batch that is handed out next, if
-        it has been collected.
+        `generators` holds the state of each worker's random generator. `coming` holds the next batch to return, if it
+        has been collected.
         """
         if not self._is_idle or any(part.exception() for part in self._coming):
             return self._state
@@ -261,7 +261,7 @@ class WorkerCollection(Collection):
         return state
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state` of any collection; exploration is the same only with as many workers."""
+        """Continue from a `state` of any collection. Exploration is the same only with the same number of workers."""
         saved = checked_state(state, self._parts)
         self._state = dict(state)
 
@@ -269,7 +269,7 @@ class WorkerCollection(Collection):
             first = number * self._size
 
             def send_to(worker: Any) -> None:
-                if saved.env:  # else the worker continues the episodes that it has just begun
+                if saved.env:  # otherwise the worker continues the episodes that it has just begun
                     _call(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
                 if saved.root is not None and self._keeps_episodes:
                     _call(worker, "_carrier.update", _sliced(saved.root, first, self._size))
@@ -285,7 +285,7 @@ class WorkerCollection(Collection):
             self._coming = [_done(rows) for rows in coming.split(self._size)]
 
     def close(self) -> None:
-        """End the workers; wait a short time for the batch that is on its way."""
+        """End the workers, after a short wait for the unfinished batch."""
         _, running = wait(self._coming, _PATIENCE_S)
         self._is_closing = True
         for part, worker in zip(self._coming, self._workers, strict=False):
@@ -317,7 +317,7 @@ def _done(batch: TensorDictBase) -> Future[TensorDictBase]:
 
 @contextmanager
 def children_without(*numbers: signal.Signals) -> Iterator[None]:
-    """Block these signals in all processes that this thread starts within the block."""
+    """Block these signals in all processes that this thread starts inside the block."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -327,7 +327,7 @@ def children_without(*numbers: signal.Signals) -> Iterator[None]:
 
 @contextmanager
 def modules_here_last() -> Iterator[None]:
-    """Let processes that are started within the block look for modules in the working directory last."""
+    """Make processes that are started inside the block look for modules in the working directory last."""
     protect_children()
     try:
         yield
@@ -345,7 +345,7 @@ def _side_by_side(states: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _sliced(values: Mapping[str, Any], first: int, size: int) -> dict[str, Any]:
-    """Return `size` rows of nested columns from the row `first` on, on the CPU."""
+    """Return `size` rows of nested columns, starting at row `first`, on the CPU."""
     return {
         name: _sliced(value, first, size) if isinstance(value, Mapping) else value[first : first + size].cpu()
         for name, value in values.items()
@@ -353,5 +353,5 @@ def _sliced(values: Mapping[str, Any], first: int, size: int) -> dict[str, Any]:
 
 
 def _without_ids(root: Mapping[str, Any]) -> dict[str, Any]:
-    """Leave out the trajectory numbers that TorchRL's collector keeps."""
+    """Return the root without the trajectory numbers of TorchRL's collector."""
     return {name: value for name, value in root.items() if name != "collector"}
