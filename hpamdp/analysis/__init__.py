@@ -1,1 +1,1 @@
-"""Tables and statistics of studies, and figures that know no problem."""
+"""Tables and statistics of studies, and figures that suit every problem."""

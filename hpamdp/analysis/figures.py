@@ -1,4 +1,4 @@
-"""Figures of a finished or stopped run, drawn from the files in its folder alone."""
+"""Draw figures of a finished or stopped run, using only the files in its folder."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from hpamdp.run_files import FIGURES_NAME, MAX_TEXT_BYTES
 
 
 def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
-    """Draw all figures that the files in a run's folder allow, and return their paths.
+    """Draw all figures for which a run's folder has the files, and return their paths.
 
     `learning_curves.png` shows `metrics.csv` with the references of `summary.json`. The environment draws its figures
     from `evaluation.npz`. If a file is missing or broken, its figures are left out.
 
     Args:
-        output_dir: the run's folder; the figures go there.
+        output_dir: the run's folder, which gets the figures.
         env: the environment's class, which names the curves and draws its own figures.
     """
     summary = _read_summary(output_dir / "summary.json")

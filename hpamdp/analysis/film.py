@@ -1,6 +1,6 @@
-"""Films of episodes as files: GIF by Pillow, which also draws the pictures; MP4 by imageio, which brings an encoder.
+"""Write films of episodes: GIF by Pillow, which also draws the pictures, and MP4 by imageio, which has an encoder.
 
-Matplotlib's writers are ten times slower, since they draw through a figure, and need an installed ffmpeg.
+Matplotlib's writers are ten times slower, since they draw through a figure. They also need an installed ffmpeg.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
 
 SUFFIXES = (".gif", ".mp4")
-GIF_FPS = 50  # the most pictures a second that a GIF shows
+GIF_FPS = 50  # pictures per second that a GIF shows at most
 COLUMNS = 3
-# For how long the last picture stays, s.
+# Seconds that the last picture stays.
 _PAUSE = 1.5
 _GIF_COLOURS = 128
 
@@ -27,17 +27,17 @@ Track = Sequence[Mapping[str, Tensor]]
 
 
 class FilmError(ValueError):
-    """A film that cannot be written; the message is one line."""
+    """Raised if a film cannot be written; the message is one line."""
 
 
 def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> list[np.ndarray]:
-    """Return the pictures of several episodes side by side, uint8 `[height, width, 3]`; none if the problem draws none.
+    """Return the pictures of episodes side by side, uint8 `[height, width, 3]`; empty if the problem draws none.
 
     Args:
-        env: the problem, which draws.
+        env: the problem, which draws the pictures.
         tracks: the `env_state` of each episode at the start and after every step, columns `[1, ...]`.
-        fps: pictures a second.
-        size: px from edge to edge of one episode.
+        fps: pictures per second.
+        size: width of one episode, px.
     """
     episodes = [list(env.film(track, fps, size)) for track in tracks]
     if not episodes or not all(episodes):
@@ -59,7 +59,7 @@ def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = No
 
     Args:
         states: the columns `[N, ...]` at the start and after every step.
-        num_steps: the most steps of a track. If None, all.
+        num_steps: largest number of steps of a track. If None, all steps.
     """
     if not states or not states[0]:
         return []
@@ -69,10 +69,10 @@ def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = No
 
 
 def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """Write pictures as a GIF that repeats for ever, or as an MP4, by the ending of the path.
+    """Write pictures as a GIF that repeats forever, or as an MP4, by the ending of the path.
 
     Raises:
-        FilmError: another ending, no picture, or imageio is missing.
+        FilmError: the path has another ending, there is no picture, or imageio is missing.
     """
     remaining = iter(pictures)
     first = next(remaining, None)
@@ -89,11 +89,11 @@ def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
     images = [Image.fromarray(picture) for picture in pictures]
-    # One palette for all pictures, made from three of them: one for each would flicker.
+    # All pictures share one palette, made from three of them, since separate palettes would flicker.
     samples = [np.asarray(images[i]) for i in (0, len(images) // 2, -1)]
     palette = Image.fromarray(np.concatenate(samples)).quantize(_GIF_COLOURS)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    # A GIF counts in hundredths of a second, and viewers show a picture for a tenth of one if it says a hundredth.
+    # A GIF counts in hundredths of a second. Viewers show pictures of one hundredth for a tenth of a second.
     hundredths = round(100.0 / min(fps, GIF_FPS))
     with replacing(path) as partial:
         indexed[0].save(partial, save_all=True, append_images=indexed[1:], duration=10 * hundredths, loop=0)

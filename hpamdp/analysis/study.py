@@ -1,4 +1,4 @@
-"""What the runs of a study come to: their files gathered into tables, with the seeds as the unit of the statistics."""
+"""Gather the runs of a study into tables, with the seeds as the unit of the statistics."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_
 
 Rows = list[dict[str, Any]]
 
-MIN_SEEDS = 5  # from which on an interquartile mean is shown
+MIN_SEEDS = 5  # least number of seeds for an interquartile mean
 
 
 @dataclass(frozen=True)
 class Run:
-    """One finished run's folder, summary and config."""
+    """Folder, summary and config of a finished run."""
 
     folder: Path
     summary: dict[str, Any]
     config: dict[str, Any]
 
     def evaluations(self) -> list[dict[str, float]]:
-        """Return the rows of its metrics that hold an evaluation."""
+        """Return the rows of the run's metrics that hold an evaluation."""
         return [row for row in read_rows(self.folder / "metrics.csv") if "eval/score" in row]
 
     def played(self) -> dict[str, np.ndarray]:
-        """Return its final evaluation, one array an attribute, first dimension the episode."""
+        """Return the run's final evaluation as arrays whose first dimension is the episode."""
         with np.load(self.folder / "evaluation.npz", allow_pickle=False) as file:
             return dict(file)
 
 
 def finished(folders: Iterable[Path | str]) -> list[Run]:
-    """Return the finished runs under the folders, in the order of their names; warn about all other runs.
+    """Return the finished runs under the folders, in the order of their names, and warn about all other runs.
 
     Links to folders are followed. A run that is found twice counts once.
     """
@@ -88,7 +88,7 @@ def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
     empty = [name for name, rows in tables.items() if not rows]
     if empty:
         files = ", ".join(f"{name}.csv" for name in empty)
-        raise SystemExit(f"in the folders given are no finished runs for {files}; nothing was written")
+        raise SystemExit(f"the given folders have no finished runs for {files}; nothing was written")
     for name, rows in tables.items():
         with replacing(folder / f"{name}.csv") as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, rows[0])
@@ -97,7 +97,7 @@ def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
 
 
 def read_csv(path: Path) -> Rows:
-    """Read rows from csv; numbers as such."""
+    """Read rows from a csv file, with numbers as floats."""
     with path.open(newline="") as file:
         return [{name: _number(value) for name, value in row.items()} for row in csv.DictReader(file)]
 
@@ -112,7 +112,7 @@ def _number(text: str) -> float | str:
 
 
 def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
-    """Return the rows by their values of the named columns, in order of appearance."""
+    """Return the rows by their values in the named columns, in order of appearance."""
     found = defaultdict(list)
     for row in rows:
         found[tuple(row[name] for name in names)].append(row)
@@ -120,12 +120,12 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
 
 
 def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:
-    """Return the first row, such as a run's evaluation, with `level` or more in a column; None if there is none."""
+    """Return the first row whose column is at least `level`, such as a run's evaluation; None if there is none."""
     return next((row for row in rows if row[column] >= level), None)
 
 
 def spread(values: Sequence[float], digits: int = 3) -> str:
-    """Return mean ± standard deviation (of a sample, n - 1) over seeds, or the one value."""
+    """Return mean ± standard deviation (of a sample, n - 1) over seeds, or the single value."""
     mean = f"{np.mean(values):.{digits}f}"
     return f"{mean} ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else mean
 
@@ -133,7 +133,7 @@ def spread(values: Sequence[float], digits: int = 3) -> str:
 def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
     """Return the mean of the middle half, and its 95 % bootstrap interval over seeds.
 
-    With fewer than `MIN_SEEDS` values it is close to the plain mean, so `middle_half` leaves it out.
+    With fewer than `MIN_SEEDS` values it is close to the plain mean, so `middle_half` omits it.
 
     Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
     """
@@ -154,13 +154,13 @@ def middle_half(values: Sequence[float]) -> str:
 
 @dataclass(frozen=True)
 class Difference:
-    """How much one method is above another, with the seeds as the unit.
+    """Difference of two methods' scores, with the seeds as the unit.
 
     Attributes:
-        mean: difference of the means; from `MIN_SEEDS` seeds of both on, of the interquartile means.
-        low, high: its 95 % bootstrap interval; NaN if either has a single seed. With three seeds of each, the interval
-            spans about the differences of single seeds, and contains the true difference in 90 % of cases.
-        improvement: the probability that a seed of the first is above a seed of the second. Ties count half.
+        mean: difference of the means, or of the interquartile means if both have `MIN_SEEDS` seeds or more.
+        low, high: 95 % bootstrap interval of the difference; NaN if either method has a single seed. With three seeds
+            of each, the interval contains the true difference in 90 % of cases.
+        improvement: probability that a seed of the first method exceeds a seed of the second. Ties count half.
     """
 
     mean: float
@@ -174,7 +174,7 @@ class Difference:
         return self.low > 0.0 or self.high < 0.0
 
     def __str__(self) -> str:
-        """Return the difference and its interval, and `unclear` if the interval contains 0."""
+        """Return the difference and its interval, with `unclear` if the interval contains 0."""
         if np.isnan(self.low):
             return f"{self.mean:+.3f}"
         interval = f"{self.mean:+.3f} ({self.low:+.3f} to {self.high:+.3f})"
@@ -182,7 +182,7 @@ class Difference:
 
 
 def difference(values: Sequence[float], others: Sequence[float]) -> Difference:
-    """Return how much the first scores are above the others, one score a seed.
+    """Return the difference of the first scores and the others, one score per seed.
 
     Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
     """
@@ -203,8 +203,8 @@ def difference(values: Sequence[float], others: Sequence[float]) -> Difference:
 def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., np.ndarray]) -> tuple[float, float]:
     """Return the 95 % expanded percentile bootstrap interval of a statistic of independent samples.
 
-    The plain percentile interval of a few seeds is too narrow: for three seeds against three it contains the true
-    difference in 78 % of cases. The expanded interval is as wide as Student's t interval, as far as the samples reach.
+    The plain percentile interval of a few seeds is too narrow: for three seeds against three, it contains the true
+    difference in 78 % of cases. The expanded interval is as wide as Student's t interval, within the samples' range.
 
     Source: Hesterberg 2015, *What teachers should know about the bootstrap*, arXiv 1411.5279.
     """
@@ -218,9 +218,9 @@ def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., np.ndarr
 
 
 def curve(runs: Rows, x: str, y: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `x` and the mean and standard deviation of `y` over seeds, up to the shortest run.
+    """Return `x`, and the mean and standard deviation of `y` over seeds, up to the shortest run.
 
-    The deviation is that of a sample, as in `spread`; with one seed it is 0.
+    The standard deviation is that of a sample, as in `spread`. With one seed it is 0.
     """
     seeds = [np.array([(row[x], row[y]) for row in rows], dtype=float) for rows in groups(runs, "seed").values()]
     num = min(map(len, seeds))

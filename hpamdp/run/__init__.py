@@ -1,1 +1,1 @@
-"""One run: its parts, its loop, what it leaves behind; and sweeps of many."""
+"""Assemble, train, evaluate and save single runs, and run sweeps."""

@@ -1,4 +1,4 @@
-"""The parts of a run, built from its config: environment, agent, evaluation, data."""
+"""Build the parts of a run from its config: environment, agent, evaluation, data."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from hpamdp.run import capacity, checkpoint, compatibility
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.specs import PAMDPSpecs
 
-# Episodes of the film that every run leaves behind.
+# Number of episodes in the film of a run.
 FILMED_EPISODES = 3
-# Updates of a learner in a run from which on it is faster to compile them first, which takes some 40 s.
+# Number of a learner's updates in a run from which compilation saves time, although it takes some 40 s.
 _UPDATES_THAT_PAY = 10_000
 
 
 @dataclass
 class AssembledRun:
-    """What a run is made of.
+    """The parts of a run.
 
     Attributes:
-        env: the environments to train in, with their decisions tracked.
-        policy: acts in `env`.
+        env: the environments to train in, with tracked decisions.
+        policy: policy that acts in `env`.
         agent: selector and learners.
-        evaluation: scores the agent on environments of its own.
-        data: what others did, to learn from, if there is any.
-        device: of all of them.
+        evaluation: evaluation of the agent on separate environments.
+        data: the data set to learn from, if any.
+        device: device of all parts.
     """
 
     env: TransformedEnv
@@ -60,7 +60,7 @@ def assemble(config: Config, output_dir: Path) -> AssembledRun:
     """Build the parts of a run.
 
     Raises:
-        ConfigError: values that do not go together, that a constructor refuses, or for which there is no memory.
+        ConfigError: values do not go together, a constructor refuses them, or memory does not suffice.
     """
     run = config.run
     compatibility.check(config)
@@ -84,12 +84,12 @@ def assemble(config: Config, output_dir: Path) -> AssembledRun:
 
 
 def make_env(config: Config, num_envs: int, device: torch.device, seed: int, first_env: int = 0) -> PAMDPEnv:
-    """Build the environments from number `first_env` on, which write what the two levels read of them.
+    """Build the environments from number `first_env` on, with the entries that both levels need.
 
-    Environments whose class has no argument `first_env` get a seed of their own.
+    If the class has no argument `first_env`, the environments get a seed that depends on it.
 
     Raises:
-        ConfigError: a setting that the constructor refuses.
+        ConfigError: the constructor refuses a setting.
     """
     assert config.env.cls is not None
     if first_env > 0 and "first_env" not in constructor_arguments(config.env.cls):
@@ -111,7 +111,7 @@ def check_built(config: Config, env: PAMDPEnv) -> None:
     """Check the rules about the problem, some of which had to wait for the environment; warn of a ceiling out of reach.
 
     Raises:
-        ConfigError: settings that do not go with the problem.
+        ConfigError: the settings do not go with the problem.
     """
     facts = compatibility.facts_of(config) or _facts_of_built(env)
     compatibility.check_problem(config, facts)
@@ -135,12 +135,12 @@ def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:
 
 
 def choose_selector(config: Config, words: Sequence[str] = ()) -> Config:
-    """Return the config with a selector in the place of `high=auto`; see `compatibility.with_selector`.
+    """Return the config with `high=auto` replaced; see `compatibility.with_selector`.
 
-    A problem whose settings do not tell whether it has options is built once for it.
+    If the settings do not determine whether the problem has options, the problem is built once to find out.
 
     Raises:
-        ConfigError: the problem cannot be built, or a word sets something of a selector that is not there.
+        ConfigError: the problem cannot be built, or a word is a selector's setting, but there is no selector.
     """
     if config.high.name != compatibility.AUTO_SELECTOR:
         return config
@@ -156,7 +156,7 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
     """Build both levels with fresh weights.
 
     Raises:
-        ConfigError: an option that a constructor refuses.
+        ConfigError: a constructor refuses a setting.
     """
     selector = config.high.build(specs=specs, device=device) if specs.num_options else None
     is_shared = config.run.agent.sharing == "shared" and specs.num_options > 0
@@ -179,10 +179,10 @@ def make_agent(config: Config, specs: PAMDPSpecs, device: torch.device) -> Hiera
 
 
 def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:
-    """Have the learners compile their updates, or make their products in bfloat16, if the run asks for it.
+    """Compile the learners' updates, or compute their matrix products in bfloat16, if the run asks for it.
 
     Raises:
-        ConfigError: one of them cannot, or what follows an option decides what a compiled update computes.
+        ConfigError: a learner cannot do so, or options may end inside episodes, which a compiled update cannot handle.
     """
     run = config.run
     if run.compile_updates == "auto":
@@ -198,7 +198,7 @@ def set_up_updates(config: Config, agent: HierarchicalAgent) -> None:
 
 
 def _compile_if_it_pays(config: Config, agent: HierarchicalAgent) -> None:
-    """Compile the updates of learners that can, if they make enough of them in this run."""
+    """Compile the updates of all learners that support it, if they make enough updates in this run."""
     run = config.run
     if run.agent.termination != "episode" or run.low.freeze:
         return
@@ -211,7 +211,7 @@ def _compile_if_it_pays(config: Config, agent: HierarchicalAgent) -> None:
 
 
 def _ask_learners(config: Config, agent: HierarchicalAgent, given: str, ask: Callable[[Learner], None]) -> None:
-    """Ask all learners for something; if one refuses, say so with the setting that was given."""
+    """Apply a request to all learners; if one refuses, raise an error that names the setting."""
     for low, learner in with_learners(config, agent):
         try:
             ask(learner)
@@ -227,17 +227,17 @@ def with_learners(config: Config, agent: HierarchicalAgent) -> Iterator[tuple[Co
 
 
 def learners_of(config: Config, specs: PAMDPSpecs) -> list[Component]:
-    """Return the component of each learner: one for each option or, if they share it or there is none, one."""
+    """Return the component of each learner: one for each option, or a single one if all options share it."""
     if config.run.agent.sharing == "shared":
         return [config.low]
     return [config.low_of.get(name, config.low) for name in specs.option_names] or [config.low]
 
 
 def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | None:
-    """Build the data set, if there is one, with option returns that are discounted by the selector's `gamma`.
+    """Build the data set, if there is one, and discount its option returns by the selector's `gamma`.
 
     Raises:
-        ConfigError: the data set cannot be read, has a wrong value, or its returns cannot be discounted.
+        ConfigError: the data set cannot be read, has a wrong value, or has returns that cannot be discounted.
     """
     try:
         demonstrations: Demonstrations | None = config.data.build(env=env)
@@ -258,9 +258,9 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
 
 
 def make_evaluation(config: Config, env: PAMDPEnv, num_filmed: int = FILMED_EPISODES) -> Evaluation:
-    """Build the evaluation on environments of its own, which scale observations as `env` does.
+    """Build the evaluation on separate environments, which scale observations as `env` does.
 
-    With `film=false` no episode is filmed, otherwise the first `num_filmed`.
+    The first `num_filmed` episodes are filmed, or none with `film=false`.
     """
     test_env = make_env(config, config.run.eval.layouts, env.device, seed=0)
     test_env.set_scaling_from(env)
@@ -268,7 +268,7 @@ def make_evaluation(config: Config, env: PAMDPEnv, num_filmed: int = FILMED_EPIS
 
 
 def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:
-    """Return the environment to train in, with its decisions tracked, and the policy that acts there."""
+    """Return the environment to train in, with tracked decisions, and the policy that acts there."""
     gamma = _gamma(agent)
     if config.run.low.freeze:
         return _with_decisions(OptionChoiceEnv(agent.router, env, gamma), config), agent.selector

@@ -1,8 +1,8 @@
-"""A run on disk: everything that is needed to continue it or to score its agent.
+"""Save a run on disk, with everything needed to continue it or to score its agent, and load it.
 
-A checkpoint is a zip archive: `manifest.json` with the run's progress and the checksums of the other members, and one
-member for each component, written by `torch.save`. Opening somebody else's file runs none of its code, see
-`tensor_archive`. Loading changes an agent only if the whole file fits, see `state_checks`.
+A checkpoint is a zip archive. Its member `manifest.json` holds the run's progress and the checksums of the other
+members, which `torch.save` writes, one for each component. Opening somebody else's file runs none of its code (see
+`tensor_archive`). Loading changes an agent only if the whole file fits (see `state_checks`).
 
 TorchRL's `Checkpoint` is not used. It reads a replay buffer's prefetch queue with pickle, and stores replay buffers at
 full capacity. It also moves the old file away before the new one is in place.
@@ -63,11 +63,11 @@ _MANIFEST = "manifest.json"
 _MAX_JSON = 2**24
 _BLOCK = 2**20
 _CUDA_STATE_BYTES = 16
-# Parts of an agent as earlier versions named them in checkpoints, and today's names.
+# Names of parts of an agent in earlier versions' checkpoints, and today's names.
 _RENAMED = {"optimiser": "optimizer"}
-# Parts of a run that are saved beside the agent.
+# Parts of a run that a checkpoint holds beside the agent.
 STATES = ("collection", "recorder")
-# What can be wrong with the bytes of a file.
+# Errors that damaged bytes of a file can raise.
 _DAMAGE = (
     zipfile.BadZipFile,
     EOFError,
@@ -85,16 +85,16 @@ _DAMAGE = (
 def find(path: str | Path, where: str) -> Path:
     """Return the file of a checkpoint.
 
-    A folder without a checkpoint may hold the networks alone, which suffice for everything but to resume the run.
+    A folder without a checkpoint may hold only the networks, which suffice for everything except resuming the run.
 
     Args:
         path: the file itself or the output folder of its run.
-        where: the setting that gave the path, to name in an error.
+        where: the setting that gives the path, for the error.
 
     Raises:
         ConfigError: there is no checkpoint.
     """
-    path = Path(os.path.expanduser(path))  # `Path` takes "./" away, with which ~ is a name
+    path = Path(os.path.expanduser(path))  # `Path` drops "./", which makes a name of ~
     is_folder = os.path.isdir(path)  # `Path.is_dir` would fail for some texts
     file = path / FILE_NAME if is_folder else path
     if where != "resume" and is_folder and not file.is_file() and (path / POLICY_NAME).is_file():
@@ -110,12 +110,12 @@ def find(path: str | Path, where: str) -> Path:
 
 @dataclass(frozen=True)
 class Saved:
-    """The parts of a run that `load` returns; the agent itself is filled in place.
+    """The parts of a run that `load` returns. The agent itself is filled in place.
 
     Attributes:
         file: the checkpoint.
-        progress: JSON values that `save` was given.
-        states: of the other parts of the run, by name, as `save` was given them.
+        progress: the JSON values of `save`.
+        states: the states of the other parts of the run, by name, as for `save`.
         generators: the states of the random generators, for `set_generators`; None without training.
     """
 
@@ -125,7 +125,7 @@ class Saved:
     generators: Generators | None
 
     def set_statistics(self, env: PAMDPEnv) -> None:
-        """Let an environment scale its observations as in the saved run.
+        """Make an environment scale its observations as in the saved run.
 
         Raises:
             ConfigError: the saved statistics are of another environment.
@@ -147,9 +147,9 @@ def save(
     Args:
         path: the file.
         agent: the agent.
-        states: of the other parts of the run, by name: nested dictionaries of tensors and numbers.
-        progress: JSON values to read back with `progress_of`: the config, the frames so far.
-        with_replay: whether replay buffers are stored; without them a resumed run begins with empty ones.
+        states: states of the other parts of the run, by name: nested dictionaries of tensors and numbers.
+        progress: JSON values to read back with `progress_of`, such as the config and the frames so far.
+        with_replay: whether to store replay buffers. Without them, a resumed run starts with empty buffers.
 
     Raises:
         OSError: the disk is full, or the folder is gone or cannot be written to; the old file stays as it is.
@@ -172,17 +172,17 @@ def save(
 
 
 def save_policy(path: Path, agent: HierarchicalAgent, progress: Mapping[str, Any]) -> None:
-    """Write the networks alone, without what only training needs; `mode=eval` can load it.
+    """Write only the networks, without the parts for training. `mode=eval` can load the file.
 
     Raises:
-        OSError: as `save`.
+        OSError: see `save`.
     """
     with replacing(path) as partial:
         torch.save({"format": _FORMAT, "progress": json.dumps(dict(progress)), "agent": agent.state_dict()}, partial)
 
 
 def progress_of(file: Path) -> dict[str, Any]:
-    """Return the `progress` that `save` was given.
+    """Return the `progress` in a file.
 
     Raises:
         ConfigError: the file is damaged or not a checkpoint of this program.
@@ -192,9 +192,9 @@ def progress_of(file: Path) -> dict[str, Any]:
 
 
 def load_learners(file: Path, agent: HierarchicalAgent, device: torch.device) -> None:
-    """Fill the agent's learners from another run's checkpoint, but neither their optimizers, replay nor `progress`.
+    """Fill the agent's learners from another run's checkpoint, without optimizers, replay and `progress`.
 
-    Nothing is changed unless all learners fit.
+    If a learner does not fit, nothing is changed.
 
     Raises:
         ConfigError: the checkpoint is damaged or of other learners.
@@ -225,16 +225,16 @@ def load(
     with_training: bool,
     steps: TensorDictBase | None = None,
 ) -> Saved:
-    """Fill the agent from a checkpoint, with training also its optimizers and replay.
+    """Fill the agent from a checkpoint, and its optimizers and replay if training continues.
 
-    Nothing is changed before the whole file was read and checked. The random generators are left to `set_generators`.
+    Nothing is changed before the whole file has been read and checked. `set_generators` restores the random generators.
 
     Args:
         file: the checkpoint.
         agent: the agent to fill.
         device: the agent's device.
-        with_training: whether the run is continued.
-        steps: see `HierarchicalAgent.replay_rows`; with training they must be given.
+        with_training: whether training continues.
+        steps: see `HierarchicalAgent.replay_rows`; required with training.
 
     Raises:
         ConfigError: the checkpoint is damaged or of another agent.
@@ -275,7 +275,7 @@ def _explained(what: str) -> Iterator[None]:
     """Turn errors about the bytes or the values of a file into one line that begins with `what`.
 
     Raises:
-        ConfigError: instead of the error.
+        ConfigError: the block raised such an error.
     """
     try:
         yield
@@ -313,7 +313,7 @@ class _Manifest(SavedPart):
 
 
 class _Opened:
-    """A checkpoint or policy file that is being read: its members are described first, and read when they fit.
+    """An open checkpoint or policy file, whose members are read only after their descriptions fit.
 
     Args:
         path: the file.
@@ -370,7 +370,7 @@ class _Opened:
         self.progress = checked(Progress, progress).model_dump(exclude_unset=True)
 
     def part(self, name: str) -> Any:
-        """Return the contents of a member, with a `SavedTensor` in the place of each tensor."""
+        """Return the contents of a member, with a `SavedTensor` in place of each tensor."""
         if name not in self._parts:
             with _explained(self._damaged):
                 member, checksum = self._members[name]
@@ -405,7 +405,7 @@ class _Opened:
         for key, value in own.items():
             if isinstance(value, Tensor):
                 check_form(key, saved[key], value, any_size=id(value) in any_size)
-        read: dict[int, Tensor] = {}  # weights that several parts share occur several times
+        read: dict[int, Tensor] = {}  # shared weights occur several times
         state: dict[str, Any] = {}
         for key, value in own.items():
             if not isinstance(value, Tensor):
@@ -427,7 +427,7 @@ class _Opened:
         return state
 
     def other(self, name: str, part: Any, device: torch.device) -> dict[str, Any]:
-        """Return a state dict that a part of `stateful` other than a replay buffer can load.
+        """Return a state dict for a part of `stateful` other than a replay buffer.
 
         Raises:
             ValueError: the state is of another part, or holds invalid numbers.
@@ -559,7 +559,7 @@ class Generators(SavedPart):
 
 
 def set_generators(generators: Generators) -> None:
-    """Restore the random generators; warn about generators of devices that this machine lacks, and leave them out."""
+    """Restore the random generators. Warn about missing devices and modules, and leave out their generators."""
     states = {name: state for name, state in generators if state is not None}
     if "torch_cuda" in states:
         num = torch.cuda.device_count() if torch.cuda.is_available() else 0

@@ -1,4 +1,4 @@
-"""The table that closes a run: this agent beside the references."""
+"""Write the table at the end of a run: this agent beside the references."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Find the rest of a run in its folder when the command that started it is given again."""
+"""Find the rest of a run in its folder if the command that started it is given again."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _BOOKKEEPING = (
 
 
 class Rest(NamedTuple):
-    """The rest of a run: nothing if it has a score, else everything after its checkpoint, or all if it has none."""
+    """The rest of a run: nothing if it has a score, otherwise everything after its checkpoint, if it has one."""
 
     score: float | None = None
     checkpoint: Path | None = None
@@ -41,7 +41,7 @@ def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
     Args:
         wanted: the config of the run.
         folder: the run's folder.
-        name: the folder's name in the error.
+        name: name of the folder in the error.
 
     Raises:
         ConfigError: the folder holds the results of another run, and `overwrite` is false.
@@ -66,8 +66,8 @@ def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
 
 
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
-    """Return in words where two configs differ, except in bookkeeping; empty if they agree."""
-    # Through yaml, as the saved config.
+    """Return the difference of two configs as text, except in bookkeeping; empty if they agree."""
+    # Convert through yaml, like the saved config.
     here, there = _flat(yaml.safe_load(wanted.to_yaml())), _flat(upgraded(saved) if saved else {})
     names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
     names = [name for name in names if name.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING]

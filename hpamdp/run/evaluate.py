@@ -1,4 +1,4 @@
-"""Evaluation: every episode of a fixed set is played once, greedily, to its end."""
+"""Evaluate agents: play every episode of a fixed set once, greedily and to its end."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Evaluation:
     """A fixed set of episodes on which agents are scored.
 
     Args:
-        env: a `PAMDPEnv` with its decisions tracked; one environment for each episode, used for nothing else.
-        seed: of the episodes.
-        num_filmed: of how many episodes, the first ones, `run_agent` keeps the states.
+        env: a `PAMDPEnv` with tracked decisions, one environment for each episode, used for nothing else.
+        seed: seed of the episodes.
+        num_filmed: number of episodes, the first ones, whose states `run_agent` keeps.
 
     Attributes:
-        states: the environment's `env_state` of these episodes at the start and after every step, columns
-            `[num_filmed, ...]`; empty before the first `run_agent` and where the environment has none.
+        states: the `env_state` of these episodes at the start and after every step, columns `[num_filmed, ...]`;
+            empty before the first `run_agent`, or if the environment has no `env_state`.
     """
 
     def __init__(self, env: TransformedEnv, seed: int, num_filmed: int = 0) -> None:
@@ -41,7 +41,7 @@ class Evaluation:
 
     @property
     def problem(self) -> PAMDPEnv:
-        """The environment itself, without what tracks its decisions."""
+        """The environment without the tracker of its decisions."""
         return self.env.base_env
 
     def _reset(self) -> TensorDictBase:
@@ -52,19 +52,20 @@ class Evaluation:
         """Play every episode greedily and return arrays whose first dimension is the episode.
 
         Args:
-            policy: acts.
-            states: the states of the first `num_filmed` episodes are appended to it.
+            policy: policy that acts.
+            states: list to which the states of the first `num_filmed` episodes are appended.
 
         Returns:
+            Arrays by their names:
 
-            - `return`, `steps`, and `score`: the return, where the environment has no score of its own;
-            - `option`: the first one of each episode, where the agent chooses;
-            - `option_changes`: how often the option changed in each episode, where options may end inside episodes;
-            - `path` `[N, T + 1, 2]`, NaN past an episode's end, where the environment has positions;
-            - what the environment's `describe` and `results` give.
+            - `return`, `steps`, and `score`, which is the return if the environment has no score of its own;
+            - `option`: the first option of each episode, if the agent chooses options;
+            - `option_changes`: number of option changes in each episode, if options may end inside episodes;
+            - `path` `[N, T + 1, 2]`, NaN past an episode's end, if the environment has positions;
+            - the entries of the environment's `describe` and `results`.
 
         Raises:
-            ProblemError: the return of an episode is not finite, or an episode is longer than `max_steps`.
+            ProblemError: the return of an episode is not finite, or an episode exceeds `max_steps`.
         """
         device = self.env.device
         td = self._reset()
@@ -110,9 +111,10 @@ class Evaluation:
         return {name: value.cpu().numpy() for name, value in played.items()}
 
     def run_agent(self, agent: HierarchicalAgent) -> dict[str, np.ndarray]:
-        """Play every episode as `run` does and, where the agent chooses, once more with each option held.
+        """Play every episode as `run` does, and again with each option held if the agent chooses options.
 
-        The latter gives `option_scores` `[N, num_options]`: the scores of the agent's own learners with each option.
+        The further episodes give `option_scores` `[N, num_options]`, the scores of the agent's learners with each
+        option.
         """
         self.states = []
         played = self.run(agent.policy, self.states)
@@ -122,7 +124,7 @@ class Evaluation:
         return played
 
     def _film(self, states: list[dict[str, Tensor]] | None) -> None:
-        """Append the present state of the filmed episodes to `states`."""
+        """Append the current state of the filmed episodes to `states`."""
         if states is not None and self.num_filmed > 0:
             columns = self.problem.env_state()
             states.append({name: column[: self.num_filmed].cpu().clone() for name, column in columns.items()})
@@ -130,15 +132,17 @@ class Evaluation:
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of an evaluation: score, return, steps, success and the environment's own metrics.
 
-        - `optimality_gap`: the environment's `ceiling` less the score.
+        The further entries are:
 
-        Where options may end inside their episodes: `option_changes`, how often the option changed in an episode.
+        - `optimality_gap`: the environment's `ceiling` less the score;
+        - `option_changes`: number of option changes in an episode, if options may end inside episodes.
 
-        Where the agent chooses options:
+        If the agent chooses options:
+
         - `score_NAME`: the score with the option NAME held;
         - `regret`: the score of each episode's best option, with the agent's own learners, less the score;
-        - `choice_gain`: the score less that of the best single option;
-        - `choice_entropy`: entropy of the options' shares (nats).
+        - `choice_gain`: the score less the score of the best single option;
+        - `choice_entropy`: entropy of the options' frequencies (nats).
         """
         names = [name for name in ("score", "success", "return", "steps", "option_changes") if name in played]
         means = {name: float(played[name].mean()) for name in names} | self.env.measure(played)

@@ -1,4 +1,4 @@
-"""The folder of a run: one process and one run at a time; results are overwritten only if the user says so."""
+"""Guard the folder of a run: one process and one run at a time, and no overwriting unless the user allows it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from hpamdp.run_files import (
 )
 from hpamdp.shell import path_setting
 
-# Each of these marks the folder as that of a run.
+# Each of these files marks the folder of a run.
 _MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME)
 _OTHERS = (
     METRICS_NAME,
@@ -45,7 +45,7 @@ _OTHERS = (
     TENSORBOARD_NAME,
     WANDB_NAME,
 )
-# Holds an earlier run while a new one starts in its place.
+# Folder of an earlier run while a new one starts in its place.
 _ASIDE_NAME = ".replaced"
 
 
@@ -54,11 +54,11 @@ def locked(folder: Path, patience_s: float = 0.0) -> Iterator[None]:
     """Keep other processes out of a folder.
 
     Args:
-        folder: made if need be.
-        patience_s: how long to wait for a process that is about to stop.
+        folder: the folder, created if it is missing.
+        patience_s: seconds to wait for a process that is about to stop.
 
     Raises:
-        ConfigError: another process works in it.
+        ConfigError: another process works in the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / ".lock"
@@ -79,14 +79,14 @@ def check_no_link(folder: Path) -> None:
     """Refuse to write to a folder inside a run's folder if it is a link to another place.
 
     Raises:
-        ConfigError: it is a link.
+        ConfigError: the folder is a link.
     """
     if folder.is_symlink():
         raise ConfigError(f"{folder}: a link to {os.readlink(folder)}; a run writes to no linked folder, so remove it")
 
 
 def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
-    """Refuse a folder that holds files which no run has written, or a run, unless this may be overwritten.
+    """Refuse a folder with files that no run has written, or with a run unless it may be overwritten.
 
     Raises:
         ConfigError: the folder is refused.
@@ -130,7 +130,7 @@ def mark_unfinished(folder: Path) -> None:
 
 @contextmanager
 def moved_aside(folder: Path) -> Iterator[None]:
-    """Move an earlier run aside, delete it after the block, and bring it back if the block fails.
+    """Move an earlier run aside, and delete it after the block or bring it back if the block fails.
 
     Files that no run writes stay in the folder.
 
@@ -166,7 +166,7 @@ def _bring_back(folder: Path) -> None:
 
 
 def is_about_folder(error: OSError, folder: Path) -> bool:
-    """Return whether the run's folder cannot be made or written to, or is gone.
+    """Return whether an error says that the run's folder is gone or cannot be created or written to.
 
     An error of a write to an open file names no file, so its number decides. Collections report errors of shared memory
     themselves.
@@ -177,7 +177,7 @@ def is_about_folder(error: OSError, folder: Path) -> bool:
 
 
 def written_by_a_run(folder: Path) -> list[Path]:
-    """Return the paths that a run has written into its folder; the files that mark a run come first."""
+    """Return the paths that a run has written into its folder, first the files that mark a run."""
     names = [*_MARKS, *_OTHERS]
     with suppress(OSError, UnicodeDecodeError):
         listed = read_regular(folder / FIGURES_NAME, MAX_TEXT_BYTES).decode().splitlines()

@@ -409,7 +409,7 @@ def _has_wandb_key(server: str) -> bool:
     if os.environ.get("WANDB_API_KEY"):
         return True
     host = urlsplit(server).netloc
-    # Keys of wandb's own cloud may still be kept under its older name, where wandb finds them as well.
+    # Keys of wandb's own cloud may still be stored under its older name, and wandb finds them there.
     hosts = [host, "api.wandb.ai"] if host == "api.forge.coreweave.com" else [host]
     files = [os.environ["NETRC"]] if "NETRC" in os.environ else [Path.home() / ".netrc", Path.home() / "_netrc"]
     for file in files:

@@ -1,7 +1,7 @@
-"""The server of a problem's page: a handful of files, and one place to send episodes to.
+"""Serve a problem's page: a handful of files, and one address that takes episodes.
 
-It is made of the standard library: five files and one POST need no framework, and so the page works after every
-installation. It is meant for one's own computer and listens on the loopback address unless told otherwise.
+The server uses only the standard library, since five files and one POST need no framework. So the page works after
+every installation. The server is meant for the user's own computer and listens on the loopback address by default.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TYPES = {
 }
 _LOOPBACK = {"127.0.0.1", "localhost", "[::1]", "::1"}
 _HEADERS = {
-    # Nothing from elsewhere, and nobody else's frame; alone in its process the page has a finer clock.
+    # No content from other sites, and no frame of another site. Alone in its process, the page has a finer clock.
     "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "frame-ancestors 'none'",
     "Cross-Origin-Opener-Policy": "same-origin",
@@ -51,20 +51,20 @@ _HEADERS = {
 
 
 def as_script(data: Mapping[str, Any]) -> bytes:
-    """Return `data.js`: a script, because a page that is opened from a file may load no other data."""
+    """Return `data.js`. The data are a script because a page that is opened from a file may load nothing else."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     return f"window.HPAMDP_DATA = {text};\n".encode()
 
 
 class EpisodeFile:
-    """A file of episodes, one JSON object a line, to which several threads and processes may add.
+    """A file of episodes, one JSON object per line, to which several threads and processes may add.
 
     Args:
-        path: the file, made at the first episode.
-        page: knows which episodes are the same.
+        path: the file, which is created at the first episode.
+        page: the page, which recognises equal episodes.
 
     Raises:
-        EpisodeError: the file holds no episode, it cannot be written, or its folder is missing.
+        EpisodeError: the file holds no episode, cannot be written, or its folder is missing.
     """
 
     def __init__(self, path: Path, page: PlayPage) -> None:
@@ -87,7 +87,7 @@ class EpisodeFile:
             raise EpisodeError(f"{path}: {reason_of(error)}") from error
 
     def add(self, episode: Mapping[str, Any]) -> bool:
-        """Add a checked episode and return whether it is new; on return it is on the disk.
+        """Add a checked episode to the disk, and return whether it is new.
 
         Raises:
             TimeoutError: another program holds the file's lock.
@@ -105,10 +105,10 @@ class EpisodeFile:
             self._lock.release()
 
     def _append(self, identity: str, line: bytes) -> bool:
-        """Add a line, unless its episode is already in the file; both locks must be held."""
+        """Add a line, unless its episode is already in the file. The caller must hold both locks."""
         with suppress(FileNotFoundError):
             regular_size(self.path)
-        # Without a buffer, nothing is left to be written later after an error.
+        # Without a buffer, nothing remains to be written after an error.
         with self.path.open("a+b", buffering=0) as file:
             size = file.seek(0, os.SEEK_END)
             inode = os.fstat(file.fileno()).st_ino
@@ -121,7 +121,7 @@ class EpisodeFile:
             self._read_to = size
             if identity in self._known:
                 return False
-            if size and not _ends_line(file, size):  # a line that was cut short stays a line of its own
+            if size and not _ends_line(file, size):  # a line that was cut short stays a separate line
                 line = b"\n" + line
             try:
                 if file.write(line) < len(line):
@@ -137,7 +137,7 @@ class EpisodeFile:
         return True
 
     def _check_file(self) -> None:
-        """Read the file, if it exists, and warn about the lines that hold no episode.
+        """Read the file, if it exists, and warn about lines without an episode.
 
         Raises:
             EpisodeError: no line is an episode.
@@ -186,16 +186,16 @@ class PageServer(ThreadingHTTPServer):
     """Serves a page and takes its episodes.
 
     Args:
-        address: host and port; port 0: any that is free.
-        page: with its files and the check of episodes.
-        data: what its script starts with.
-        episodes: where checked episodes go.
+        address: host and port. If the port is 0, any free one.
+        page: the page, with its files and the check of episodes.
+        data: data of the page's script.
+        episodes: file for checked episodes.
 
     Attributes:
-        address: of the page.
+        address: address of the page.
 
     Raises:
-        OSError: the address cannot be listened on.
+        OSError: the server cannot listen on the address.
     """
 
     daemon_threads = True
@@ -215,7 +215,7 @@ class PageServer(ThreadingHTTPServer):
         self.address = f"http://{host}:{port}/"
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing of a connection that broke: the others are served on."""
+        """Ignore a broken connection, and continue to serve the others."""
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -237,7 +237,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Check an episode and store it."""
-        self.close_connection = True  # whatever is left of a body that is refused
+        self.close_connection = True  # the rest of a refused body may remain
         refusal = self._refusal()
         if refusal is not None:
             self._answer(*refusal)
@@ -273,7 +273,7 @@ class _Handler(BaseHTTPRequestHandler):
         return HTTPStatus.CREATED if is_new else HTTPStatus.OK, "stored"
 
     def _refusal(self) -> tuple[HTTPStatus, str] | None:
-        """Return why a POST is refused before its body is read, if it is."""
+        """Return the status and the reason if a POST is refused before its body is read, else None."""
         length = self.headers.get("Content-Length", "")
         if not self._is_from_here():
             return HTTPStatus.FORBIDDEN, "only the page itself may send episodes"
@@ -288,9 +288,9 @@ class _Handler(BaseHTTPRequestHandler):
         return None
 
     def _is_from_here(self) -> bool:
-        """Return whether the request is from the page itself, and not from another site that the browser shows.
+        """Return whether the request comes from the page itself, and not from another site in the browser.
 
-        Another site's request has its Origin; one that made its own name stand for this address has that name as Host.
+        A request of another site carries its Origin. If the site pointed its name at this address, Host has that name.
         """
         host = self.headers.get("Host", "")
         try:
@@ -300,14 +300,14 @@ class _Handler(BaseHTTPRequestHandler):
         if self.server.is_local and name not in _LOOPBACK:
             return False
         origin = self.headers.get("Origin")
-        # A web server in front of this one may encrypt.
+        # A web server in front of this one may use https.
         return origin is None or origin in (f"http://{host}", f"https://{host}")
 
     def _send_file(self, *, with_body: bool) -> None:
         if not self._is_from_here():
             self._answer(HTTPStatus.FORBIDDEN, "ask for this page by its own address")
             return
-        # Only what is in the dictionary is sent: no path is ever looked up on the disk.
+        # The server sends only entries of the dictionary, and never looks up a path on the disk.
         name = self.path.partition("?")[0]
         content = self.server.contents.get(name)
         if content is None:
@@ -336,7 +336,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse in one line what the base class refuses with a page: other methods, and requests that are none."""
+        """Refuse other methods and malformed requests in one line, instead of the base class's page."""
         self.close_connection = True
         status = HTTPStatus.METHOD_NOT_ALLOWED if code == HTTPStatus.NOT_IMPLEMENTED else HTTPStatus(code)
         self._answer(status, message or status.phrase)

@@ -1,4 +1,4 @@
-"""`hpamdp play`: people at a problem, in a page that is served on this computer or written as files."""
+"""Run `hpamdp play`, which lets people play a problem in a page, served on this computer or written as files."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ _ONE_EPISODE = ("eval.layouts=1", "film=false")
 
 
 def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
-    """Serve the page until Ctrl-C, or write it to a folder; return the exit code.
+    """Serve the page until Ctrl-C, or write it to a folder, and return the exit code.
 
     Raises:
-        ConfigError: a wrong word, no such agent, or a problem that has no page.
+        ConfigError: a word is wrong, the agent does not exist, or the problem has no page.
     """
     parser.description = _DESCRIPTION
     parser.add_argument(
@@ -92,27 +92,27 @@ def _page(config: Config, seed: int) -> PlayPage:
 
 
 def own_agents(config: Config) -> list[dict[str, Any]]:
-    """Return those of the agents that come with the code that a page can take, for the problem at hand."""
+    """Return the agents of this package that fit the problem and its page."""
     folder = package_dir("agents")
     if folder is None:
         return []
     files = sorted(folder.glob(f"*/{POLICY_NAME}"))
-    # Most are of other problems, and an agent takes half a second to build.
+    # Most agents are for other problems, and building an agent takes half a second.
     folders = [file.parent for file in files if choices_of(progress_of(file)["config"])["env"] == config.env.name]
     agents = [_agent(path, load_player(str(path), _ONE_EPISODE)) for path in folders]
     return [agent for agent in agents if agent is not None]
 
 
 def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the agents in these folders as a page takes them.
+    """Return the agents in these folders in the page's form.
 
     Args:
         names: the folders; `none` stands for no agent.
-        config: the config of the problem that the page shows.
-        settings: the words of the command line that made `config`.
+        config: the config of the page's problem.
+        settings: the words of the command line that led to `config`.
 
     Raises:
-        ConfigError: no such agent, or one that a page cannot take.
+        ConfigError: an agent does not exist, or the page cannot show it.
     """
     agents = []
     for name in names:
@@ -129,7 +129,7 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
 
 
 def _permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]:
-    """Return the words that permit an agent's config what the user has permitted: guarded settings and `trust`."""
+    """Return the user's permissions for an agent's config as words: guarded settings and `trust`."""
     is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
     given = [word.partition("=") for word in settings]
     return [
@@ -161,7 +161,7 @@ def export(page: PlayPage, data: dict[str, Any], folder: Path) -> None:
     """Write the page to a folder, which need not be empty.
 
     Raises:
-        ConfigError: it cannot be written.
+        ConfigError: the folder cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Who plays: a saved agent, or a player that a command line describes, such as `low=planner high=oracle`."""
+"""Build players: a saved agent, or a player from a command line, such as `low=planner high=oracle`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from hpamdp.specs import PAMDPSpecs
 
 @dataclass(frozen=True)
 class Player:
-    """An agent and the episodes that it can be watched on.
+    """An agent, and episodes to watch it play.
 
     Attributes:
-        config: of the agent and its problem.
-        agent: with the weights of its checkpoint, if there is one.
-        evaluation: of `eval.layouts` episodes, all of them filmed.
+        config: config of the agent and its problem.
+        agent: the agent, with the weights of its checkpoint if there is one.
+        evaluation: evaluation with `eval.layouts` episodes, all of them filmed.
     """
 
     config: Config
@@ -40,7 +40,7 @@ def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
     """Return the path among a command line's words, if there is one, and the settings.
 
     Raises:
-        ConfigError: several paths.
+        ConfigError: there are several paths.
     """
     paths = [word for word in words if "=" not in word or os.path.exists(word)]
     if len(paths) > 1:
@@ -49,7 +49,7 @@ def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
 
 
 def whole_number(least: int, most: int) -> Callable[[str], int]:
-    """Return what reads a whole number in this range from a command line, for `argparse`."""
+    """Return a function for `argparse` that reads a whole number in this range."""
 
     def read_number(text: str) -> int:
         if not text.isdecimal() or not least <= int(text) <= most:
@@ -63,11 +63,11 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     """Build a player.
 
     Args:
-        path: the agent's folder, or a checkpoint or `policy.pt`; None: the player that the settings describe.
+        path: the agent's folder, a checkpoint or `policy.pt`. If None, the settings describe the player.
         settings: words of a command line, such as `env=goal` or `eval.layouts=6`.
 
     Raises:
-        ConfigError: no such agent, or a wrong setting.
+        ConfigError: the agent does not exist, or a setting is wrong.
     """
     config, source = _config(path, list(settings))
     torch.set_num_threads(config.run.threads)

@@ -1,4 +1,4 @@
-"""What a run writes while it trains and when it ends: metrics, evaluations, the summary, figures."""
+"""Write a run's metrics, evaluations, summary and figures, during training and at its end."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from hpamdp.run.state_checks import SavedPart, check_columns, check_values, chec
 from hpamdp.run.summary import summarise
 from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 
-# Small and short enough to take a second or two.
+# Small and short enough to film in a second or two.
 _FPS, _FILM_SIZE, _FILMED_STEPS = 20.0, 200, 40
 
 
@@ -37,12 +37,12 @@ class _State(SavedPart):
 
 
 class Recorder:
-    """Collects a run's figures and writes them to its output folder and its logger.
+    """Collect a run's figures and write them to its output folder and its logger.
 
     Args:
-        config: of the run.
+        config: config of the run.
         parts: the run's environment, agent and evaluation.
-        output_dir: where `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures go.
+        output_dir: folder of `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures.
     """
 
     def __init__(self, config: Config, parts: AssembledRun, output_dir: Path) -> None:
@@ -61,12 +61,12 @@ class Recorder:
         self._random = parts.evaluation.measure(parts.evaluation.run(random.policy))
 
     def resume_from(self, folder: Path, frames: int) -> None:
-        """Begin the metrics with the rows of the run in `folder`, up to `frames`."""
+        """Start the metrics with the rows of the run in `folder`, up to `frames`."""
         self.metrics = MetricsFile(self.metrics.path, folder / METRICS_NAME, frames)
         self._resumed_from = folder
 
     def start(self) -> None:
-        """Start the logger, which takes over the rows of a run that is resumed.
+        """Start the logger, which takes over the rows of a resumed run.
 
         Raises:
             ConfigError: the logger refuses its settings.
@@ -80,7 +80,7 @@ class Recorder:
         )
 
     def state(self) -> dict[str, Any]:
-        """Return what the next row of metrics depends on, for a checkpoint."""
+        """Return the state that the next row of metrics depends on, for a checkpoint."""
         return {
             "ended": [dict(ended.items()) for ended in self._ended],
             "scalars": dict(self._scalars),
@@ -115,20 +115,20 @@ class Recorder:
         self._ended.append(self._results(batch)[is_end])
 
     def _results(self, steps: TensorDictBase) -> TensorDictBase:
-        """Return the entries of steps `[*B]` that are recorded if the step ends an episode."""
+        """Return the entries of steps `[*B]` to record at the end of an episode."""
         results = steps.get("next").select(*self.parts.env.result_keys, keys.EPISODE_RETURN, keys.EPISODE_STEPS)
         if keys.OPTION in steps.keys():
             results.set(keys.OPTION, steps.get(keys.OPTION))
         return results
 
     def forget_evaluation(self) -> None:
-        """Evaluate again when scores are next needed, because the agent may have changed."""
+        """Drop the last evaluation, because the agent may have changed."""
         self._played = None
 
     def log(self, frames: int, wall_s: float, is_evaluated: bool, *, is_stopped: bool = False) -> dict[str, float]:
         """Write a row of metrics, with an evaluation if `is_evaluated`, and return it.
 
-        A row with `is_stopped` is the last one of a stopped run. The run that continues it leaves the row out.
+        A row with `is_stopped` is the last row of a stopped run. The run that continues it leaves the row out.
         """
         row = {FRAMES: float(frames), WALL_SECONDS: wall_s, **self._training_scores(), **self._scalars}
         if is_stopped:
@@ -143,12 +143,13 @@ class Recorder:
         return row
 
     def finish(self, frames: int, wall_s: float, cpu_s: float, *, is_finished: bool) -> str:
-        """Evaluate, write the summary and the figures, close the logger; return the closing table.
+        """Evaluate, write the summary and the figures, close the logger, and return the closing table.
 
         Args:
-            frames: of training.
-            wall_s, cpu_s: of training; with `mode=eval`, the time of the evaluation takes their place.
-            is_finished: whether training reached its end; otherwise the evaluation is the last row of the metrics.
+            frames: frames of training.
+            wall_s: wall time of training; with `mode=eval`, the time of the evaluation replaces it.
+            cpu_s: CPU time of training; likewise.
+            is_finished: whether training reached its end. Otherwise the evaluation is the last row of the metrics.
         """
         if self.config.run.mode == "eval":
             wall_before, cpu_before = time.perf_counter(), time.process_time()
@@ -179,7 +180,7 @@ class Recorder:
         return closing_table(summary, env.table_metrics)
 
     def _film(self) -> Path | None:
-        """Film the first episodes of the last evaluation, if the problem can be seen, and return the file."""
+        """Film the first episodes of the last evaluation, if the problem has pictures, and return the file."""
         evaluation = self.parts.evaluation
         tracks = film.tracks_of(evaluation.states, _FILMED_STEPS)
         pictures = film.film(evaluation.problem, tracks, _FPS, _FILM_SIZE)

@@ -1,4 +1,4 @@
-"""The config of a run that starts from a checkpoint: that of the saved run, changed by the command line."""
+"""Resolve the config of a run that starts from a checkpoint: the saved config, changed by the command line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hpamdp.run import checkpoint, compatibility
 from hpamdp.run.assemble import choose_selector, make_env
 from hpamdp.shell import setting
 
-# Parts of the config that make the agent what it is.
+# Parts of the config that define the agent.
 _AGENT = ("high", "low", "agent", "experiment", "search", RECIPE)
 # Settings that a run does not take over from the saved run.
 _BEGIN = ("mode", "resume", "checkpoint", "overwrite", "trust")
@@ -32,14 +32,14 @@ _NOT_EVALUATED = ("data", "logger", "collector")
 def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | None]:
     """Return the config to run and the checkpoint to start from, if there is one.
 
-    With `resume` or `mode=eval` the saved run's config is taken, changed by what the command line sets anew.
+    With `resume` or `mode=eval`, the config is the saved one, changed by the command line.
 
     Args:
         cfg: the composed config.
         overrides: the words of the command line.
 
     Raises:
-        ConfigError: a wrong value, no such checkpoint, or a word that would change the saved agent.
+        ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent.
     """
     config = choose_selector(read(cfg), overrides)
     compatibility.check_rules(config, (compatibility.saved_runs_are_named,))
@@ -69,15 +69,15 @@ def _plain_value(cfg: DictConfig, name: str) -> Any:
 
 
 def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str, str]:
-    """Return the names that a saved run chose for the groups, so that the command line is read as an addition to it.
+    """Return the choices of a saved run, to which the command line adds.
 
     Args:
         source: the run's output folder or its checkpoint.
-        where: the setting that names it.
+        where: the setting that names the source.
         overrides: the words of the command line.
 
     Raises:
-        ConfigError: no such checkpoint, or a word that would change the saved agent.
+        ConfigError: the checkpoint does not exist, or a word would change the saved agent.
     """
     file = checkpoint.find(source, where)
     saved = checkpoint.progress_of(file)["config"]
@@ -87,16 +87,16 @@ def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str
 
 
 def check_saved_options(config: Config, env: PAMDPEnv) -> None:
-    """Refuse a saved agent of other options in number or order, and warn where its options have other names.
+    """Refuse a saved agent if number or order of its options differs, and warn if their names differ.
 
-    An agent knows its options by number alone.
+    An agent knows its options only by their numbers.
 
     Args:
-        config: of the run, whose `resume`, `checkpoint` or `low.checkpoint` has the agent.
+        config: config of the run, whose `resume`, `checkpoint` or `low.checkpoint` names the agent.
         env: the environment of the run.
 
     Raises:
-        ConfigError: with the options of both.
+        ConfigError: the options differ; the message names the options of both.
     """
     run = config.run
     sources = {"resume": run.resume, "checkpoint": run.checkpoint, "low.checkpoint": run.low.checkpoint}
@@ -119,10 +119,10 @@ def check_saved_options(config: Config, env: PAMDPEnv) -> None:
 
 
 def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple[str, ...]:
-    """Return the options that a saved run's agent chose among; none if they are not known."""
+    """Return the options of a saved run's agent; empty if they are unknown."""
     if "option_names" in progress:
         return tuple(progress["option_names"])
-    # A checkpoint of an earlier version lacks the names. A problem of this package has them without guarded settings.
+    # Checkpoints of earlier versions lack the names. Problems of this package give them without guarded settings.
     try:
         config = read_saved(progress["config"], {"mode": "train", "resume": None, "checkpoint": None})
         if config.env.cls is None or not config.env.cls.__module__.startswith("hpamdp."):
@@ -135,7 +135,7 @@ def _option_names(progress: Mapping[str, Any], where: str, source: str) -> tuple
 
 
 def _changes(overrides: Sequence[str], saved: Mapping[str, Any], file: Path, where: str) -> list[str]:
-    """Return the words that change the saved run, without repeated choices of its groups."""
+    """Return the words that change the saved run; a repeated choice of a group changes nothing."""
     choices = choices_of(saved)
     changes = [word for word in overrides if _name(word) not in GROUPS or _choice(word) != choices[_name(word)]]
     for word in changes:

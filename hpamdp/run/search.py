@@ -1,4 +1,4 @@
-"""Continue an Optuna search whose trials are kept in a storage."""
+"""Continue an Optuna search whose trials are in a storage."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from hpamdp.run.folder import locked
 if TYPE_CHECKING:
     from optuna import Study
 
-# The study's entry with the numbers of the trials that were repeated.
+# The study's entry with the numbers of repeated trials.
 _TRIED_AGAIN = "tried_again"
 
 
 def go_on(config: DictConfig) -> int | None:
-    """Set up Hydra's Optuna sweeper to continue a search; return the number of its first job.
+    """Set up Hydra's Optuna sweeper to continue a search, and return the number of its first job.
 
-    The search first repeats trials that were stopped or failed. Then it proposes new ones until `n_trials` are
+    The search first repeats trials that were stopped or failed. Then it proposes new trials until `n_trials` are
     complete. Without a storage, or with another sweeper, the first job has number 0.
 
     Args:
-        config: the sweep's config, with its `hydra` part, which is changed.
+        config: the sweep's config with its `hydra` part, which is changed.
 
     Returns:
-        The number, or None if all trials are complete.
+        The number of the first job, or None if all trials are complete.
 
     Raises:
         ConfigError: the storage cannot be used.
@@ -64,7 +64,7 @@ def go_on(config: DictConfig) -> int | None:
 
 
 def _load(config: DictConfig) -> Study:
-    """Load the study from the storage, or create it; without a name it is named after the sweep's folder."""
+    """Load the study from the storage, or create it. By default, its name is the sweep's folder."""
     import optuna
     import sqlalchemy
 
@@ -89,7 +89,7 @@ def _load(config: DictConfig) -> Study:
 
 
 def _move(config: DictConfig, before: int, now: int) -> None:
-    """Rename a trial's folder to its new number, so that its checkpoint is found, unless a process uses the folder."""
+    """Rename a trial's folder to its new number, unless a process uses it, so that the job finds its checkpoint."""
     sweep = config.hydra.sweep
     if sweep._get_node("subdir")._value() != "${hydra.job.num}":
         return

@@ -1,4 +1,4 @@
-"""Compare the contents of a checkpoint with a run, before the run changes."""
+"""Compare the contents of a checkpoint with a run before the run changes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from hpamdp.messages import first_line
 from hpamdp.policies.shared.sized_by_data import SizedByData
 from hpamdp.run.tensor_archive import SavedTensor
 
-# The largest whole number that a float holds exactly.
+# Largest whole number up to which a float holds all exactly.
 _MOST = 2**53
 Count = Annotated[int, Field(ge=0, le=_MOST)]
 Amount = Annotated[FiniteFloat, Field(ge=0.0)]
-# Settings of an optimizer that training changes, and settings that choose between equivalent implementations.
+# Settings that training changes in an optimizer, and settings that choose between equivalent implementations.
 _SCHEDULED, _IMPLEMENTATION = ("lr", "weight_decay"), ("foreach", "fused", "capturable", "differentiable")
 # Settings that earlier versions of torch lack.
 _MAY_LACK = (*_IMPLEMENTATION, "decoupled_weight_decay")
@@ -33,13 +33,13 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class SavedPart(BaseModel):
-    """Contents of a file by their names; a value of another type is refused."""
+    """Contents of a file by their names. Values of other types are refused."""
 
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
 class Progress(SavedPart):
-    """How far a run has come. Entries of later versions are ignored."""
+    """Progress of a run. Entries of later versions are ignored."""
 
     model_config = ConfigDict(strict=True, extra="ignore", frozen=True)
 
@@ -71,7 +71,7 @@ def checked(model: type[Model], values: Any) -> Model:
     """Return values as a model.
 
     Raises:
-        ValueError: the message names the first wrong value in one line.
+        ValueError: a value is wrong; the message names the first one in one line.
     """
     try:
         return model.model_validate(values)
@@ -80,7 +80,7 @@ def checked(model: type[Model], values: Any) -> Model:
 
 
 def checked_as(kind: Any, values: Any) -> Any:
-    """Return values of a type that is no model, as `checked` does."""
+    """Check values as `checked` does, for a type that is no model."""
     try:
         return TypeAdapter(kind, config=ConfigDict(strict=True, arbitrary_types_allowed=True)).validate_python(values)
     except ValidationError as error:
@@ -93,10 +93,10 @@ def _first_wrong(error: ValidationError) -> str:
 
 
 def check_form(where: str, saved: object, own: Tensor, *, any_size: bool = False, any_rows: bool = False) -> None:
-    """Refuse a value that is no tensor with the dtype and shape of `own`; float16 is accepted for float32.
+    """Refuse a value unless it is a tensor with the dtype and shape of `own`; float16 may stand for float32.
 
     Args:
-        where: the value's name in the error.
+        where: name of the value in the error.
         saved: the value, read or not.
         own: the tensor of the run.
         any_size: whether only the number of dimensions must be the same.
@@ -119,7 +119,7 @@ def _form(tensor: Tensor | SavedTensor) -> str:
 
 
 def check_values(where: str, value: Tensor, own: Tensor) -> None:
-    """Refuse NaN and inf, unless `own` has them, and integers below both -1 and the smallest one in `own`.
+    """Refuse NaN and inf, unless `own` has them, and integers below -1 and all integers in `own`.
 
     Raises:
         ValueError: a number is invalid.
@@ -140,7 +140,7 @@ def check_columns(where: str, saved: Any, own: Mapping[str, Any], *, any_rows: b
     """Refuse nested columns whose names, dtypes or shapes differ from `own`.
 
     Raises:
-        ValueError: the message names the first difference.
+        ValueError: the columns differ; the message names the first difference.
     """
     if not isinstance(saved, Mapping):
         raise ValueError(f"{where} is {type(saved).__name__}, but must be a mapping")
@@ -158,7 +158,7 @@ def check_like(where: str, saved: Any, own: Any) -> None:
     """Refuse nested values whose names, types or shapes differ from `own`.
 
     Raises:
-        ValueError: the message names the first difference.
+        ValueError: the values differ; the message names the first difference.
     """
     if isinstance(own, Tensor):
         check_form(where, saved, own)
@@ -170,7 +170,7 @@ def check_like(where: str, saved: Any, own: Any) -> None:
 
 
 def check_names(saved: object, own: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return a state dict if it has the names of another one.
+    """Return a state dict if its names are the names of `own`.
 
     Raises:
         ValueError: the names differ, or `saved` is no state dict.
@@ -186,13 +186,13 @@ def check_names(saved: object, own: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def buffers_sized_by_data(module: nn.Module) -> set[int]:
-    """Return the ids of the buffers whose sizes depend on data."""
+    """Return the ids of a module's buffers whose sizes depend on data."""
     sized = [part for part in module.modules() if isinstance(part, SizedByData)]
     return {id(buffer) for part in sized for buffer in part.buffers(recurse=False)}
 
 
 def state_after_a_step(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Return the state of a copy of an optimizer after a step; only the forms of its tensors matter."""
+    """Return the state of a copy of an optimizer after a step. Only dtypes and shapes of its tensors matter."""
     another = copy.deepcopy(optimizer)
     for group in another.param_groups:
         for parameter in group["params"]:
@@ -202,15 +202,15 @@ def state_after_a_step(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
 
 
 def check_optimizer(where: str, saved: Any, own: Mapping[str, Any]) -> None:
-    """Refuse the saved state of another optimizer; its tensors may not have been read yet.
+    """Refuse the saved state of another optimizer, whether or not its tensors have been read.
 
     Args:
-        where: the state's name in the error.
+        where: name of the state in the error.
         saved: the saved state.
         own: the optimizer's own state after a step.
 
     Raises:
-        ValueError: the message names the first difference.
+        ValueError: the states differ; the message names the first difference.
     """
     state = checked(_OptimizerState, saved)
     if len(state.param_groups) != len(own["param_groups"]):
@@ -236,12 +236,12 @@ def _check_setting(where: str, name: str, value: Any, own: Any) -> None:
 
 
 def scheduled(own: Mapping[str, Any], saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of an optimizer, with saved values for the settings that training changes."""
+    """Return an optimizer's settings, with saved values for the settings that training changes."""
     return {**own, **{name: saved[name] for name in _SCHEDULED if name in saved}}
 
 
 def check_moments(where: str, state: Mapping[int, Mapping[str, Tensor]]) -> None:
-    """Refuse moments from which an optimizer cannot make a step.
+    """Refuse moments with which an optimizer cannot make a step.
 
     Raises:
         ValueError: a number is invalid.
@@ -254,7 +254,7 @@ def check_moments(where: str, state: Mapping[int, Mapping[str, Tensor]]) -> None
 
 
 def check_replay(where: str, saved: Any, buffer: ReplayBuffer) -> _ReplayState:
-    """Check the state of a replay buffer before its rows are read, and return it.
+    """Check and return the state of a replay buffer before its rows are read.
 
     Raises:
         ValueError: the state is of another buffer.
@@ -281,10 +281,10 @@ def check_num_rows(where: str, saved: Any, own: Mapping[str, Any], num: int) -> 
 
 
 def check_generator(state: Tensor) -> None:
-    """Refuse a tensor that is no state of torch's generator on the CPU.
+    """Refuse a tensor that is not a state of torch's CPU generator.
 
     Raises:
-        ValueError: the tensor is no such state.
+        ValueError: the tensor is refused.
     """
     own = torch.Generator()
     if state.dtype != torch.uint8 or state.shape != own.get_state().shape:
@@ -297,7 +297,7 @@ def check_generator(state: Tensor) -> None:
 
 @torch.no_grad()
 def example_steps(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
-    """Return steps `[N]` as a run makes them; only their names, shapes and dtypes matter."""
+    """Return steps `[N]` of a run as an example. Only their names, shapes and dtypes matter."""
     steps = env.fake_tensordict()
     for name in (keys.ACTION_MASK, keys.OPTION_MASK):
         for mask in (steps.get(name, None), steps.get(("next", name), None)):

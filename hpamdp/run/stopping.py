@@ -1,4 +1,4 @@
-"""Stop a run from outside: by signals, which take effect between two batches, and by `sys.exit` in other code."""
+"""Stop a run by signals, which take effect between two batches, and explain `sys.exit` in third-party code."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import ClassVar
 
 from hpamdp.messages import one_line
 
-# A Ctrl-C; a cluster's stop; what SLURM and others send before the time is up; a closed terminal.
+# Ctrl-C, a cluster's stop, the warning of SLURM and others before the time limit, and a closed terminal.
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGXCPU)
 _URGENT = (signal.SIGINT, signal.SIGTERM)
 
 
 class StopRequest:
-    """Whether a signal has asked the run to stop."""
+    """Record of the signals that ask a run to stop."""
 
     latest: ClassVar[signal.Signals | None] = None  # of all runs of this process
 
@@ -28,10 +28,10 @@ class StopRequest:
         StopRequest.latest = None
 
     def note(self, number: int, frame: FrameType | None) -> None:
-        """Note the signal; a second Ctrl-C or SIGTERM interrupts at once.
+        """Note the signal. A second Ctrl-C or SIGTERM interrupts at once.
 
         Raises:
-            KeyboardInterrupt: it is the second.
+            KeyboardInterrupt: the signal is the second one.
         """
         if self.signal is not None and number in _URGENT:
             raise KeyboardInterrupt
@@ -40,7 +40,7 @@ class StopRequest:
 
 @contextmanager
 def stop_on_signals() -> Iterator[StopRequest]:
-    """Note the signals that stop a run, until the block ends; ignored signals stay ignored.
+    """Note the signals that stop a run until the block ends. Ignored signals stay ignored.
 
     Only the main thread notes signals, since Python delivers them to no other thread.
     """
@@ -75,12 +75,12 @@ def pass_on_signal() -> None:
 
 
 def _changeable_signals() -> tuple[signal.Signals, ...]:
-    """Return the signals that this thread can handle. Only the main thread can handle any."""
+    """Return the signals that this thread can handle, which are none outside the main thread."""
     return STOP_SIGNALS if threading.current_thread() is threading.main_thread() else ()
 
 
 class ProgramExitError(RuntimeError):
-    """A call of `sys.exit` in third-party code, explained in one line."""
+    """Raised for a call of `sys.exit` in third-party code; the message is one line."""
 
 
 @contextmanager

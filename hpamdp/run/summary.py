@@ -1,4 +1,4 @@
-"""What one run comes to, as one JSON object."""
+"""Summarise a run in one JSON object."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ def summarise(
     *,
     is_finished: bool,
 ) -> dict[str, Any]:
-    """Return the run's summary: its final evaluation's means, references, its cost, and the versions that made it.
+    """Return the run's summary: means of the final evaluation, references, cost and versions.
 
     Args:
-        config: of the run.
-        env: the problem, which knows the references.
+        config: config of the run.
+        env: the problem, which has the references.
         measured: means of the agent's final evaluation, from `Evaluation.measure`.
-        random: the same for the uniformly random agent.
-        effort: `frames` of training, `wall_s` and `cpu_s` of this run: of training, evaluations included, or with
-            `mode=eval` of the evaluation.
+        random: the same means for the uniformly random agent.
+        effort: `frames` of training, and `wall_s` and `cpu_s` of this run. With `mode=eval`, they are the times of
+            the evaluation, otherwise of training with its evaluations.
         is_finished: whether the run reached its end.
     """
     return {

@@ -1,4 +1,4 @@
-"""Sweeps: finished jobs are skipped, stopped ones resumed; a failing job stops no other; a report closes the sweep."""
+"""Run sweeps: skip finished jobs, resume stopped ones, continue after failed ones, and report at the end."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from hpamdp.shell import path_setting
 
 _MISTAKE, _INTERRUPTED = 2, 130
 _PATIENCE_S = 30.0
-# States of a job; the first one until it has ended.
+# States of a job. The first one holds until the job ends.
 _RUNNING, _FINISHED, _RESUMED, _SKIPPED = "running", "finished", "resumed and finished", "skipped, finished before"
 _STOPPED, _REFUSED, _FAILED = "stopped", "refused", "failed"
 
 
 class SweepDir(Callback):
-    """Remembers the sweep's folder, which Hydra passes to callbacks only, and keeps Hydra from writing into runs."""
+    """Remember the sweep's folder, which Hydra gives only to callbacks, and keep Hydra from writing into runs."""
 
     path: ClassVar[Path | None] = None
 
@@ -69,7 +69,7 @@ class SweepDir(Callback):
 
 
 def _check_output_subdir(config: DictConfig) -> None:
-    """Exit if Hydra should write its own files, because it would write before the run's folder is checked."""
+    """Exit if Hydra is set to write its own files, because it would write before the run's folder is checked."""
     given = config.hydra.output_subdir
     if given is not None:
         warn(f"hydra.output_subdir={given}: must be null; config.yaml in a run's folder has every value of the run")
@@ -77,22 +77,22 @@ def _check_output_subdir(config: DictConfig) -> None:
 
 
 def _compose_jobs_without_folders(loader: ConfigLoader, first_job: int) -> None:
-    """Have Hydra compose the configs of jobs so that it makes no folder for them.
+    """Make Hydra compose the configs of jobs without creating their folders.
 
-    Hydra ends the whole sweep if it cannot make the folder of one job. `run_job` makes it instead.
+    Hydra ends the whole sweep if it cannot create the folder of one job. `run_job` creates it instead.
 
     Args:
-        loader: composes the configs.
+        loader: the loader that composes the configs.
         first_job: number of the first job; not 0 if a search is continued.
     """
-    # Launchers send the loader to other processes, hence a function that can be pickled.
+    # Launchers send the loader to other processes, so the function must be picklable.
     loader.load_sweep_config = functools.partial(_job_config, loader, first_job)  # type: ignore[method-assign]
 
 
 def _job_config(
     loader: ConfigLoader, first_job: int, master_config: DictConfig, sweep_overrides: list[str]
 ) -> DictConfig:
-    """Return a job's config, with the folder below the sweep's as `hydra.sweep.job_subdir`."""
+    """Return a job's config, with its folder inside the sweep's folder as `hydra.sweep.job_subdir`."""
     config = type(loader).load_sweep_config(loader, master_config, sweep_overrides)
     with open_dict(config.hydra.sweep):
         config.hydra.sweep.job_subdir = config.hydra.sweep._get_node("subdir")._value()
@@ -103,7 +103,7 @@ def _job_config(
 
 
 def _job_folder() -> Path:
-    """Return the current job's folder; write the folder and the job's number into Hydra's own settings, too."""
+    """Return the current job's folder, and write the folder and the job's number into Hydra's settings."""
     hydra: Any = HydraConfig.get()
     whole = hydra._get_root()  # the folder's name is resolved in it
     number = hydra.job.num + hydra.sweep.first_job
@@ -133,7 +133,7 @@ class Records:
 
     Args:
         sweep_dir: the sweep's folder.
-        start: names this start of it.
+        start: name of this start of the sweep.
     """
 
     def __init__(self, sweep_dir: Path, start: str) -> None:
@@ -147,14 +147,14 @@ class Records:
             partial.write_text(json.dumps(asdict(job)))
 
     def read(self) -> list[Job]:
-        """Return the jobs that have been started, in order."""
+        """Return the started jobs in their order."""
         if not os.path.isdir(self._folder):
             return []
         jobs = [Job(**json.loads(file.read_text())) for file in self._folder.glob("[0-9]*.json")]
         return sorted(jobs, key=lambda job: job.number)
 
     def remove(self) -> None:
-        """Remove the files, and their folder unless another start of the sweep uses it."""
+        """Remove the files, and their folder if no other start of the sweep uses it."""
         for file in self._folder.glob("*"):
             file.unlink(missing_ok=True)
         with suppress(OSError):
@@ -163,11 +163,11 @@ class Records:
 
 
 def run_job(cfg: DictConfig, start: str) -> float | None:
-    """Run Hydra's current job, or what is left of it; return its score, or None if it failed.
+    """Run the rest of Hydra's current job, and return its score, or None if it failed.
 
     Args:
         cfg: the job's config.
-        start: names this start of the sweep, for `report`.
+        start: name of this start of the sweep, for `report`.
 
     Raises:
         SystemExit: the user stopped it.
@@ -205,8 +205,8 @@ def run_job(cfg: DictConfig, start: str) -> float | None:
 
 
 def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str, float | None, str]:
-    """Run what is not done yet in a job's folder; return the job's state, its score and why it failed."""
-    # These take seconds, which --help need not wait for.
+    """Run the rest of the job in a folder, and return the job's state, its score and the reason of a failure."""
+    # These imports take seconds, which --help need not wait for.
     from hpamdp.run import train
     from hpamdp.run.continuation import rest_of
     from hpamdp.run.resume import resolve
@@ -229,7 +229,7 @@ def _go_on(cfg: DictConfig, overrides: Sequence[str], folder: Path) -> tuple[str
 
 @functools.cache  # once a process, which may run several jobs
 def _stop_with_parent() -> None:
-    """Save and stop this process when the one that started it is killed, which joblib does not do."""
+    """Save and stop this process if its parent is killed, which joblib does not do."""
     parent = os.getppid()
 
     def watch() -> None:
@@ -242,16 +242,16 @@ def _stop_with_parent() -> None:
 
 
 def has_begun(start: str) -> bool:
-    """Return whether any job has."""
+    """Return whether any job has started."""
     return SweepDir.path is not None and bool(Records(SweepDir.path, start).read())
 
 
 def report(start: str, error: BaseException | None = None) -> int:
-    """Print a tally of the jobs and, on stderr, a line for each that failed; return the exit code.
+    """Print a tally of the jobs and, on stderr, a line for each failed job; return the exit code.
 
     Args:
-        start: names this start of the sweep.
-        error: what ended it early.
+        start: name of this start of the sweep.
+        error: the error that ended the sweep early, if any.
     """
     sweep_dir = SweepDir.path
     assert sweep_dir is not None

@@ -2,7 +2,7 @@
 
 `torch.load(weights_only=True)` runs no code either. But it allocates the sizes that a file claims and decompresses
 members without a limit. Before torch 2.10 it also trusts the length of a storage. A `TensorArchive` first reads a
-description: nested values with a `SavedTensor` in the place of each tensor. The caller checks the description, and then
+description: nested values with a `SavedTensor` in place of each tensor. The caller checks the description, and then
 reads the tensors.
 """
 
@@ -21,7 +21,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-# How often tensors may use the bytes of a storage. A state dict names each shared weight several times.
+# Number of tensors that may use the bytes of a storage. A state dict names each shared weight several times.
 _MAX_USES = 16
 _DTYPES = {
     "DoubleStorage": torch.float64,
@@ -44,8 +44,8 @@ class SavedTensor:
     """The description of a tensor that has not been read yet.
 
     Attributes:
-        dtype, shape, stride, offset: the tensor's.
-        record: the member of the archive that holds the tensor's numbers.
+        dtype, shape, stride, offset: dtype, shape, stride and storage offset of the tensor.
+        record: member of the archive that holds the tensor's numbers.
     """
 
     dtype: torch.dtype
@@ -66,7 +66,7 @@ def stored_members(file: IO[bytes], num_bytes: int) -> zipfile.ZipFile:
     """Open a zip archive of `num_bytes` whose members are stored without compression.
 
     Raises:
-        ValueError: a member is compressed, has the name of another one, or is larger than the file.
+        ValueError: a member is compressed, has the name of another member, or is larger than the file.
     """
     archive = zipfile.ZipFile(file)
     infos = archive.infolist()
@@ -82,7 +82,7 @@ def stored_members(file: IO[bytes], num_bytes: int) -> zipfile.ZipFile:
 
 
 class MemberFile(io.RawIOBase):
-    """A stored member of a zip archive as a file that seeks without reading."""
+    """Present a stored member of a zip archive as a file that seeks without reading."""
 
     def __init__(self, file: IO[bytes], info: zipfile.ZipInfo) -> None:
         super().__init__()
@@ -128,11 +128,11 @@ class TensorArchive:
         num_bytes: size of the file.
 
     Attributes:
-        state: the saved value, with a `SavedTensor` in the place of each tensor.
+        state: the saved value, with a `SavedTensor` in place of each tensor.
 
     Raises:
-        ValueError, or another error of a damaged file: the file holds more than the dicts, lists, tuples, strings,
-            numbers and plain tensors that `torch.save` writes.
+        ValueError: the file holds other values than dicts, lists, tuples, strings, numbers and plain tensors. A
+            damaged file may raise other errors.
     """
 
     def __init__(self, file: IO[bytes], num_bytes: int) -> None:
@@ -149,7 +149,7 @@ class TensorArchive:
         """Read a tensor.
 
         Raises:
-            ValueError: a bool tensor has other bytes than 0 and 1.
+            ValueError: a bool tensor has bytes other than 0 and 1.
         """
         data = bytearray(self._archive.read(saved.record))
         dtype = torch.uint8 if saved.dtype == torch.bool else saved.dtype
@@ -172,7 +172,7 @@ class TensorArchive:
 
 
 class _Reader:
-    """Builds nested values from the instructions that `torch.save` writes; nothing that a file names is called.
+    """Build nested values from the instructions that `torch.save` writes, without calling anything by its name.
 
     Args:
         script: the instructions.
@@ -263,7 +263,7 @@ class _Reader:
         self._stack[-1].update(zip(values[::2], values[1::2], strict=True))
 
     def _again(self, number: int) -> Any:
-        """Return a value that occurs again; refuse a container, because contents could grow exponentially."""
+        """Return a value that occurs again, but refuse a container, because contents could grow exponentially."""
         value = self._memo[number]
         parts = value if isinstance(value, tuple) else ()
         if isinstance(value, dict | list) or not all(type(part) is int for part in parts):

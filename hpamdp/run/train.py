@@ -1,4 +1,4 @@
-"""One run: build its parts, then loop: collect a batch, learn, log, evaluate and save when due."""
+"""Run one training: build its parts, then collect batches, learn, log, evaluate and save."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ INTERRUPTED, DIVERGED, FAILED = 130, 3, 1  # exit codes
 
 
 class DivergedError(Exception):
-    """A number of the training that is not finite."""
+    """Raised if a reward, a loss or a weight is not finite."""
 
 
 def run(
@@ -53,22 +53,23 @@ def run(
     may_overwrite: bool = False,
     tell: Callable[[str], None] = warn,
 ) -> int:
-    """Train or score an agent, write everything under `output_dir`, return the exit code.
+    """Train or score an agent, write everything under `output_dir`, and return the exit code.
 
-    0: the run reached its end. 130: it was stopped by a signal, and saved. 3: a reward, a loss or a weight was not
-    finite; the last good checkpoint is kept. 1: a worker process died or could not start, or somebody else's code
-    called `sys.exit`; what was learned is saved.
+    - 0: the run reached its end.
+    - 130: a signal stopped the run, and it was saved.
+    - 3: a reward, a loss or a weight was not finite. The last good checkpoint is kept.
+    - 1: a worker process died or could not start, or third-party code called `sys.exit`. The agent was saved.
 
     Args:
         cfg: the composed config.
-        output_dir: a folder, made if need be.
+        output_dir: folder of the run, created if it is missing.
         overrides: the command line's words, which change a resumed run's config.
         stopped_at: the checkpoint of this very run, to continue from.
         may_overwrite: whether the results of a run in the folder may be overwritten, as with `overwrite=true`.
-        tell: is told in one line why the run ended with the exit codes 3 and 1.
+        tell: function that gets the reason of the exit codes 3 and 1 in one line.
 
     Raises:
-        ConfigError: a wrong value or path, or values that do not go together.
+        ConfigError: a value or a path is wrong, or values do not go together.
     """
     try:
         with exits_explained():
@@ -139,12 +140,12 @@ def _resuming(config: Config, output_dir: Path) -> str:
 class Trainer:
     """The training loop and its progress.
 
-    A frame is what a run is counted in: a step, with frozen learners a decision, with `mode=offline` an update.
+    A frame is the unit of a run's length: a step, a decision with frozen learners, or an update with `mode=offline`.
 
     Args:
-        config: of the run.
-        parts: built from it.
-        output_dir: the run's folder.
+        config: config of the run.
+        parts: parts of the run.
+        output_dir: folder of the run.
     """
 
     def __init__(self, config: Config, parts: AssembledRun, output_dir: Path) -> None:
@@ -164,7 +165,7 @@ class Trainer:
             self.unit = " decisions"
 
     def restore(self, source: Path) -> None:
-        """Take the agent from a checkpoint and, to continue training, the state of its run."""
+        """Load the agent from a checkpoint, and the state of its run if training continues."""
         is_training = self.config.run.mode != "eval"
         agent, env = self.parts.agent, self.parts.env
         steps = example_steps(env, self.parts.policy) if is_training else None
@@ -188,7 +189,7 @@ class Trainer:
         """Write the config and start the logger. These are the first writes, so everything must be checked and built.
 
         Args:
-            is_own: whether the folder holds the run that is continued. Otherwise an earlier run there is deleted.
+            is_own: whether the folder holds the continued run. Otherwise an earlier run there is deleted.
 
         Raises:
             ConfigError: the logger refuses its settings; the folder stays as it was.
@@ -210,10 +211,10 @@ class Trainer:
     def train(self) -> bool:
         """Train until `num_frames` or `eval.stop_score` and save the agent; return whether a signal stopped it before.
 
-        A signal takes effect between two batches, so that what is saved is what an uninterrupted run has there.
+        A signal takes effect between two batches, so that the saved state equals that of an uninterrupted run.
 
         Raises:
-            DivergedError: a reward, a loss or a weight is not finite; nothing was saved since.
+            DivergedError: a reward, a loss or a weight is not finite. Nothing has been saved since.
         """
         with stop_on_signals() as request:
             collection: Collection = self.config.collector.build(
@@ -227,14 +228,14 @@ class Trainer:
             except (DivergedError, ConfigError):
                 collection.close()
                 raise
-            except BaseException:  # such as a worker that died: what was learned is saved before the run fails
+            except BaseException:  # such as a dead worker; the agent is saved before the run fails
                 self._save_and_close(collection)
                 raise
             self._save_and_close(collection)
             return not self._is_over()
 
     def _save_and_close(self, collection: Collection) -> None:
-        """Save before anything else; that is not interrupted and depends on no stream."""
+        """Save first, uninterrupted and without any output, then close the collection."""
         with signals_ignored():
             try:
                 self.save(collection)
@@ -242,7 +243,7 @@ class Trainer:
                 collection.close()
 
     def _continue(self, collection: Collection) -> None:
-        """Put the collection and the random generators into the state that was saved, if there is one."""
+        """Restore the saved state of the collection and the random generators, if there is one."""
         if self._saved is None:
             return
         state, generators = self._saved.states["collection"], self._saved.generators
@@ -300,7 +301,7 @@ class Trainer:
             take_time()
 
     def _learn(self, collection: Collection) -> int:
-        """Let the agent learn from a batch of steps or from the data set; return the number of frames.
+        """Let the agent learn from a batch of steps or from the data set, and return the number of frames.
 
         Raises:
             DivergedError: a reward or a loss is not finite.
@@ -332,10 +333,10 @@ class Trainer:
         bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
 
     def save(self, collection: Collection) -> None:
-        """Write the checkpoint and the networks alone.
+        """Write the checkpoint and the file with only the networks.
 
         Raises:
-            DivergedError: a weight is not finite, or another number NaN.
+            DivergedError: a weight is not finite, or another number is NaN.
         """
         for name, weight in self.parts.agent.named_parameters():
             if not weight.isfinite().all():
@@ -351,7 +352,7 @@ class Trainer:
         checkpoint.save_policy(self.output_dir / POLICY_NAME, self.parts.agent, progress)
 
     def keep_for_inspection(self) -> str:
-        """Save the agent as it is beside the last good checkpoint; return in words what there is."""
+        """Save the current agent beside the last good checkpoint, and return a message about both files."""
         file = self.output_dir / DIVERGED_NAME
         checkpoint.save(file, self.parts.agent, {}, self._progress(), with_replay=False)
         good = self.output_dir / checkpoint.FILE_NAME
@@ -373,7 +374,7 @@ def check_more(overrides: Sequence[str], frames: int, wanted: int) -> None:
     """Refuse to continue a run for fewer frames than it has.
 
     Raises:
-        ConfigError: with how many those are.
+        ConfigError: the length is too small; the message names the frames so far.
     """
     for word in overrides:
         if word.startswith(("total_frames=", "offline.updates=")) and frames > wanted:
@@ -384,7 +385,7 @@ def check_rewards(batch: TensorDictBase) -> None:
     """Check the rewards of a batch `[*B, T]` and their sums.
 
     Raises:
-        DivergedError: one is not finite.
+        DivergedError: a reward or a sum is not finite.
     """
     for key in (keys.REWARD, keys.EPISODE_RETURN):
         value = cast(torch.Tensor, batch.get(("next", key)))
@@ -395,7 +396,7 @@ def check_rewards(batch: TensorDictBase) -> None:
 
 
 def check_scalars(scalars: Mapping[str, float]) -> None:
-    """Check what the agent returned from learning.
+    """Check the values that the agent returned from learning.
 
     Raises:
         DivergedError: a value is not finite.
@@ -407,7 +408,7 @@ def check_scalars(scalars: Mapping[str, float]) -> None:
 
 @contextmanager
 def _said_by(bar: tqdm, text: str) -> Iterator[None]:
-    """Show a text before the bar, at once and as long as the block takes."""
+    """Show a text before the bar while the block runs."""
     bar.set_description_str(text)
     try:
         yield
@@ -422,5 +423,5 @@ def _tell_notices(collection: Collection, bar: tqdm) -> None:
 
 
 def _is_due(before: int, now: int, every: int) -> bool:
-    """Return whether a multiple of `every` was passed; never if it is 0."""
+    """Return whether a multiple of `every` was passed; False if `every` is 0."""
     return every > 0 and now // every > before // every

@@ -1,4 +1,4 @@
-"""`hpamdp watch`: an agent, or a random or planned player, at its problem, as a film."""
+"""Run `hpamdp watch`, which films an agent, or a random or planned player, at its problem."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ Film an agent at its problem.
 
 
 def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
-    """Write the film and say what is in it; return the exit code.
+    """Write the film, print its scores, and return the exit code.
 
     Raises:
-        ConfigError: a wrong word, no such agent, or a problem without pictures.
+        ConfigError: a word is wrong, the agent does not exist, or the problem has no pictures.
     """
     parser.description = _DESCRIPTION
     parser.add_argument("player", nargs="*", metavar="AGENT or GROUP=CHOICE", help="who plays, and at what")
