@@ -17,7 +17,7 @@ from hydra.core.override_parser.types import QuotedString
 from omegaconf import OmegaConf
 
 from hpamdp import cli
-from hpamdp.config.yaml_files import CheckedYamlFiles, check_before_hydra_reads
+from hpamdp.config.yaml_files import complete_yaml_files
 from hpamdp.files import replacing
 from hpamdp.messages import say
 from hpamdp.run import train
@@ -258,9 +258,9 @@ def test_no_file_of_the_working_directory_takes_the_place_of_a_package_in_worker
 
 
 def test_a_launchers_worker_that_registers_hydras_reader_again_keeps_ours():
-    check_before_hydra_reads()
+    complete_yaml_files()
     SourcesRegistry.instance().register(FileConfigSource)
-    assert SourcesRegistry.instance().resolve("file") is CheckedYamlFiles
+    assert hasattr(SourcesRegistry.instance().resolve("file"), "load_alone")
 
 
 def test_a_clone_stays_first_where_python_looks_for_modules(monkeypatch, tmp_path):

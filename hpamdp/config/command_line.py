@@ -19,9 +19,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp import __version__
 from hpamdp.config.components import GROUPS
-from hpamdp.config.compose import choosing
+from hpamdp.config.compose import beginning_of, choosing
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.messages import first_line
 from hpamdp.shell import setting
 
 GRAMMAR = "not understood; write GROUP=CHOICE or SETTING=VALUE"
@@ -138,7 +139,12 @@ def _refuse(message: str) -> NoReturn:
 
 
 def _parsed(words: Sequence[str]) -> tuple[Override, ...]:
-    return tuple(OverridesParser.create().parse_overrides(list(words)))
+    try:
+        return tuple(OverridesParser.create().parse_overrides(list(words)))
+    except RecursionError as error:
+        raise ConfigError(f"{beginning_of(words)}a value nests too deep") from error
+    except ValueError as error:  # an integer with more digits than Python converts
+        raise ConfigError(f"{beginning_of(words)}{first_line(error)}") from error
 
 
 def _check_groups(line: CommandLine, conf: Path) -> None:
