@@ -1,1 +1,1 @@
-"""Selectors, one a file: which option?"""
+"""Selectors, one per file. A selector chooses an option at each decision."""

@@ -1,1 +1,1 @@
-"""Learners, one a file: which discrete action, with which parameters?"""
+"""Learners, one per file. A learner chooses a discrete action and its parameters at each step."""
