@@ -1,8 +1,8 @@
-"""Train a policy over options with plain TorchRL, using nothing of hpamdp but its environments.
+"""Train a policy over options with plain TorchRL, using only the environments of hpamdp.
 
 Which boat should sail to the goal? Each boat has three keys, which push it in three fixed directions, and the two boats
-differ in these directions. How to sail is not learned here: `Sailor` follows a simple geometric rule. That leaves one
-decision per episode, the choice of the boat. `OptionChoiceEnv` turns it into an ordinary environment with one discrete
+differ in these directions. Sailing is not learned here: `Sailor` follows a simple geometric rule. One decision per
+episode remains, the choice of the boat. `OptionChoiceEnv` turns it into an ordinary environment with one discrete
 action, `option`, which TorchRL's own PPO can learn.
 
     python examples/option_policy_plain_torchrl.py [BATCHES]
@@ -97,7 +97,7 @@ def train(env: EnvBase, num_batches: int) -> TensorDictModuleBase:
 
 
 def score(env: OptionChoiceEnv, option: int | None, policy: TensorDictModuleBase) -> float:
-    """Return the mean score on fixed episodes with a fixed option or, if that is None, with the policy's choices."""
+    """Return the mean score on fixed episodes with a fixed option or, if it is None, with the policy's choices."""
     env.set_seed(0)
     td = env.reset(env.fixed_episodes(0))
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
@@ -106,7 +106,7 @@ def score(env: OptionChoiceEnv, option: int | None, policy: TensorDictModuleBase
 
 
 def main(num_batches: int = 30) -> dict[str, float]:
-    """Train; print and return the mean scores with each boat alone and with the learned choices."""
+    """Train a policy, then print and return the mean scores with each boat alone and with the learned choices."""
     torch.manual_seed(0)
     torch.set_num_threads(1)  # the networks are small
     policy = train(choice_of_boat(seed=1), num_batches)

@@ -1,4 +1,4 @@
-"""Draw and tabulate every study again from its csv files, and put all pages into one report.
+"""Draw and tabulate every study again from its csv files, and collect all pages in one report.
 
 python experiments/report.py    runs `main([])` of every study.py; renews the tables in the Markdown pages; writes
                                 report/report.html, and every figure as SVG
@@ -28,7 +28,7 @@ HERE = Path(__file__).resolve().parent
 TABLE = re.compile(
     r"(?P<opening><!-- table(?: (?P<number>\d+) of (?P<study>\w+))? -->\n).*?(?P<closing><!-- /table -->)", re.DOTALL
 )
-# The pages to begin with; the others follow by name.
+# First pages of the report; the others follow by name.
 FIRST = ("table1", "learners", "hierarchy", "quickstart", "human")
 STYLE = """
 body { font: 16px/1.5 sans-serif; max-width: 62em; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -43,8 +43,8 @@ def report(experiments: Path, target: Path) -> list[str]:
     """Renew figures, tables and the report.
 
     Args:
-        experiments: the folder of the studies. README.md, agents/README.md and docs/ beside it get their tables
-            renewed, too.
+        experiments: the folder of the studies. The tables of README.md, agents/README.md and docs/ beside it are
+            renewed as well.
         target: the folder of the report.
 
     Returns:
@@ -80,11 +80,11 @@ def _order(folder: Path) -> tuple[int, str]:
 
 
 def page_of(folder: Path, tables: str | None) -> str | None:
-    """Return the text of a study's page, its tables renewed; a page made up of tables and figures if it has none.
+    """Return the text of a study's page with renewed tables. If there is no page, make one of tables and figures.
 
     Args:
-        folder: of the study.
-        tables: what its study.py printed; None if there is no study.py or it failed.
+        folder: folder of the study.
+        tables: the printed tables of its study.py; None if there is no study.py or it failed.
 
     Returns:
         None if there is neither a page nor a study.
@@ -101,7 +101,7 @@ def page_of(folder: Path, tables: str | None) -> str | None:
 
 
 def run(script: Path, figures: Path) -> str:
-    """Run `main([])` of a study and return what it prints; save its figures as SVG, too."""
+    """Run `main([])` of a study, return the printed text, and save its figures also as SVG."""
     spec = importlib.util.spec_from_file_location(f"study_{script.parent.name}", script)
     module = importlib.util.module_from_spec(spec)
     with redirect_stdout(io.StringIO()) as printed, saved_as_svg_too(figures):
@@ -112,7 +112,7 @@ def run(script: Path, figures: Path) -> str:
 
 @contextmanager
 def saved_as_svg_too(folder: Path) -> Iterator[None]:
-    """Within this context, save every figure also as SVG in this folder."""
+    """Save every figure inside the block also as SVG in this folder."""
     folder.mkdir(parents=True, exist_ok=True)
     save = Figure.savefig
 
@@ -142,7 +142,7 @@ def renew(page: Path, table_for: Callable[[re.Match[str]], str | None]) -> None:
 
     Args:
         page: a Markdown file, which is written only if something changes.
-        table_for: returns the table for a match of `TABLE`; None leaves what is there.
+        table_for: returns the table for a match of `TABLE`, or None to keep the current table.
     """
 
     def replace(found: re.Match[str]) -> str:
@@ -158,8 +158,10 @@ def renew(page: Path, table_for: Callable[[re.Match[str]], str | None]) -> None:
 def renew_numbered(page: Path, tables: Mapping[str, str]) -> list[str]:
     """Put the tables of studies, which are separated by empty lines, into a page that names them by number.
 
+    If the study failed or lacks a table, the current table stays.
+
     Returns:
-        A line for each table that the study does not have; what is there then stays, as it does if the study failed.
+        A line for each table that the study lacks.
     """
     missing = []
 
@@ -205,7 +207,7 @@ def bind(pages: list[tuple[str, str]]) -> str:
 
 
 def main() -> int:
-    """Make the report of this folder; return 1 if anything failed, else 0."""
+    """Make the report of this folder, and return 1 if anything failed, else 0."""
     target = HERE.parent / "report"
     failures = report(HERE, target)
     print(f"Everything is in {target / 'report.html'}")

@@ -1,4 +1,4 @@
-"""Crossing: a problem whose best option changes within an episode, and the best values of all its places."""
+"""Define Crossing, a problem whose best option changes within an episode, and compute the best values of its states."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ NUM_CELLS = int(LENGTH / SLOW) + 1
 
 
 class Crossing(PAMDPEnv):
-    """Walk over land, then swim through water; only the arrival is rewarded, with 1.
+    """Walk over land, then swim through water. Only the arrival is rewarded, with 1.
 
-    Discrete actions: 0 steps, and its parameter in [0, 1] is the fraction of a whole step; 1 rests, and its parameter
-    has no effect. A whole step is 1 long with the option that suits the place and `SLOW` with the other. The
-    observation is the one-hot index of the place, in units of `SLOW`. Episodes start at a random place in the first
-    `start` of the way.
+    Discrete action 0 makes a step, and its parameter in [0, 1] is the fraction of a whole step. Action 1 rests, and its
+    parameter has no effect. A whole step has length 1 with the option that suits the place and length `SLOW` with the
+    other. The observation is the one-hot index of the place, in units of `SLOW`. Episodes start at a random place in
+    the first `start` of the way.
     """
 
     option_names = ("walk", "swim")
@@ -81,7 +81,7 @@ class Crossing(PAMDPEnv):
 
 
 def cell_of(place: Tensor) -> Tensor:
-    """Return the numbers of the cells, int64 `[N]`, in which places `[N]` lie."""
+    """Return the cell, int64 `[N]`, of each place `[N]`."""
     return (place / SLOW).floor().long()
 
 
@@ -91,13 +91,13 @@ def observe(cell: Tensor) -> Tensor:
 
 
 def best_values(gamma: float, option_length: int) -> list[float]:
-    """Return the best discounted return from the beginning of every cell, where an option is due; the last is 0.
+    """Return the best discounted return from the beginning of every cell, at a decision; 0 for the last cell.
 
-    By dynamic programming from the end of the way. The best actions are whole steps.
+    The values follow by dynamic programming from the end of the way. The best actions are whole steps.
 
     Args:
         gamma: discount of a step.
-        option_length: steps after which an option ends; 1: options can change at every step.
+        option_length: steps after which an option ends. If 1, options can change at every step.
     """
     quick = round(1.0 / SLOW)
     value = [0.0] * NUM_CELLS

@@ -1,4 +1,4 @@
-"""A problem of one's own: put a ball into a hole with two clubs.
+"""Define a custom problem: put a ball into a hole with two clubs.
 
 The ball lies some metres from the hole, on a line. The putter rolls it (one parameter: the power), the wedge chips it
 further (two parameters: the power and the spin). The episode ends when the ball is holed, or after six strokes.
@@ -28,7 +28,7 @@ STROKE_COST, REWARD = 0.1, 1.0
 
 
 class Ball(NamedTuple):
-    """Columns `[N]`: metres to the hole (negative beyond it), strokes so far, number of the episode."""
+    """Columns `[N]`: metres to the hole (negative beyond it), strokes so far, and number of the episode."""
 
     distance: Tensor
     strokes: Tensor
@@ -40,15 +40,15 @@ class PuttingEnv(PAMDPEnv):
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 putter, 1 wedge; `("action", "parameters")` float32
     `[N, 3]`: the putter's power in [0, 1] (8 m), the wedge's power in [0, 1] (25 m) and its spin in [-1, 1] (1 m).
-    Observation `[N, 2]`: distance to the hole in units of 20 m, share of the strokes that are left. Each stroke costs
-    0.1, holing the ball earns 1.
+    Observation `[N, 2]`: distance to the hole in units of 20 m, and fraction of the strokes that remain. The reward is
+    -0.1 for each stroke and 1 for holing the ball.
 
     Args:
-        num_envs: how many balls.
-        wind: standard deviation of a chip's length, as a share of it.
-        device: where the balls lie.
-        seed: of the starts and the wind.
-        first_env: number of the first ball, where other processes have those before.
+        num_envs: number of balls.
+        wind: standard deviation of a chip's length, as a fraction of the length.
+        device: device of the tensors.
+        seed: seed of the starts and the wind.
+        first_env: number of the first ball, if other processes have earlier balls.
     """
 
     parameter_dims = (1, 2)
@@ -78,17 +78,17 @@ class PuttingEnv(PAMDPEnv):
         self.done_spec = self.make_done_spec()
         self._set_seed(seed)
 
-    # What the framework asks of a problem beyond TorchRL: how an episode went, and what to show of it.
+    # The framework's contract beyond TorchRL's: results of episodes, and figures to show.
 
     result_keys = ("left",)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return whether the ball was holed, and how far from the hole it lies, each `[M]`."""
+        """Return whether the ball was holed and its distance to the hole, each `[M]`."""
         left = last.get("left")
         return {"success": left < HOLE, "left": left}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return the mean distance that is left, in metres."""
+        """Return the mean remaining distance in metres."""
         return {"left": float(played["left"].mean())}
 
     def env_state(self) -> dict[str, Tensor]:

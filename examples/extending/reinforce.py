@@ -1,4 +1,4 @@
-"""A learner of one's own: REINFORCE with a learned baseline, on the shared hybrid actor.
+"""Define a custom learner: REINFORCE with a learned baseline, on the shared hybrid actor.
 
 Source: Williams 1992, *Simple statistical gradient-following algorithms for connectionist reinforcement learning*.
 """
@@ -24,7 +24,7 @@ RAW = "raw_parameters"  # the parameters as they were sampled, before they are c
 
 
 class ReinforcePolicy(TensorDictModuleBase):
-    """Samples from the actor, or takes its mode when greedy."""
+    """Sample from the actor, or take its mode if greedy."""
 
     def __init__(self, actor: HybridActor, specs: PAMDPSpecs) -> None:
         super().__init__()
@@ -43,7 +43,7 @@ class ReinforcePolicy(TensorDictModuleBase):
 
 
 class Reinforce(Learner):
-    """One gradient step a batch on the log-likelihood of what was done, weighted by the return less a baseline."""
+    """Make one gradient step per batch on the actions' log-likelihood, weighted by the return less a baseline."""
 
     def __init__(
         self,
@@ -65,11 +65,11 @@ class Reinforce(Learner):
         self.optimizer = torch.optim.Adam(self.parameters(), lr=lr)
 
     def stateful(self) -> dict[str, Any]:
-        """Return the optimizer, which a checkpoint holds beside the networks."""
+        """Return the optimizer, which a checkpoint saves beside the networks."""
         return {"optimizer": self.optimizer}
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
-        """Make one step from the rows of `mask` `[*B, T]`; the returns of unfinished episodes end in the baseline."""
+        """Make one step from the rows of `mask` `[*B, T]`. Unfinished episodes bootstrap from the baseline."""
         if not mask.any():
             return {}
         returns = self.returns(batch)[mask]
@@ -89,7 +89,7 @@ class Reinforce(Learner):
 
     @torch.no_grad()
     def returns(self, batch: TensorDictBase) -> Tensor:
-        """Return the discounted return from every step of a batch on, `[*B, T]`."""
+        """Return the discounted return from every step of a batch, `[*B, T]`."""
         reward = batch["next", keys.REWARD].squeeze(-1)
         is_end = option_ends(batch).squeeze(-1)
         terminated = batch["next", keys.TERMINATED].squeeze(-1)

@@ -1,4 +1,4 @@
-"""A selector of one's own: a bandit that chooses by the softmax of the mean rewards."""
+"""Define a custom selector: a bandit that chooses by the softmax of the mean rewards."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ class SoftmaxOptions(BanditOptions):
     """Settings of `Softmax`."""
 
     temperature: PositiveFloat = 0.2
-    """The higher it is, the more alike are the options' probabilities."""
+    """Temperature of the softmax. A higher one makes the options' probabilities more equal."""
 
 
 class Softmax(Bandit):
-    """Choose option i with probability exp(mean reward of i / temperature), normalised."""
+    """Choose option i with a probability proportional to exp(mean reward of i / temperature)."""
 
     Options = SoftmaxOptions
     options: SoftmaxOptions
 
     def sample(self, num: int) -> Tensor:
-        """Return `num` exploring choices, int64 `[num]`."""
+        """Return `num` exploratory choices, int64 `[num]`."""
         probabilities = (self.statistics.means / self.options.temperature).softmax(0)
         return probabilities.multinomial(num, replacement=True) if num else probabilities.new_zeros(0).long()

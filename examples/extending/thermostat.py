@@ -1,4 +1,4 @@
-"""A Gymnasium environment with parameterised actions, as one may have it already: nothing here knows hpamdp."""
+"""Define a Gymnasium environment with parameterised actions, without using hpamdp."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from gymnasium import spaces
 class Thermostat(gymnasium.Env):
     """Keep a room at 20 degrees: wait, heat with some power, or open the window for some time.
 
-    Action: `Tuple(Discrete(3), Tuple(Box(0), Box(1), Box(1)))`: 0 wait; 1 heat, power in [0, 3] kW; 2 air, minutes in
-    [0, 10]. Observation: the room's and the outside temperature. The reward is minus the distance to 20 degrees and
-    minus the cost of heating; an episode lasts 24 hours.
+    The action is `Tuple(Discrete(3), Tuple(Box(0), Box(1), Box(1)))`: 0 waits, 1 heats with a power in [0, 3] kW, and 2
+    airs for [0, 10] minutes. The observation holds the room's and the outside temperature. The reward is minus the
+    distance to 20 degrees and minus the cost of heating. An episode lasts 24 hours.
     """
 
     def __init__(self, outside: float = 5.0) -> None:

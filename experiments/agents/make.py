@@ -1,4 +1,4 @@
-"""Make the agents that come with the code anew, each by one run, and put them into agents/.
+"""Train the agents of this package again, each by one run, and put them into agents/.
 
 python experiments/agents/make.py                train all of them, one after another
 python experiments/agents/make.py NAME ...       only these
@@ -15,7 +15,7 @@ import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 KEPT = ("policy.pt", "config.yaml", "summary.json")
-# The critics serve training alone; small ones make small files.
+# Only training needs the critics, so small ones suffice and make small files.
 SMALL = "low.critic_hidden_dims=[64,64]"
 ONE_BOAT = ["high=none", "low=hppo", SMALL, "total_frames=1000000", "eval.every=250000"]
 HARD_MOVE = ["high=none", "low=hppo", "env=hard_move", "eval.every=50000"]
@@ -33,7 +33,7 @@ AGENTS = {
     "hppo_hard_move_8": [*HARD_MOVE, "env.n=8"],
     "hppo_moving": ["high=none", "low=hppo", "env=moving"],
     "hppo_sliding": ["high=none", "low=hppo", "env=sliding"],
-    # Its options change inside an episode.
+    # The options of this agent change inside an episode.
     "meta_critic_hppo_rooms": [
         *("high=meta_critic", "high.hidden_dims=[64,64]", "low=hppo", "env=rooms", "low.gamma=0.97"),
         *("agent.termination=learned", "agent.sharing=shared", "low.minibatch_size=512"),
@@ -59,10 +59,10 @@ def keep(name: str, run: Path) -> None:
 
 
 def round_networks(file: Path) -> None:
-    """Store the learners' networks in half precision, for half the size; a selector stays, as it may hold counts."""
+    """Store the learners' networks in half precision, for half the size. A selector may hold counts, so it stays."""
     saved = torch.load(file, weights_only=True)
     agent = saved["agent"]
-    # The same weights are there under several names, but only once in the file; so they must stay one tensor.
+    # The same weights have several names, but are in the file once, so they must stay one tensor.
     rounded = {
         value.data_ptr(): value.half()
         for name, value in agent.items()

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 AGENTS = Path(__file__).resolve().parents[2] / "agents"
-# What of a problem's settings tells one agent from another.
+# Settings of problems in which agents differ.
 TOLD = ("controller", "n")
 HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success", "length", "trained for", "CPU, s")
 
@@ -48,7 +48,7 @@ def main(words: Sequence[str]) -> None:
 
 
 def _order(folder: Path) -> tuple[bool, str, int, str]:
-    """Return what puts the boats first, then the problems by name, and Hard Move by its number of actuators."""
+    """Return the place of a line: the boats first, then the problems by name, Hard Move by its number of actuators."""
     problem = json.loads((folder / "summary.json").read_text())["env"]
     return problem != "boatdock", problem, len(folder.name), folder.name
 

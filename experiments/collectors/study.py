@@ -25,7 +25,7 @@ SEEDS = (0, 1, 2)
 COMMON = ["high=none", "low=hppo", "eval.every=0", "eval.layouts=1000", "log_every=0"]
 TASKS = {
     "cheap steps": ["env.controller=congruent", "total_frames=300000"],
-    # The same boat as a Gymnasium environment, whose copies Python steps one after another.
+    # The same boat as a Gymnasium environment. Python steps its copies one after another.
     "expensive steps": [
         "env=gymnasium",
         "env.id=hpamdp/BoatDock-v0",
@@ -65,7 +65,7 @@ def train(task: str, collector: str, seed: int) -> dict[str, float | str]:
 
 
 def run_all() -> Rows:
-    """Return a row for each run; collectors and seeds alternate, so that other load on the machine slows all alike."""
+    """Return a row for each run. Collectors and seeds alternate, so that other load on the machine slows all alike."""
     rows: Rows = []
     for task in TASKS:
         for seed in SEEDS:
@@ -76,7 +76,7 @@ def run_all() -> Rows:
 
 
 def table(rows: Rows) -> str:
-    """Return a line for each task and collector: mean ± standard deviation over seeds of the score, else means."""
+    """Return a line for each task and collector: mean ± standard deviation of the score over seeds, and other means."""
     lines = ["| | collector | score | frames/s | wall s | CPU s | whole command, s |", "|---|---|---|---|---|---|---|"]
     for (task, collector), runs in groups(rows, "task", "collector").items():
         score = spread([run["score"] for run in runs])

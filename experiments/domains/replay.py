@@ -31,13 +31,13 @@ FLOAT64_TOLERANCE = 1e-9
 
 @dataclass
 class Report:
-    """What a replay found.
+    """Results of a replay.
 
     Attributes:
-        steps: how many were compared.
-        largest: the largest difference by what differs: the columns of the state, `observation`, `reward` and, where an
-            action has them, `ticks`.
-        mismatches: steps whose outcome or flags differ, in words.
+        steps: number of compared steps.
+        largest: the largest difference of each column of the state, and of `observation`, `reward` and, if an action
+            has them, `ticks`.
+        mismatches: descriptions of steps whose outcome or flags differ.
     """
 
     steps: int = 0
@@ -52,7 +52,7 @@ class Report:
 
 @dataclass(frozen=True)
 class _Step:
-    """One recorded step: where it stands in the file, the state before it, and what was recorded."""
+    """One recorded step: its place in the file, the state before it, and the recorded values."""
 
     episode: int
     number: int
@@ -97,7 +97,7 @@ def _steps(number: int, episode: dict[str, Any]) -> list[_Step]:
 
 
 def _compare(report: Report, adapter: Adapter, state: Any, steps: list[_Step]) -> Any:
-    """Take the steps `[N]` from the states, note what differs, and return the states after them."""
+    """Take the steps `[N]` from the states, note the differences, and return the states after them."""
     recorded = [step.recorded for step in steps]
     after, results = adapter.act(state, recorded)
     report.steps += len(steps)

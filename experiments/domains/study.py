@@ -35,7 +35,7 @@ from hpamdp.analysis.study import (
 from hpamdp.figure_style import LEARNER_COLOURS
 
 HERE = Path(__file__).resolve().parent
-# The domains, with the largest published number of steps and what is scored: the mean return or the share of successes.
+# The domains, with the largest published number of steps and the score: the mean return or the success rate.
 # No scores were published on Moving and Sliding, for which DI-engine's settings allow ten million steps.
 DOMAINS = {
     "platform": (200_000, "score"),
@@ -50,10 +50,10 @@ DOMAINS = {
     "sliding": (10_000_000, "score"),
 }
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
-MIN_SEEDS_COMPARED = 3  # of both learners, for a probability of improvement
-FIRST_STEPS = 700  # where the curves' axes begin: no learner was evaluated earlier
+MIN_SEEDS_COMPARED = 3  # least seeds of both learners for a probability of improvement
+FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
 CPU_LIMIT = 600.0  # seconds, of the table within ten minutes
-AUGMENTED = "_augment"  # follows a learner's name where steps are mapped by symmetries that the problem declares
+AUGMENTED = "_augment"  # follows a learner's name if it learns from steps mapped by the problem's symmetries
 KEY = ("domain", "learner", "frames", "seed")
 
 
@@ -82,7 +82,7 @@ def domain(run: Run) -> str:
 
 
 def learner(run: Run) -> str:
-    """Return the learner's name; the forms of P-DQN, PADDPG and HyAR that have names of their own go by those.
+    """Return the learner's name, or the name of its form of P-DQN, PADDPG or HyAR.
 
     `AUGMENTED` may follow.
     """
@@ -98,7 +98,7 @@ def learner(run: Run) -> str:
 
 
 def merged(stored: Rows, new: Rows) -> Rows:
-    """Return the stored rows without those of runs that were made anew, and the new rows, by domain and learner."""
+    """Return the stored rows, with rows of repeated runs replaced by the new rows, by domain and learner."""
     made_anew = {tuple(str(row[name]) for name in KEY) for row in new}
     kept = [row for row in stored if tuple(str(row[name]) for name in KEY) not in made_anew]
     rows = kept + new
@@ -109,7 +109,7 @@ def merged(stored: Rows, new: Rows) -> Rows:
 
 
 def at_published_steps(results: Rows) -> Rows:
-    """Return, of each learner on each domain, the runs with most steps, but no more than the published number."""
+    """Return each learner's longest runs on each domain that do not exceed the published number of steps."""
 
     def is_allowed(rows: Rows) -> bool:
         return rows[0]["frames"] <= DOMAINS[rows[0]["domain"]][0] * (1.0 + BATCH_TOLERANCE)
@@ -118,12 +118,12 @@ def at_published_steps(results: Rows) -> Rows:
 
 
 def within_cpu_limit(results: Rows) -> Rows:
-    """Return, of each learner on each domain, the runs with most steps whose mean CPU time is within the limit."""
+    """Return each learner's longest runs on each domain whose mean CPU time is within the limit."""
     return _longest(results, lambda rows: np.mean([row["cpu_s"] for row in rows]) <= CPU_LIMIT)
 
 
 def _longest(results: Rows, is_allowed: Callable[[Rows], bool]) -> Rows:
-    """Return, of each learner on each domain, the runs with most steps among those with as many that are allowed."""
+    """Return each learner's longest allowed runs on each domain; runs of equal length are allowed together."""
     chosen: Rows = []
     for cell in groups(results, "domain", "learner").values():
         allowed = [rows for rows in groups(cell, "frames").values() if is_allowed(rows)]
@@ -132,9 +132,9 @@ def _longest(results: Rows, is_allowed: Callable[[Rows], bool]) -> Rows:
 
 
 def table(results: Rows, published: Rows, references: Rows) -> str:
-    """Return a line for each learner, a column for each domain: its scores over seeds.
+    """Return a line for each learner with its scores over seeds, in a column for each domain.
 
-    Lines with the published scores, the players that learn nothing and the ceilings follow.
+    Lines with the published scores, the players without learning and the ceilings follow.
     """
     names = [f"{name}{form}" for form in ("", AUGMENTED) for name in LEARNER_COLOURS]
     learners = [name for name in names if any(row["learner"] == name for row in results)]
@@ -153,7 +153,7 @@ def table(results: Rows, published: Rows, references: Rows) -> str:
 
 
 def _line(name: str, rows: Rows) -> str:
-    """Return a line of the table with one score for each domain that has one."""
+    """Return a line of the table with the score of each domain, if it has one."""
     scores = {row["domain"]: f"{row['score']:g}" for row in rows}
     return f"| {name} | " + " | ".join(scores.get(domain, "") for domain in DOMAINS) + " |"
 
@@ -163,7 +163,7 @@ def _values(rows: Rows) -> list[float]:
 
 
 def _cell(values: list[float]) -> str:
-    """Return the interquartile mean and its interval from `MIN_SEEDS` seeds on, else mean ± deviation; the seeds."""
+    """Return the interquartile mean and interval with `MIN_SEEDS` seeds, else mean ± deviation, and the seeds."""
     if not values:
         return ""
     if len(values) < MIN_SEEDS:
@@ -178,7 +178,7 @@ def _middle(values: list[float]) -> float:
 
 
 def best_table(results: Rows, published: Rows) -> str:
-    """Return a line for each domain: our best learner, how sure it is above our next best, the best published score."""
+    """Return a line for each domain: our best learner, its probability of improvement, and the best published score."""
     lines = [
         "| domain | best | score | next best | probability of improvement | best published | CPU of a run |",
         "|---|---|---|---|---|---|---|",
@@ -205,7 +205,7 @@ def best_table(results: Rows, published: Rows) -> str:
 
 
 def cost_table(results: Rows) -> str:
-    """Return a line for each learner and domain: steps, CPU and wall time of a run; and one for all runs together."""
+    """Return a line for each learner and domain with steps, CPU and wall time of a run, and a line for all runs."""
     lines = ["| domain | learner | seeds | steps | CPU | wall |", "|---|---|---|---|---|---|"]
     for (name, low, frames), rows in groups(results, "domain", "learner", "frames").items():
         cpu_s, wall_s = (np.mean([row[column] for row in rows]) for column in ("cpu_s", "wall_s"))
@@ -216,7 +216,7 @@ def cost_table(results: Rows) -> str:
 
 
 def steps_table(curves: Rows, published: Rows) -> str:
-    """Return a line for each learner, domain and length of runs: steps to the best published score."""
+    """Return a line for each learner, domain and length of runs with the steps to the best published score."""
     lines = [
         "| domain | learner | steps | best published | steps to it, each seed | a tenth of the published steps |",
         "|---|---|---|---|---|---|",
@@ -237,7 +237,7 @@ def steps_table(curves: Rows, published: Rows) -> str:
 
 
 def best_published(published: Rows, name: str) -> dict[str, Any] | None:
-    """Return the row of the best score that was published on a domain, None if there is none."""
+    """Return the row of the best published score on a domain, None if there is none."""
     return max((row for row in published if row["domain"] == name), key=lambda row: row["score"], default=None)
 
 

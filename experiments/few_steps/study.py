@@ -1,4 +1,4 @@
-"""Draw and tabulate how many presses PETS needs to play as well as people, beside people's own learning.
+"""Draw and tabulate the presses that PETS needs to play as well as people, beside people's own learning.
 
 python experiments/few_steps/study.py FOLDER...    gathers the runs of experiment=few_steps in these folders into
                                                    curves.csv, the long ones into long.csv, those of other learners
@@ -23,7 +23,7 @@ HERE = Path(__file__).resolve().parent
 HUMAN_BLOCKS = HERE.parent / "human" / "blocks.csv"
 BOTH_BOATS = -1  # in the column `controller` of these
 BLOCK_EPISODES = 60
-LONG = 2000  # presses from which on a run is one that was left running
+LONG = 2000  # least presses of a long run
 BOATS = ("congruent", "incongruent")
 TASKS = {"congruent": "congruent", "incongruent": "incongruent", "chosen": "chosen by the agent"}
 HUMAN_SCORE = HUMAN["chosen"]["score"]
@@ -34,7 +34,7 @@ SETTINGS = {
     ("auto", "sparse"): "symmetry declared, sparse reward",
     ("False", "shaped"): "told nothing of symmetry",
 }
-# What an ablation changes, its values otherwise, and what that means.
+# Settings that ablations change, their default values, and labels.
 ABLATED = {"num_members": (5,), "posterior_sampling": ("auto", True), "updates_per_step": (10.0,), "horizon": (2,)}
 VARIANTS = {
     "": "as above",
@@ -76,19 +76,19 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 
 def variant(run: Run) -> str:
-    """Return what an ablation changed."""
+    """Return the settings that an ablation changed."""
     values = {name: run.config["low"][name] for name in ABLATED}
     return " ".join(f"{name}={value}" for name, value in values.items() if value not in ABLATED[name])
 
 
 def presses_to(score: float, evaluations: Rows) -> float:
-    """Return a run's presses at its first evaluation with this score or more, infinity if there is none."""
+    """Return a run's presses at its first evaluation with at least this score; infinity if there is none."""
     reached = first_at(evaluations, "score", score)
     return float("inf") if reached is None else reached["presses"]
 
 
 def _presses(counts: Sequence[float], statistic: str) -> str:
-    """Return the median or the largest number of presses in words, with the share of runs that got there."""
+    """Return the median or the largest number of presses as text, with the number of runs that succeeded."""
     value = float(np.median(counts)) if statistic == "median" else max(counts)
     reached = sum(np.isfinite(counts))
     share = "" if reached == len(counts) else f" ({reached} of {len(counts)} seeds)"
@@ -112,7 +112,7 @@ def table(curves: Rows) -> str:
 
 
 def ablation_table(curves: Rows) -> str:
-    """Return a line for each variant, on the congruent boat with the seeds that all variants have."""
+    """Return a line for each variant on the congruent boat, with the seeds that all variants have."""
     rows = [row for row in runs_of(curves, *DECLARED, "congruent") if row["seed"] in ABLATION_SEEDS]
     cells = {name: of_name for (name,), of_name in groups(rows, "variant").items()}
     return "\n".join(
@@ -139,7 +139,7 @@ def _figures(rows: Rows) -> str:
 
 
 def long_table(long: Rows) -> str:
-    """Return a line for each boat: the scores of runs that were left running."""
+    """Return a line for each boat: the scores of long runs."""
     presses = sorted({row["presses"] for row in long if row["presses"] > 0})
     columns = ("seeds", *(f"{number:,.0f} presses" for number in presses), "CPU of a run")
     lines = [f"| boat | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]

@@ -1,4 +1,4 @@
-"""Context-free selectors over frozen learners: motor noise on one boat first, then on the other.
+"""Test context-free selectors over frozen learners, with motor noise first on one boat, then on the other.
 
 python experiments/hierarchy/drift.py RUN     plays with the learners of a run's output folder, writes drift.csv, draws
 python experiments/hierarchy/drift.py         draws and tabulates the stored drift.csv
@@ -30,14 +30,14 @@ SEEDS = range(3)
 NUM_ENVS = 20
 DECISIONS = 10_000  # in each phase
 EVERY = 200  # decisions between two rows
-# Motor noise of the incongruent and of the congruent boat in each phase: first the congruent boat is the better one.
+# Motor noise of the incongruent and the congruent boat in each phase. First the congruent boat is the better one.
 NOISE = ((0.15, 0.0), (0.0, 0.15))
 BETTER = (1, 0)  # option, in each phase
 RECOVERED = 0.8  # share of the better boat among the last EVERY decisions
 
 
 def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, float | str]]:
-    """Yield a row every `EVERY` decisions: the share of the better boat, and the mean reward of each boat."""
+    """Yield a row every `EVERY` decisions: the frequency of the better boat, and the mean reward of each boat."""
     overrides = [
         f"high={high}",
         f"high.memory={memory}",
@@ -89,7 +89,7 @@ def _mean_reward(rewards: torch.Tensor) -> float | str:
 
 
 def recovery(rows: Rows) -> float:
-    """Return after how many decisions of the second phase a run chooses the better boat again; inf if never."""
+    """Return the decisions of the second phase until a run chooses the better boat again; infinity if never."""
     shares = [row["better"] for row in rows if row["phase"] == 1]
     for number, share in enumerate(shares, start=1):
         if share >= RECOVERED:
@@ -98,7 +98,7 @@ def recovery(rows: Rows) -> float:
 
 
 def table(rows: Rows) -> str:
-    """Return a line for each form: the share of the better boat at the end of each phase, and the recovery by seed."""
+    """Return a line for each form: frequency of the better boat at the end of each phase, and recovery by seed."""
     lines = [
         "| selector | memory | better boat before the change | at the end | decisions to recover, by seed |",
         "|---|---|---|---|---|",

@@ -21,7 +21,7 @@ from hpamdp.analysis.study import Rows, Run, curve, difference, finished, groups
 from hpamdp.env.boatdock.reference import HUMAN, HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES
 
 HERE = Path(__file__).resolve().parent
-# Selectors that see the layout, those that do not, and the references.
+# Selectors with context, selectors without context, and references.
 SELECTORS = {
     "meta_critic": "#0072B2",
     "linucb": "#009E73",
@@ -35,7 +35,7 @@ SELECTORS = {
     "human": "#D98200",
     "oracle": "#2b2b2b",
 }
-# Columns of results.csv and the summary's names for them.
+# Columns of results.csv, and their names in the summary.
 COLUMNS = {
     "score": "score",
     "success": "success",
@@ -86,7 +86,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
 
 
 def _mean_drift(evaluation: dict[str, float]) -> float:
-    """Return the mean absolute drift of the options, 0 where the evaluation has none."""
+    """Return the mean absolute drift of the options, 0 if the evaluation has none."""
     drift = [abs(value) for column, value in evaluation.items() if column.startswith("eval/drift_")]
     return float(np.mean(drift)) if drift else 0.0
 
@@ -121,7 +121,7 @@ def _order(case: tuple[tuple[Any, ...], Rows]) -> tuple[Any, ...]:
 
 
 def of_the_map(rows: Rows) -> Rows:
-    """Return the runs that all selectors have: those of each learner's commonest length, without uniform options."""
+    """Return the runs of each learner's most common length without uniform options, which all selectors have."""
     commonest = {}
     for (low,), of_learner in groups(rows, "low").items():
         lengths = Counter(row["total"] for row in of_learner)
@@ -167,7 +167,7 @@ def draw_curves(curves: Rows, column: str, label: str, path: Path) -> None:
 
 
 def draw_choices(choices: Rows, path: Path) -> None:
-    """Draw the share of the congruent boat by the bearing's offset, a panel for each learner, with people's share."""
+    """Draw the frequency of the congruent boat by the bearing's offset, with people's, a panel for each learner."""
     lows = list(dict.fromkeys(row["low"] for row in choices))
     middle = np.add(OFFSET_EDGES[:-1], OFFSET_EDGES[1:]) / 2
     figure = Figure(figsize=(6.2 * len(lows), 4.0), layout="constrained")

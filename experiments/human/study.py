@@ -118,7 +118,7 @@ def _mean_score_of_each_person(data: HumanData, mask: torch.Tensor) -> torch.Ten
 
 
 def choices(data: HumanData, best: torch.Tensor) -> Rows:
-    """Return a row for each block (or all) and bin of bearings: how often the congruent boat was chosen, and better."""
+    """Return a row for each block (or all) and bin of bearings: how often the congruent boat was chosen or better."""
     rows = []
     bins = statistics.offset_bins(data)
     is_congruent_better = (best.argmax(1) == harbour.CONGRUENT).double()
@@ -141,7 +141,7 @@ def choices(data: HumanData, best: torch.Tensor) -> Rows:
 
 
 def write(name: str, rows: Iterable[Mapping[str, object]]) -> None:
-    """Write rows as a csv file, numbers with four digits."""
+    """Write rows as a csv file, with four digits of each number."""
     rounded = [
         {column: round(value, 4) if isinstance(value, float) else value for column, value in row.items()}
         for row in rows
@@ -153,7 +153,7 @@ def write(name: str, rows: Iterable[Mapping[str, object]]) -> None:
 
 
 def load(name: str) -> Columns:
-    """Read the columns of a csv file: numbers, but for the names of constants."""
+    """Read the columns of a csv file, all numbers except the names of constants."""
     with (HERE / f"{name}.csv").open() as file:
         rows = list(csv.DictReader(file))
     columns = {}
@@ -199,7 +199,7 @@ def draw_learning(axes: Axes) -> None:
 
 
 def draw_gaps(axes: Axes) -> None:
-    """Draw what each person lost with the keys and by the choice of the boat."""
+    """Draw each person's loss of score through the keys and through the choice of the boat."""
     rows = load("persons")
     order = np.argsort(rows["gap"])
     x = np.arange(len(order))
@@ -213,7 +213,7 @@ def draw_gaps(axes: Axes) -> None:
 
 
 def draw_choices(axes: Axes) -> None:
-    """Draw how often the congruent boat was chosen by the bearing, and how often it was the better one."""
+    """Draw how often the congruent boat was chosen and how often it was better, by the bearing."""
     rows = load("choices")
     for block, colour, label in ((ALL_BLOCKS, HUMAN, "people"), (0, FAINT, "first 60"), (5, INK, "last 60")):
         own = rows["block"] == block
@@ -248,7 +248,7 @@ def draw_better_boat(axes: Axes) -> None:
 
 
 def draw_singles(axes: Axes) -> None:
-    """Draw where single presses ended, and the lines at which our boats stop or get too slow to fail."""
+    """Draw where single presses ended, and the distances at which our boats stop or become slow enough to dock."""
     rows = load("singles")
     outcome = rows["outcome"]
     is_wrong = _reached(outcome) != _reached(rows["predicted"])
@@ -276,18 +276,18 @@ def draw_singles(axes: Axes) -> None:
 
 
 def duration_at(speed: float) -> torch.Tensor:
-    """Return the seconds of pressing after which the boat is this fast (px/s)."""
+    """Return the duration of a press, s, after which the boat has this speed, px/s."""
     times = torch.linspace(0.0, physics.MAX_DURATION, 20_001)
     return times[(physics.speed(times) - speed).abs().argmin()]
 
 
 def _reached(outcome: np.ndarray) -> np.ndarray:
-    """Return how the boat reached the dock, 0 where it did not."""
+    """Return the outcome at the dock, 0 if the boat did not reach it."""
     return np.where((outcome == physics.SUCCESS) | (outcome == physics.TOO_FAST), outcome, 0)
 
 
 def draw_ways(axes: Axes) -> None:
-    """Draw how far first presses went, as a multiple of the way while the key is down."""
+    """Draw the distances of first presses, as multiples of the distance while the key is down."""
     rows = load("first_presses")
     axes.hist(rows["travelled"] / rows["pressed"], bins=np.arange(0.9, 2.25, 0.05), color=HUMAN)
     for edge, text in ((1.0, "no glide"), (1.0 + physics.GLIDE, "at rest")):
@@ -298,7 +298,7 @@ def draw_ways(axes: Axes) -> None:
 
 
 def draw_agreement(axes: Axes) -> None:
-    """Draw the share of outcomes predicted right over both constants, with the fitted ones and ours."""
+    """Draw the fraction of correctly predicted outcomes over both constants, with the fitted constants and ours."""
     rows = load("agreement")
     glides, speeds = np.unique(rows["glide"]), np.unique(rows["docking_speed"])
     share = rows["agreement"].reshape(len(glides), len(speeds))

@@ -35,7 +35,7 @@ DLPA_SIZE = [
 
 
 class Case(NamedTuple):
-    """What to time, and the figures of the released code on one core."""
+    """Settings of a timing, and the figures of the released code on one core."""
 
     name: str
     overrides: list[str]
@@ -61,7 +61,7 @@ CASES = [
 
 
 def run_case(case: Case) -> tuple[float, float | None]:
-    """Return the presses/s of training and the ms of an update, None where the learner counts no updates."""
+    """Return the presses/s of training and the ms of an update, None if the learner counts no updates."""
     with tempfile.TemporaryDirectory() as folder:
         parts, batch_size = build(case.overrides, Path(folder))
     collector = Collector(
@@ -95,7 +95,7 @@ def build(overrides: list[str], folder: Path) -> tuple[AssembledRun, int]:
 
 
 def _updates(parts: AssembledRun) -> int:
-    """Return the number of updates so far, 0 where the learner counts none."""
+    """Return the number of updates so far, 0 if the learner counts none."""
     return int(getattr(parts.agent.learners[0], "updates", 0))
 
 

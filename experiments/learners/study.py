@@ -76,7 +76,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
 
 
 def _name(run: Run) -> str:
-    """Return the learner's name; P-DQN's published forms have names of their own."""
+    """Return the learner's name; P-DQN's published forms have separate names."""
     low = run.config["low"]
     if run.summary["low"] != "pdqn" or low["twin"]:
         return run.summary["low"]
@@ -108,7 +108,7 @@ def table(results: Rows) -> str:
 
 
 def boats_table(results: Rows) -> str:
-    """Return a line for each learner that was trained on both boats: the difference of its scores."""
+    """Return a line with the difference of scores for each learner that was trained on both boats."""
     lines = ["| learner | congruent less incongruent (95 %) | probability of improvement |", "|---|---|---|"]
     for (low,), runs in groups(results, "low").items():
         scores = [

@@ -1,4 +1,4 @@
-"""Gather the offline learners' runs and those that went on from them, and draw and tabulate them.
+"""Gather the offline learners' runs and the runs that continued from them, then draw and tabulate them.
 
 python experiments/offline/study.py multirun/offline multirun/finetune   reads the runs, writes csv files, then draws
 python experiments/offline/study.py                                      draws and tabulates the stored csv files
@@ -33,9 +33,9 @@ HERE = Path(__file__).resolve().parent
 HUMAN_SCORE = HUMAN["chosen"]["score"]
 COLOURS = {"bc": "#8c8c8c", "iql": "#0072B2", "td3_bc": "#D55E00"}
 OUTCOMES = ("success", "too_fast", "out_of_bounds", "out_of_fuel")
-OFFLINE, PRETRAINED, SCRATCH = "offline", "pretrained", "scratch"  # how a run starts
-REST_TO_REST, RECORDED = "rest-to-rest", "recorded"  # how it takes the data's presses
-# What the page compares: learner, start, presses and episodes of the one and of the other.
+OFFLINE, PRETRAINED, SCRATCH = "offline", "pretrained", "scratch"  # start of a run
+REST_TO_REST, RECORDED = "rest-to-rest", "recorded"  # form of the data's presses
+# Comparisons of the page: learner, start, presses and episodes of both sides.
 COMPARISONS = (
     ("bc: rest-to-rest less recorded", ("bc", OFFLINE, REST_TO_REST, "all"), ("bc", OFFLINE, RECORDED, "all")),
     ("iql: rest-to-rest less recorded", ("iql", OFFLINE, REST_TO_REST, "all"), ("iql", OFFLINE, RECORDED, "all")),
@@ -79,14 +79,14 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows]:
 
 
 def _start(run: Run) -> str:
-    """Return what a run's agent began with."""
+    """Return the start of a run: offline, from a trained agent, or from scratch."""
     if run.config["mode"] == "offline":
         return OFFLINE
     return SCRATCH if run.config["low"]["checkpoint"] is None else PRETRAINED
 
 
 def _data(run: Run) -> tuple[str, str]:
-    """Return which form of the data's presses a run learned from, and which episodes."""
+    """Return the form of the presses that a run learned from, and the episodes."""
     if run.config["mode"] != "offline":
         return "none", "all"
     data = REST_TO_REST if run.config["data"]["rest_to_rest"] else RECORDED
@@ -94,7 +94,7 @@ def _data(run: Run) -> tuple[str, str]:
 
 
 def table(results: Rows) -> str:
-    """Return the offline learners' scores, then the presses that pre-training saves."""
+    """Return the offline learners' scores, and then the presses that pre-training saves."""
     lines = [
         "| learner | presses as | episodes | seeds | score | success | too fast | out | no fuel | presses | CPU |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
@@ -134,7 +134,7 @@ def _mean(rows: Rows, column: str) -> float:
 
 
 def draw(curves: Rows, path: Path) -> None:
-    """Draw the scores against updates from the data set, and against presses of the agent's own."""
+    """Draw the scores against updates from the data set, and against the agent's own presses."""
     figure = Figure(figsize=(12.0, 4.0), layout="constrained")
     offline, online = figure.subplots(1, 2, sharey=True)
     cases = groups(curves, "start", "data", "episodes", "low").items()

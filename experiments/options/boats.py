@@ -1,4 +1,4 @@
-"""Train agents on other boats than people's, and on boats that may be changed inside an episode.
+"""Train agents on boats other than people's, and on boats that may be changed inside an episode.
 
 python experiments/options/boats.py WORDS    trains with these words of the command line, and adds a row to boats.csv
 python experiments/options/boats.py          tabulates boats.csv
@@ -47,7 +47,7 @@ def row_of(summary: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
 
 
 def add(row: Mapping[str, Any]) -> None:
-    """Write a row at the end of the file."""
+    """Append a row to the file."""
     is_new = not FILE.exists()
     with FILE.open("a", newline="") as stream:
         writer = csv.DictWriter(stream, COLUMNS, restval="")

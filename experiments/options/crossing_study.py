@@ -29,7 +29,7 @@ from crossing import NUM_CELLS, Crossing, best_values, cell_of, observe  # noqa:
 
 GAMMA = 0.9
 OPTION_LENGTH = 3
-# On every run, before the words of the command line.
+# Settings of every run, before the words of the command line.
 COMMON = [
     f"hydra.searchpath=[file://{EXAMPLE / 'conf'}]",
     "env=crossing",
@@ -145,12 +145,12 @@ def evaluate(parts: AssembledRun, best: torch.Tensor) -> tuple[float, float, tor
     """Play the evaluation's episodes.
 
     Args:
-        parts: of the run.
+        parts: parts of the run.
         best: the best values of the cells, `[NUM_CELLS]`.
 
     Returns:
-        The mean discounted return over the mean best one, the share of the episodes that arrive, and how often an
-        option was due in each cell, `[NUM_CELLS]`.
+        The mean discounted return relative to the best one, the fraction of episodes that arrive, and the number of
+        decisions in each cell, `[NUM_CELLS]`.
     """
     env = parts.evaluation.problem
     assert isinstance(env, Crossing)

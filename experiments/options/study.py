@@ -33,7 +33,7 @@ CONF = HERE.parent.parent / "conf"
 FILE = HERE / "results.csv"
 GAMMA = 0.95
 Settings: TypeAlias = Mapping[str, Sequence[str]]  # words of the command line, by the selector or the learner
-# On every run, before the words of the command line.
+# Settings of every run, before the words of the command line.
 COMMON = [
     "env=rooms",
     f"low.gamma={GAMMA}",
@@ -43,7 +43,7 @@ COMMON = [
     "eval.every=0",
     "log_every=0",
 ]
-# Selectors: many updates from recent decisions alone. The defaults suit one decision an episode.
+# Selectors make many updates from recent decisions only. The defaults suit one decision per episode.
 SELECTORS = {
     "meta_critic": [
         f"high.gamma={GAMMA}",
@@ -66,15 +66,15 @@ SELECTORS = {
         "agent.option_length=null",
     ],
 }
-# Options are uniform for half of the steps: a learner that is not chosen does not learn, and then is never chosen.
-# Replay learners: small networks and fast targets, for a problem of 104 cells.
+# Options are uniform for half of the steps. Otherwise a learner that is not chosen does not learn, and is never chosen.
+# Replay learners have small networks and fast targets, for a problem of 104 cells.
 REPLAY = [
     "num_envs=256",
     "total_frames=200000",
     "agent.uniform_option_steps=120000",
     "low.hidden_dims=[64,64]",
 ]
-# Plans of one step: what their last state is worth says the rest, and tells lengths of steps apart more clearly.
+# Plans have one step. The value of the last state covers the rest, and distinguishes lengths of steps more clearly.
 ONE_STEP_PLANS = [
     "low.end_values=true",
     "low.end_value_tau=0.05",
@@ -85,7 +85,7 @@ ONE_STEP_PLANS = [
 DLPA_PLANS = [*ONE_STEP_PLANS, "low.num_samples=32", "low.num_elites=8", "low.epsilon=0.2"]
 PETS_PLANS = [*ONE_STEP_PLANS, "low.greedy_samples=12", "low.parameter_noise=0.2"]
 LEARNERS = {
-    # Small batches, for many updates of a policy that must go through the rooms before it finds a reward.
+    # Small batches, for many updates of a policy that must cross the rooms before it finds a reward.
     "hppo": [
         "total_frames=160000",
         "agent.uniform_option_steps=80000",
@@ -110,7 +110,7 @@ LEARNERS = {
         "low.epsilon_steps=30000",
         "low.codec_pretrain_updates=1000",
     ],
-    # Of random episodes one in 500 arrives, so the random steps at the start are many.
+    # One in 500 random episodes arrives, so there are many random steps at the start.
     "paddpg": [
         *REPLAY,
         "low.warmup_steps=25000",
@@ -122,7 +122,7 @@ LEARNERS = {
         "low.epsilon_steps=60000",
         "low.actor_lr=3e-4",
     ],
-    # Low temperatures: with the default ones a step earns more entropy than it costs, and never arriving is best.
+    # Low temperatures. With the defaults, a step's entropy bonus exceeds its cost, and never arriving is best.
     "hsac": [
         *REPLAY,
         "low.warmup_steps=25000",
@@ -143,7 +143,7 @@ LEARNERS = {
         "low.updates_per_step=0.1",
         *DLPA_PLANS,
     ],
-    # As of PADDPG, and more of them for models that learn from few arrivals.
+    # As for PADDPG, but more random steps, for models that learn from few arrivals.
     "pets": [
         "total_frames=140000",
         "agent.uniform_option_steps=110000",
@@ -156,7 +156,7 @@ LEARNERS = {
         "low.optimism=0",
         *PETS_PLANS,
     ],
-    # All entries, two in a feature: with the one-hot vectors this makes a value for each cell. Episodes are options.
+    # Features of two entries each: with one-hot vectors, this gives each cell a value. Episodes are options.
     "qpamdp": [
         "total_frames=800000",
         "agent.uniform_option_steps=400000",
@@ -178,7 +178,7 @@ LEARNERS = {
 
 
 def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings, learners: Settings) -> Config:
-    """Return the checked config of a run: what all runs have, what its selector and its learner need, and the words."""
+    """Return the checked config of a run, from settings of all runs, its selector and its learner, and the words."""
     chosen = dict(word.split("=", 1) for word in words)
     own = [*selectors.get(chosen.get("high", ""), []), *learners.get(chosen.get("low", ""), [])]
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -186,7 +186,7 @@ def make_config(words: Sequence[str], common: Sequence[str], selectors: Settings
 
 
 def trained(config: Config) -> tuple[AssembledRun, int, float]:
-    """Train an agent; return the parts of its run, its steps and the CPU seconds that it took."""
+    """Train an agent, and return the parts of its run, its steps and its CPU seconds."""
     cpu = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         torch.manual_seed(config.run.seed)
@@ -197,11 +197,11 @@ def trained(config: Config) -> tuple[AssembledRun, int, float]:
 
 
 def value_errors(value: torch.Tensor, best: torch.Tensor, num_due: torch.Tensor) -> dict[str, float]:
-    """Return the errors of values over the mean best one, where options were due and everywhere.
+    """Return the errors of values relative to the mean best value, at decisions and in all cells.
 
     Args:
-        value, best: of the cells, `[*C]`.
-        num_due: how often an option was due in each of them, `[*C]`.
+        value, best: learned and best values of the cells, `[*C]`.
+        num_due: number of decisions in each cell, `[*C]`.
     """
     error = (value - best).abs()
     return {
@@ -245,7 +245,7 @@ def mean_over_starts(parts: AssembledRun, values: torch.Tensor) -> float:
 
 
 def evaluate(parts: AssembledRun) -> tuple[dict[str, float], torch.Tensor]:
-    """Play the evaluation's episodes; return their means, and how often an option was due in each cell, `[x, y]`."""
+    """Play the evaluation's episodes, and return their means and the number of decisions in each cell, `[x, y]`."""
     env = parts.evaluation.problem
     assert isinstance(env, RoomsEnv)
     num_due = torch.zeros(rules.SIZE, rules.SIZE, dtype=torch.float64)
@@ -292,7 +292,7 @@ def values_of_cells(agent: HierarchicalAgent) -> torch.Tensor:
 
 
 def add(row: Mapping[str, object], file: Path) -> None:
-    """Write a row at the end of a csv file."""
+    """Append a row to a csv file."""
     is_new = not file.exists()
     with file.open("a", newline="") as stream:
         writer = csv.DictWriter(stream, list(row))

@@ -1,4 +1,4 @@
-"""Play the released environment to measure the effects of its rules; prints the figures of README.md.
+"""Play the released environment to measure the effects of its rules, and print the figures of README.md.
 
 Run: python experiments/released/claims.py
 """
@@ -34,21 +34,21 @@ def place(env: ReleasedBoatDockEnv, start: tuple[float, float], goal: tuple[floa
 
 
 def sail(observation: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-    """Return keys and durations u `[N]` by a rule of thumb: the key that leads to the goal best, as far as it helps.
+    """Return keys and durations u `[N]` by a rule of thumb: press the best key towards the goal as long as it helps.
 
     Args:
-        observation: in pixels, `[N, 15]`.
-        directions: of the keys, `[N, 3, 2]`.
+        observation: observation in pixels, `[N, 15]`.
+        directions: directions of the keys, `[N, 3, 2]`.
     """
     to_goal = observation[:, 2:4] - observation[:, 9:11]
     distance, key = torch.einsum("nd,nkd->nk", to_goal, directions).max(-1)
-    seconds = torch.linspace(0.0, 0.2, 2001)  # up to .2 s a longer press carries further
+    seconds = torch.linspace(0.0, 0.2, 2001)  # up to 0.2 s, a longer press carries further
     nearest = torch.searchsorted(released.reach(seconds), distance.clamp(0.0, LONGEST)).clamp(max=2000)
     return key, seconds[nearest] / 2.5 - 1.0
 
 
 def play(controller: str, idle: int) -> tuple[Tensor, Tensor]:
-    """Press `idle` times for no time, then sail; return the returns and the outcomes `[LAYOUTS]`."""
+    """Press `idle` times with duration 0, then sail, and return the returns and the outcomes `[LAYOUTS]`."""
     env = ReleasedBoatDockEnv(LAYOUTS, controller=controller, keymap=1)
     td = env.reset(env.fixed_episodes(0))
     directions = torch.tensor(released.DIRECTIONS[controller])[-1].expand(LAYOUTS, 3, 2)
@@ -61,7 +61,7 @@ def play(controller: str, idle: int) -> tuple[Tensor, Tensor]:
 
 
 def refuelling() -> None:
-    """Print what idling before sailing is worth."""
+    """Print the effect of idling before sailing on the return."""
     for controller in BOATS:
         for idle in (0, IDLE):
             total, outcome = play(controller, idle)
@@ -73,7 +73,7 @@ def refuelling() -> None:
 
 
 def throws() -> None:
-    """Print how far presses carry, and the share of durations that throws backwards."""
+    """Print how far presses carry, and the fraction of durations that throw backwards."""
     for seconds in (0.1, 0.2, 0.29, 0.31, 0.5, 1.0, 5.0):
         px = released.reach(torch.tensor(seconds, dtype=torch.float64))
         print(f"a press of {seconds:.2f} s (u = {seconds / 2.5 - 1:+.3f}) carries {px:,.1f} px")
@@ -83,9 +83,9 @@ def throws() -> None:
 
 
 def walls() -> None:
-    """Print what the four walls do, and what a tank burnt empty costs."""
+    """Print the effects of the four walls, and the cost of an empty tank."""
     env = ReleasedBoatDockEnv()
-    # The congruent keys go down left, up and down right; u = -.92 carries 67 px.
+    # The congruent keys go down left, up and down right; u = -0.92 carries 67 px.
     courses = (
         ("left", (580.0, 500.0), 0),
         ("upper", (640.0, 450.0), 1),
@@ -105,7 +105,7 @@ def walls() -> None:
 
 
 def random_presses() -> None:
-    """Print what uniformly random presses reach."""
+    """Print the results of uniformly random presses."""
     env = ReleasedBoatDockEnv(LAYOUTS)
     env.reset(env.fixed_episodes(0))
     generator = torch.Generator().manual_seed(0)
@@ -123,7 +123,7 @@ def random_presses() -> None:
 
 
 def frozen_layouts() -> None:
-    """Print how many layouts an environment meets."""
+    """Print the number of layouts of an environment."""
     for is_frozen in (True, False):
         env = ReleasedBoatDockEnv(frozen_layouts=is_frozen)
         seen = set()

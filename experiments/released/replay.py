@@ -27,7 +27,7 @@ TOLERANCE = {"float64": 1e-9, "float32": 1e-3}  # relative for numbers beyond 1
 
 
 def replay(episodes: list[dict[str, Any]], dtype: str = "float64") -> tuple[int, float]:
-    """Return the number of steps compared and the largest difference, infinite where a flag differs."""
+    """Return the number of compared steps and the largest difference, which is infinite if a flag differs."""
     steps = 0
     worst = 0.0
     for number, name in enumerate(CONTROLLERS):
@@ -39,7 +39,7 @@ def replay(episodes: list[dict[str, Any]], dtype: str = "float64") -> tuple[int,
 
 
 def _replay_boat(controller: str, episodes: list[dict[str, Any]], dtype: str) -> float:
-    """Replay episodes of one boat side by side; return the largest difference."""
+    """Replay episodes of one boat side by side, and return the largest difference."""
     env = ReleasedBoatDockEnv(len(episodes), controller=controller, dtype=dtype)
     layout = {"start": _column(episodes, "start"), "goal": _column(episodes, "goal")}
     if controller == "incongruent":
@@ -47,7 +47,7 @@ def _replay_boat(controller: str, episodes: list[dict[str, Any]], dtype: str) ->
     td = env.reset(TensorDict(layout, [len(episodes)]))
     worst = _difference(td[keys.OBSERVATION], _column(episodes, "observation0"))
     for t in range(max(len(episode["steps"]) for episode in episodes)):
-        # In episodes that are over, the last press is repeated; it changes nothing.
+        # Episodes that are over repeat the last press, which changes nothing.
         recorded = [episode["steps"][min(t, len(episode["steps"]) - 1)] for episode in episodes]
         is_running = torch.tensor([t < len(episode["steps"]) for episode in episodes])
         action = {
@@ -71,7 +71,7 @@ def _column(rows: list[dict[str, Any]], name: str) -> torch.Tensor:
 
 
 def _difference(mine: torch.Tensor, recorded: torch.Tensor) -> float:
-    """Return the largest difference, relative for numbers beyond 1; infinite where the shapes differ."""
+    """Return the largest difference, relative for numbers beyond 1, and infinite if the shapes differ."""
     if mine.shape != recorded.shape:
         return float("inf")
     relative = (mine.double() - recorded).abs() / recorded.abs().clamp(min=1.0)

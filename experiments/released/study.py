@@ -1,4 +1,4 @@
-"""Draw and tabulate what learners reach under the rules of the released environment.
+"""Draw and tabulate the learners' results under the rules of the released environment.
 
 python experiments/released/study.py FOLDER...   gathers the finished runs in these folders into learned.csv and
                                                  curves.csv, then draws and tabulates
@@ -54,7 +54,7 @@ def _order(row: dict[str, Any]) -> tuple[int, str]:
 
 
 def table(rows: Rows) -> str:
-    """Return a line for each learner and boat, with its seeds side by side: they differ too much for a mean."""
+    """Return a line for each learner and boat, with single seeds, which differ too much for a mean."""
     lines = [
         "| learner | boat | trained | return, by seed | docks in | idles to the limit in | presses an episode |",
         "|---|---|---|---|---|---|---|",

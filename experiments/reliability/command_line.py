@@ -1,4 +1,4 @@
-"""Run the command line in processes forked from this one, which has its imports done: hundreds of runs cost minutes."""
+"""Run the command line in processes forked after the imports, so that hundreds of runs take only minutes."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ REPOSITORY = Path(__file__).parents[2]
 
 @dataclass(frozen=True)
 class Ending:
-    """How a run ended.
+    """The end of a run.
 
     Attributes:
-        code: exit code; negative: the signal that killed it; None: it was still running after the time allowed.
-        errors: what it wrote to stderr, without progress bars.
+        code: exit code. If negative, the signal that killed the run. If None, the run exceeded its time.
+        errors: lines on stderr, without progress bars.
     """
 
     code: int | None
@@ -30,12 +30,12 @@ class Ending:
 
     @property
     def is_one_line(self) -> bool:
-        """Whether the run told of a mistake, or of another end, in one line."""
+        """Whether the run reported a mistake, or another end, in one line."""
         return self.code not in (0, None) and len(self.errors) == 1 and "Traceback" not in self.errors[0]
 
 
 def start(words: list[str], folder: Path) -> multiprocessing.Process:
-    """Start `run.py` with these words in a process of its own, with `folder` as its working directory."""
+    """Start `run.py` with these words in a separate process, with `folder` as its working directory."""
     folder.mkdir(parents=True, exist_ok=True)
     process = multiprocessing.get_context("fork").Process(target=_main, args=(words, folder))
     process.start()
@@ -43,7 +43,7 @@ def start(words: list[str], folder: Path) -> multiprocessing.Process:
 
 
 def finish(process: multiprocessing.Process, folder: Path, seconds: float = 120.0) -> Ending:
-    """Wait for a run; one that takes longer is killed."""
+    """Wait for a run, and kill it if it takes longer than `seconds`."""
     process.join(seconds)
     code = process.exitcode
     if code is None:

@@ -1,4 +1,4 @@
-"""Train on Gymnasium environments, each with a fault of its own, and list how the runs end."""
+"""Train on Gymnasium environments, each with a different fault, and list how the runs end."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ FAULTS = {
 
 
 class Faulty(gymnasium.Env):
-    """An environment of no interest, with one of the faults."""
+    """A trivial environment with one of the faults."""
 
     made = 0
 

@@ -21,7 +21,7 @@ KINDS = ("files", "environments", "data", "requests")
 
 
 def cases(kinds: list[str], agents: Path, contents: int, seed: int) -> Iterator[Case]:
-    """Yield the cases of these kinds; `contents` is the number of changed checkpoints."""
+    """Yield the cases of these kinds, among them `contents` changed checkpoints."""
     if "files" in kinds:
         yield from saved_files.cases(saved_files.train_agents(agents), contents, seed)
     if "environments" in kinds:

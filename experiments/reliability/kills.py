@@ -1,4 +1,4 @@
-"""Kill runs at random moments, resume each, and compare it with the run that nobody killed."""
+"""Kill runs at random moments, resume each, and compare it with an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RUNS = {
 
 
 def scores(folder: Path) -> list[dict[str, str]]:
-    """Return the rows of a run's metrics, without the column that no two runs share."""
+    """Return the rows of a run's metrics without the column of times, which differ between all runs."""
     with (folder / "metrics.csv").open() as file:
         return [{name: value for name, value in row.items() if name != "wall_s"} for row in csv.DictReader(file)]
 
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def kill_and_resume(name: str, folder: Path, whole: Path, moment: float, count: dict[str, int]) -> None:
-    """Kill a run after `moment` seconds, perhaps twice, resume it to its end, and count what came of it."""
+    """Kill a run after `moment` seconds, perhaps twice, resume it to its end, and count the result."""
     process = command_line.start([*RUNS[name], *COMMON, "hydra.run.dir=run"], folder)
     process.join(moment)
     process.kill()

@@ -1,4 +1,4 @@
-"""Run with wrong settings, one at a time, and list those that are not refused in one line."""
+"""Run with wrong settings, one at a time, and list the settings that are not refused in one line."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ import yaml
 
 CONF = command_line.REPOSITORY / "conf"
 SMALL = ["num_envs=4", "steps_per_batch=2", "total_frames=16", "eval.layouts=4", "eval.every=0"]
-# What lets learners and selectors make an update in so short a run.
+# Settings with which learners and selectors make an update in so short a run.
 SHORT = {
     "warmup_steps": 8, "warmup_decisions": 8, "minibatch_size": 8, "updates_per_step": 0.5,
     "updates_per_decision": 0.5, "codec_pretrain_updates": 2,
 }  # fmt: skip
 DEFAULTS = {"high": "ucb", "low": "hyar"}
-# What a value of each type can never be.
+# Values that are wrong for each type.
 WRONG: dict[type, tuple[str, ...]] = {
     int: ("banana", "[1,2]", "-7", "1.5", "nan", "1e12", "null"),
     float: ("banana", "[1,2]", "-1e30", "nan", "1e30"),
@@ -29,12 +29,12 @@ WRONG: dict[type, tuple[str, ...]] = {
     str: ("banana", "[a]", "7"),
     list: ("banana", "-3", "[banana]", "{a:1}"),
 }
-# Options that take any word, or any number of that size.
+# Settings that take any word, or any number of that size.
 FREE = {
     ("logger", "project"), ("logger", "entity"), ("logger", "group"), ("logger", "name"), ("run", "seed"),
     ("data", "checksum"), ("env", "kwargs"), ("run", "low.checkpoint"), ("run", "eval.stop_score"),
 }  # fmt: skip
-# What goes with a choice of a group, so that nothing but the wrong value is wrong.
+# Settings that go with a choice of a group, so that only the wrong value is wrong.
 WITH = {
     "env/gymnasium": ["env.id=hpamdp/BoatDock-v0", "high=none", "low=random"],
     "env/platform": ["high=none", "low=random"],
@@ -77,7 +77,7 @@ BY_HAND = [
 
 
 def generated() -> list[str]:
-    """Return words with a wrong value of each option of each yaml."""
+    """Return words with a wrong value for each setting of each yaml file."""
     words = []
     for file in sorted(CONF.glob("*/*.yaml")):
         group, choice = file.parent.name, file.stem
@@ -93,7 +93,7 @@ def generated() -> list[str]:
 
 
 def short(given: list[str]) -> list[str]:
-    """Return the words that make the warm-ups of the chosen learner and selector short."""
+    """Return the words that shorten the warm-ups of the chosen learner and selector."""
     chosen = DEFAULTS | dict(word.split("=", 1) for word in given if word.startswith(("high=", "low=")))
     words = []
     for group, choice in chosen.items():
@@ -115,7 +115,7 @@ def _is_number(value: Any) -> bool:
 
 
 def main() -> None:
-    """Print what was not refused in one line, and the counts."""
+    """Print the cases that were not refused in one line, and the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=300, help="all of those by hand, the rest drawn of the generated")
     parser.add_argument("--seed", type=int, default=0)

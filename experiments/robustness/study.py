@@ -47,12 +47,12 @@ AGENT_COLUMNS = ("agent", "boat", "trained_with", "seed")
 
 
 def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, float | str]]:
-    """Yield a row for each noise and level: how well a run's agent does.
+    """Yield a row with the score of a run's agent for each noise and level.
 
     Args:
         run: a finished run.
-        evaluations: those made so far, by the options of their environment, to which new ones are added: planning their
-            layouts takes longer than playing them.
+        evaluations: evaluations so far, by the settings of their environment. New ones are added, since planning
+            their layouts takes longer than playing them.
     """
     device = torch.device("cpu")
     overrides = ["mode=eval", f"checkpoint={run.folder}"]
@@ -83,7 +83,7 @@ def score(run: Run, evaluations: dict[str, Evaluation]) -> Iterator[dict[str, fl
 
 
 def add(runs: Sequence[Run]) -> None:
-    """Score the agents of runs and write results.csv after each, in which its rows replace those of the same agent."""
+    """Score the agents of runs, and replace each agent's rows in results.csv."""
     evaluations: dict[str, Evaluation] = {}
     for run in tqdm(runs):
         new = list(score(run, evaluations))
@@ -97,7 +97,7 @@ def _agent(row: dict[str, Any]) -> list[Any]:
 
 
 def table(rows: Rows) -> str:
-    """Return a line for each agent and noise: the score at each level, mean and standard deviation over seeds."""
+    """Return a line for each agent and noise: mean and standard deviation of the score over seeds at each level."""
     lines = ["| agent | boat | trained with | noise | level: score |", "|---|---|---|---|---|"]
     cases = groups(rows, "agent", "boat", "trained_with", "noise").items()
     for (agent, boat, trained_with, noise), of_case in cases:
@@ -109,7 +109,7 @@ def table(rows: Rows) -> str:
 
 
 def gains_table(rows: Rows) -> str:
-    """Return a line for each noise that H-PPO was trained with alone: what that gains with this noise and without."""
+    """Return a line for each single noise of H-PPO's training: the gain in score with this noise and without it."""
     lines = ["| H-PPO trained with | gain at that noise (95 %) | without noise (95 %) |", "|---|---|---|"]
     rows = [row for row in rows if row["agent"] == "hppo"]
     for (trained_with,), of_training in groups(rows, "trained_with").items():
@@ -135,7 +135,8 @@ def _scores(rows: Rows, noise: str, level: float) -> list[float]:
 def draw(rows: Rows, path: Path) -> None:
     """Draw scores on the congruent boat against the level of each noise.
 
-    Above: all agents trained without noise. Below: H-PPO trained without, with this noise, and with all three.
+    The upper row shows all agents trained without noise. The lower row shows H-PPO trained without noise, with this
+    noise, and with all three.
     """
     figure = Figure(figsize=(12.0, 7.2), layout="constrained")
     above, below = figure.subplots(2, len(LEVELS), sharey=True)

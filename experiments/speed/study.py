@@ -1,12 +1,12 @@
-"""Time an update of every learner beside its matrix products alone.
+"""Time an update of every learner, and compare it with the time of its matrix products alone.
 
 python experiments/speed/study.py            prints the table of results.csv
 python experiments/speed/study.py run        measures all learners with one thread, renews results.csv, prints the table
 python experiments/speed/study.py run hppo   measures some learners alone
 
-The products are those that the very updates made, forward and backward: they are noted as PyTorch runs them, and made
-again on other numbers of the same shapes and strides. Both are timed in turns, in CPU time, which leaves out the turns
-of other processes; the fastest turn of each counts.
+The products are those of the timed updates, forward and backward. They are recorded while PyTorch runs them, and
+repeated on random numbers of the same shapes and strides. Updates and products are timed in turns, in CPU time, which
+leaves out other processes. The fastest turn of each counts.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from hpamdp.run.assemble import AssembledRun, assemble
 
 HERE = Path(__file__).resolve().parent
 LEARNERS = ["hppo", "pdqn", "hyar", "hsac", "paddpg", "dlpa", "pets", "iql", "td3_bc"]
-# So many updates a turn that whatever is done every few updates is done in each: HyAR's codec every 10.
+# Each turn has enough updates to include periodic work, such as HyAR's codec every 10 updates.
 UPDATES = 20
 TURNS = 6
-STORED = 20_000  # steps before the first turn; fewer where the learner's budget is small
+STORED = 20_000  # steps before the first turn; fewer if the learner's budget is small
 ATEN = torch.ops.aten
 PRODUCTS = {ATEN.mm.default, ATEN.addmm.default, ATEN.bmm.default, ATEN.baddbmm.default}
 
@@ -42,7 +42,7 @@ Product = tuple[Callable[..., Tensor], list[Any], dict[str, Any]]
 
 
 class Products(TorchDispatchMode):
-    """Notes the matrix products that are made under it, with random numbers in the place of their own."""
+    """Record the matrix products inside the block, with random numbers in place of their operands."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ class Products(TorchDispatchMode):
         self._same: dict[Any, Tensor] = {}
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run an operation; note it if it is a product."""
+        """Run an operation, and record it if it is a product."""
         kwargs = kwargs or {}
         if func in PRODUCTS:
             self.made.append((func, [self._like(each) for each in args], kwargs))
@@ -61,7 +61,7 @@ class Products(TorchDispatchMode):
             return each
         place = (each.dtype, each.shape, each.stride())
         if place not in self._same:
-            self._same[place] = torch.randn_like(each)  # keeps the strides of what fills its memory
+            self._same[place] = torch.randn_like(each)  # keeps the strides of a tensor without gaps
         return self._same[place]
 
 
@@ -76,12 +76,12 @@ def make(name: str, folder: Path) -> tuple[AssembledRun, Learner, int]:
 
 
 def _of(name: str) -> list[str]:
-    """Return settings that keep the time before the first update short and change nothing of an update."""
+    """Return settings that shorten the time before the first update without changing an update."""
     return ["low.codec_pretrain_updates=10"] if name == "hyar" else []
 
 
 def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int, Learner]:
-    """Return what makes updates, how many it makes (with H-PPO the optimisation steps of a batch), and the learner."""
+    """Return a function that makes updates, their number (for H-PPO, optimisation steps), and the learner."""
     parts, learner, batch_size = make(name, folder)
     collector = Collector(
         parts.env, parts.policy, frames_per_batch=batch_size, total_frames=-1, auto_register_policy_transforms=False
@@ -100,7 +100,7 @@ def updates_of(name: str, folder: Path) -> tuple[Callable[[], object], int, Lear
 
 
 def measure(name: str) -> dict[str, Any]:
-    """Return a row of the table: CPU ms of an update, plain, compiled, and with bfloat16, and of its products."""
+    """Return a row of the table: CPU ms of an update (plain, compiled and with bfloat16) and of its products."""
     with tempfile.TemporaryDirectory() as folder:
         update, num_updates, learner = updates_of(name, Path(folder))
     update()
@@ -134,7 +134,7 @@ def measure(name: str) -> dict[str, Any]:
 
 
 def in_turns(update: Callable[[], object], floor: Callable[[], object], num_updates: int) -> list[float]:
-    """Return the CPU ms that each takes for an update, in its fastest turn."""
+    """Return the CPU ms per update of both functions, in their fastest turns."""
     best = [float("inf"), float("inf")]
     for _ in range(TURNS):
         for i, run in enumerate((update, floor)):

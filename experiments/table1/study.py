@@ -103,7 +103,7 @@ def gather(runs: Sequence[Run]) -> dict[str, Rows]:
 
 
 def missing_runs(tables: dict[str, Rows]) -> list[str]:
-    """Return a line for each experiment, learner and boat that lacks some of its three runs."""
+    """Return a line for each experiment, learner and boat with missing runs."""
     experiments = {
         "table1": [row for row in tables["results"] if row["reward"] == "shaped"],
         "sparse": [row for row in tables["results"] if row["reward"] == "sparse"],
@@ -156,7 +156,7 @@ def summarise(results: Rows) -> Rows:
 
 
 def _above_next(results: Rows, low: str, boat: str) -> str:
-    """Return how much a learner is above the next best one on this boat; empty for the last one."""
+    """Return the difference of a learner to the next best one on this boat; empty for the last one."""
     scores = {name: [run["score"] for run in _of(results, name, boat)] for name in LEARNERS}
     ranking = sorted((name for name in LEARNERS if scores[name]), key=lambda name: -np.mean(scores[name]))
     place = ranking.index(low) + 1
@@ -167,7 +167,7 @@ def ceilings(results: Rows) -> dict[str, float]:
     """Return the ceiling of each boat, which is the same in all runs.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the runs have different ceilings.
     """
     found = {}
     for boat in BOATS:
@@ -224,7 +224,7 @@ def table(rows: Rows, results: Rows) -> str:
 
 
 def reward_table(results: Rows) -> str:
-    """Return a line for each learner: its scores after training with either reward, and the difference."""
+    """Return a line for each learner with its scores after training with each reward, and the difference."""
     columns = [f"{boat}, {what}" for boat in BOATS for what in (*REWARDS, "sparse less shaped (95 %)")]
     lines = [f"| learner | {' | '.join(columns)} |", "|---|---|---|---|---|---|---|"]
     for low in LEARNERS:
@@ -270,7 +270,7 @@ def _first_at_human_score(rows: Rows) -> dict[str, Any] | None:
 
 
 def _range(rows: Sequence[dict[str, Any] | None], column: str) -> str:
-    """Return the smallest and the largest value, and how many runs have one if some have none (None)."""
+    """Return the smallest and the largest value, and the number of runs with a value if some have None."""
     values = [row[column] for row in rows if row is not None]
     share = f"{len(values)} of {len(rows)} seeds"
     if not values:

@@ -1,8 +1,8 @@
-"""One environment at a time in plain Python: lean stand-ins for the published code of the field's domains.
+"""Simulate the field's domains in plain Python, as lean stand-ins for their published code.
 
-They have its loops and its arithmetic on floats, but neither its NumPy arrays nor its checks, and so are faster.
-Each is a generator function `(random) -> iterator`: one `next` is one action of a uniformly random agent, with new
-episodes where they end.
+The stand-ins have the published loops and float arithmetic. They lack the NumPy arrays and the checks, so they are
+faster. Each is a generator function `(random) -> iterator`. One `next` is one action of a uniformly random agent, and
+a new episode starts when one ends.
 """
 
 from __future__ import annotations

@@ -1,16 +1,16 @@
-"""Measure how many steps a second the environments make on one core; write results.csv and print the figures.
+"""Measure the environments' steps per second on one core, write results.csv and print the figures.
 
 Run: python experiments/throughput/throughput.py [--seconds 1] [--device cpu]
 
-Each figure is the fastest of many short trials of one process on one core, by its CPU time, which leaves out the turns
-of other processes; its peers are measured beside it in the same run:
+Each figure is the fastest of many short trials of one process on one core. CPU time leaves out the turns of other
+processes. The environments to compare with are measured in the same run:
 - boats, one: `gymnasium.make`, beside Gymnasium's own CartPole;
 - boats, many: Gymnasium's vector environment, `BoatDockEnv.step_and_maybe_reset` by the kernel and by the tensor
   functions (as they are and, with --compiled, compiled), beside Gymnasium's vectorised NumPy CartPole;
 - the field's domains: the TorchRL and the Gymnasium environments, beside one environment in plain Python
   (`originals.py`).
 
-Actions are random, from a pool of eight that was sampled before; episodes start anew where they end.
+Actions are random, from a pool of eight samples. A new episode starts when one ends.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ POOL = 8
 
 
 def rate(step: Callable[[], object], steps_per_call: int, seconds: float) -> float:
-    """Return the steps a second of CPU time of the fastest of many trials of a few milliseconds."""
+    """Return the steps per second of CPU time in the fastest of many trials of a few milliseconds."""
     for _ in range(POOL + 2):
         step()
     calls, ended = 1, time.perf_counter() + seconds
@@ -80,7 +80,7 @@ def env_stepper(env: PAMDPEnv) -> Callable[[], object]:
 
 
 def by_tensor_functions(num_envs: int) -> BoatDockEnv:
-    """Return boats that the tensor functions move, uncompiled: what durations that require gradients lead to."""
+    """Return boats that the uncompiled tensor functions move, since their durations require gradients."""
     env = BoatDockEnv(num_envs)
     td = env.rand_action(env.reset())
     td[keys.PARAMETERS] = td[keys.PARAMETERS].requires_grad_()
@@ -115,7 +115,7 @@ def vector_stepper(env_id: str, num_envs: int) -> Callable[[], object]:
 
 
 def boats(num_envs: int, device: str, is_compiled: bool) -> dict[str, Callable[[], Callable[[], object]]]:
-    """Return what makes each function to time, by its name in the table."""
+    """Return factories of the functions to time, by their names in the table."""
     makers = {
         "CartPole-v1, Gymnasium vector": lambda: vector_stepper("CartPole-v1", num_envs),
         "boats, Gymnasium vector": lambda: vector_stepper("hpamdp/BoatDock-v0", num_envs),

@@ -108,7 +108,7 @@ def make_env(config: Config, num_envs: int, device: torch.device, seed: int, fir
 
 
 def check_built(config: Config, env: PAMDPEnv) -> None:
-    """Check the rules about the problem, some of which had to wait for the environment; warn of a ceiling out of reach.
+    """Check the rules about the problem, and warn if its ceiling is out of reach.
 
     Raises:
         ConfigError: the settings do not go with the problem.

@@ -1,4 +1,4 @@
-"""What a replay needs of each domain: a module here with its names, `DOMAINS`, and a class `DomainAdapter`."""
+"""Adapters for replays. The module of a domain has the names of its recordings, `DOMAINS`, and a `DomainAdapter`."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ SCHEMA = 1  # of the files
 
 
 class Adapter(Protocol):
-    """A domain's rules, as a replay calls them. N is the number of rows, each of another episode or step.
+    """The interface of a domain's rules for replays. N is the number of rows, each of another episode or step.
 
     Attributes:
-        outcomes: what the recordings call each of our outcomes, "" while an episode goes on.
+        outcomes: the recordings' name of each of our outcomes, "" while an episode continues.
         angles: columns that count modulo 2 pi.
-        float32_tolerance: the largest difference of a single step in float32 that is rounding alone.
+        float32_tolerance: the largest rounding error of a single step in float32.
     """
 
     outcomes: tuple[str, ...]
@@ -29,28 +29,28 @@ class Adapter(Protocol):
     def __init__(self, recording: dict[str, Any]) -> None: ...
 
     def states(self, rows: Sequence[Sequence[float]], taken: Sequence[int], dtype: torch.dtype) -> Any:
-        """Return our states from recorded ones, as `state_names` orders them, after so many actions each."""
+        """Return our states from recorded ones, in the order of `state_names`, after `taken` actions each."""
 
     def act(self, state: Any, steps: Sequence[dict[str, Any]]) -> tuple[Any, dict[str, Tensor]]:
-        """Return the states after the recorded steps, with the recorded random numbers, and what the steps tell.
+        """Return the states after the recorded steps, with the recorded random numbers, and the steps' results.
 
-        The latter `[N]` each, by their names in the recording: `reward` and, where an action has ticks, `ticks`.
+        The results are tensors `[N]` by their names in the recording: `reward` and, if an action has ticks, `ticks`.
         """
 
     def observe(self, state: Any) -> Tensor:
         """Return the observations `[N, observation_dim]`, as they are recorded."""
 
     def named(self, state: Any) -> dict[str, Tensor]:
-        """Return the columns `[N]` that are to be compared."""
+        """Return the columns `[N]` to compare."""
 
     def columns(self, rows: Sequence[Sequence[float]]) -> dict[str, Tensor]:
         """Return the same columns of recorded states, float64 `[N]`."""
 
 
 class DirectAdapter:
-    """The parts of an adapter whose recorded columns are ours, one by one.
+    """The parts of an adapter whose recorded columns equal ours, one by one.
 
-    A subclass gives `state_type` and the names that our columns have in the recordings, where they differ.
+    A subclass gives `state_type`, and the recorded names of columns if they differ.
     """
 
     angles: tuple[str, ...] = ()
@@ -63,12 +63,12 @@ class DirectAdapter:
         self.state_names: list[str] = recording["state_names"]
 
     def columns(self, rows: Sequence[Sequence[float]]) -> dict[str, Tensor]:
-        """Return our columns that are recorded, float64 `[N]`."""
+        """Return our recorded columns, float64 `[N]`."""
         table = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(self.state_names))
         return {ours: table[:, self.state_names.index(name)] for ours, name in self.recorded_names.items()}
 
     def states(self, rows: Sequence[Sequence[float]], taken: Sequence[int], dtype: torch.dtype) -> Any:
-        """Return our states; what is not recorded is 0."""
+        """Return our states, with 0 in columns that are not recorded."""
         recorded = self.columns(rows)
         zeros = torch.zeros(len(rows), dtype=torch.float64)
         columns = {name: recorded.get(name, zeros) for name in self.state_type._fields}
@@ -81,10 +81,10 @@ class DirectAdapter:
 
 
 def chosen(steps: Sequence[dict[str, Any]], like: Tensor, size: int = 1) -> tuple[Tensor, Tensor]:
-    """Return the discrete actions int64 `[N]` and their parameters `[N, size]` of steps; 0 for what an action has not.
+    """Return the discrete actions int64 `[N]` of steps, and their parameters `[N, size]`, filled with zeros.
 
     Args:
-        steps: as recorded.
+        steps: the recorded steps.
         like: a tensor of the state's dtype.
         size: the largest number of parameters of an action.
     """
@@ -94,7 +94,7 @@ def chosen(steps: Sequence[dict[str, Any]], like: Tensor, size: int = 1) -> tupl
 
 
 def limited(state: Any, max_steps: int, limit: int) -> Any:
-    """Return the states with the outcome `limit` where an episode that goes on has had its last step."""
+    """Return the states with the outcome `limit` for unfinished episodes after their last step."""
     is_late = (state.outcome == 0) & (state.steps >= max_steps)
     return state._replace(outcome=torch.where(is_late, limit, state.outcome))
 
@@ -103,7 +103,7 @@ def load(recording: dict[str, Any]) -> Adapter:
     """Return the adapter of a recording.
 
     Raises:
-        ValueError: it is no recording, or of a domain without an adapter.
+        ValueError: the file is no recording, or its domain has no adapter.
     """
     if not isinstance(recording, dict) or "domain" not in recording or "episodes" not in recording:
         raise ValueError("it has no domain and episodes")

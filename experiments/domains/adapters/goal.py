@@ -12,11 +12,11 @@ from adapters import DirectAdapter, chosen
 from hpamdp.env.goal import rules
 
 DOMAINS = ("goal", "hard_goal")
-_SPARE_TICKS = 16  # our rules look only now and then whether all actions are over
+_SPARE_TICKS = 16  # our rules check only every few ticks whether all actions are over
 
 
 class DomainAdapter(DirectAdapter):
-    """Both domains by their rules; Hard Goal's actions become Goal's as in the environment."""
+    """Goal and Hard Goal by their rules. Hard Goal's actions become Goal's, as in the environment."""
 
     outcomes = ("", "goal", "caught", "out", "limit")
     angles = ("player_angle", "keeper_angle")

@@ -15,7 +15,7 @@ DOMAINS = ("moving", "sliding")
 
 
 class DomainAdapter(DirectAdapter):
-    """Moving and Sliding by their rules; parameters are clipped as the reference does it."""
+    """Moving and Sliding by their rules. Parameters are clipped as in the reference code."""
 
     outcomes = ("", "stopped at the target", "left the field", "limit")
     angles = ("heading", "course")

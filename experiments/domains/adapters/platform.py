@@ -18,8 +18,8 @@ _SECOND_PLATFORM = 475.0  # beyond it, the second enemy is the active one
 class DomainAdapter:
     """Platform by its rules.
 
-    Of the enemies, our state has the active one alone, since the other stands still, and it has no heights, since after
-    an action the agent stands or the episode is over. The rules do not return how many ticks an action took.
+    Our state has only the active enemy, since the other stands still. It has no heights, since after an action the
+    agent stands or the episode is over. The rules do not return the number of ticks of an action.
     """
 
     outcomes = ("", "arrived", "fell", "enemy", "limit")
@@ -62,7 +62,7 @@ class DomainAdapter:
         numbers = torch.tensor([row + [0.0] * (longest - len(row)) for row in drawn], dtype=torch.float64).to(state.x)
 
         def normal(index: Tensor) -> Tensor:
-            # Our rules simulate all actions to the length of the longest one.
+            # Our rules simulate all actions for as many ticks as the longest one.
             place = (index - first).long().expand(*index.shape[:-1], len(steps))
             is_drawn = place < longest
             found = numbers.expand(*place.shape[:-1], *numbers.shape) if place.dim() > 1 else numbers
@@ -73,5 +73,5 @@ class DomainAdapter:
         return limited(after, 200, rules.TIME_LIMIT), {"reward": (after.x - state.x) / rules.END}
 
     def observe(self, state: rules.PlatformState) -> Tensor:
-        """Return the observations in [0, 1], as gym-platform gives them."""
+        """Return the observations in [0, 1], as in gym-platform."""
         return (rules.observe(state) + 1.0) / 2.0

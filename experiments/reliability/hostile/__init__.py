@@ -1,1 +1,1 @@
-"""Hostile cases, a file for each way in; `python experiments/reliability/hostile_round.py` runs them."""
+"""Hostile cases, one file for each kind of input. `python experiments/reliability/hostile_round.py` runs them."""

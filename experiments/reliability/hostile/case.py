@@ -1,4 +1,4 @@
-"""One hostile case: what is done, how it may end, and how it ended."""
+"""Play one hostile case in a forked process, and classify its end."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TRACEBACK, SILENT, HARM = "traceback", "wrong in silence", "harm"
 BAD = (TRACEBACK, SILENT, HARM)
 
 _PATIENCE_S = 60.0
-_MOST_MEMORY_KB = 1_500_000  # beside what the process had when it was forked
+_MOST_MEMORY_KB = 1_500_000  # beyond the memory of the process when it was forked
 _ADDRESS_SPACE = 8 << 30  # bytes, so that no case takes the machine's memory
 # Errors that the command line prints as one line.
 _ONE_LINE = (ConfigError, DataError, ProblemError)
@@ -34,10 +34,10 @@ class Case:
     """A hostile input.
 
     Attributes:
-        kind: of the inputs, a row of the table.
-        name: says what was done.
-        act: does it in an empty folder. It returns `ACCEPTED`, or one of `BAD` with a reason after a colon. It raises
-            what the program raises.
+        kind: kind of the input, a row of the table.
+        name: description of the input.
+        act: function that uses the input in an empty folder. It returns `ACCEPTED`, or one of `BAD` with a reason after
+            a colon, and lets the program's errors pass.
         must_be_refused: whether accepting the input is a wrong result.
         refusals: further errors that count as one line, such as the ValueError of a constructor.
     """
@@ -50,7 +50,7 @@ class Case:
 
 
 def play(case: Case) -> str:
-    """Run a case in a forked process and return how it ended: one of the constants, with a reason after a colon."""
+    """Run a case in a forked process, and return its end: one of the constants, with a reason after a colon."""
     receiver, sender = multiprocessing.get_context("fork").Pipe(duplex=False)
     with tempfile.TemporaryDirectory() as folder:
         process = multiprocessing.get_context("fork").Process(target=_act, args=(case, Path(folder), sender))

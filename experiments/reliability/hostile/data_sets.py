@@ -1,4 +1,4 @@
-"""Files of played episodes and data sets with wrong lines, rows and values."""
+"""Make files of played episodes and data sets with wrong lines, rows and values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hpamdp.env.platform.environment import PlatformEnv
 from .case import ACCEPTED, HARM, SILENT, Case
 
 sys.path.insert(0, str(command_line.REPOSITORY / "tests"))
-from play_players import docked  # episodes that a page would send
+from play_players import docked  # episodes of a page's form
 
 VALUES: list[Any] = [
     None, True, "3", "word", "", [], [1], {}, {"a": 1}, -1, 0, 1e308, -1e308, float("nan"), float("inf"), 10**30,
@@ -116,7 +116,7 @@ class _Lines:
 
 @dataclass(frozen=True)
 class _Special:
-    """Read from a path that is no file of episodes."""
+    """Read from a path that is not a file of episodes."""
 
     path: str
 
@@ -172,7 +172,7 @@ def _matters(key: Any, change: str) -> bool:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Make a data set of transitions of which one value is another one."""
+    """Make a data set of transitions with one changed value."""
 
     transitions: Any
     key: Any

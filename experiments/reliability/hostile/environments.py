@@ -1,4 +1,4 @@
-"""Gymnasium environments that return a value which their spaces do not hold, judged by a rule of our own."""
+"""Make Gymnasium environments that return values outside their spaces, judged by a separate rule."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ MASKS: list[Any] = [
 
 
 class Strange(gymnasium.Env):
-    """An environment with a leaf `leaf` in its observation, which returns a given value from a given step on."""
+    """An environment whose observation has a leaf `leaf`, with a given value from a given step on."""
 
     def __init__(
         self,
@@ -236,7 +236,7 @@ def _written(value: Any) -> str:
 
 @dataclass(frozen=True)
 class _Play:
-    """Play some steps; a value that the space holds must be taken."""
+    """Play some steps; a value in the space must be accepted."""
 
     leaf: spaces.Space
     place: str
@@ -263,7 +263,7 @@ def _steps(kwargs: dict[str, Any]) -> tuple[GymnasiumEnv, TensorDict]:
 
 @dataclass(frozen=True)
 class _Masked:
-    """Play an environment that forbids the second action; no forbidden one may be taken without a word."""
+    """Play an environment that forbids the second action, which must not be taken without a message."""
 
     name: str
     value: Any

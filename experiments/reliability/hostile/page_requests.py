@@ -1,4 +1,4 @@
-"""Requests to the server of a problem's page: bodies, headers and bytes that no page sends."""
+"""Make hostile requests to the server of a problem's page: bodies, headers and bytes that no page sends."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _post(body: bytes, *headers: str) -> bytes:
 
 @dataclass(frozen=True)
 class _Request:
-    """Send bytes to a server; it must answer or close, keep its file right, and serve the next one."""
+    """Send bytes to a server, which must answer or close, keep its file right, and serve the next request."""
 
     text: bytes
 

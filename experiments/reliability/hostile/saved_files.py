@@ -1,4 +1,4 @@
-"""Checkpoints and policies with right checksums and wrong contents, with code, with links, and too large."""
+"""Make hostile checkpoints and policies: wrong contents with right checksums, code, links, and huge tensors."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ AGENTS = {
     ],
 }
 SECRET = "hpamdp-hostile-secret"
-# What a run writes, by which a link in somebody's folder could lead elsewhere.
+# Files that a run writes; in somebody else's folder, each could be a link to another place.
 WRITTEN = (
     *("summary.json", "config.yaml", "metrics.csv", "metrics.csv.previous", "metrics.csv.draft", "evaluation.npz"),
     *("checkpoint.zip", "policy.pt", "checkpoint.diverged.zip", "episodes.gif", "trajectories.png", "learning.png"),
@@ -46,7 +46,7 @@ Members = dict[str, Any]
 
 
 def train_agents(folder: Path) -> dict[str, Path]:
-    """Train a small agent of each kind; return their folders."""
+    """Train a small agent of each kind, and return the folders."""
     folders = {}
     for name, words in AGENTS.items():
         folders[name] = folder / name
@@ -56,7 +56,7 @@ def train_agents(folder: Path) -> dict[str, Path]:
 
 
 def cases(agents: dict[str, Path], number: int, seed: int) -> Iterator[Case]:
-    """Yield `number` cases of changed contents, and all others."""
+    """Yield `number` cases of changed contents, and all other cases."""
     chance = random.Random(seed)
     members = {name: _members(folder / "checkpoint.zip") for name, folder in agents.items()}
     yield from _changed_contents(agents, members, number, chance)
@@ -89,7 +89,7 @@ def _write(members: Members, file: Path, compression: int = zipfile.ZIP_STORED) 
         archive.writestr("manifest.json", json.dumps(manifest))
 
 
-# Each returns the new value, or raises LookupError if it has nothing to do with this one.
+# Each function returns the new value, or raises LookupError if the change does not apply to the value.
 def _shaped(value: Any, change: Callable[[torch.Tensor], Any]) -> Any:
     if not isinstance(value, torch.Tensor):
         raise LookupError
@@ -120,7 +120,7 @@ def _other(value: Any, new: Any) -> Any:
     return new
 
 
-# Name, change, and whether a program that accepts it computes with something wrong.
+# Name, change, and whether a program that accepts the change computes with wrong values.
 CHANGES: list[tuple[str, Callable[[Any], Any], bool]] = [
     ("a tensor holds NaN", lambda v: _shaped(v, lambda t: _spoiled(t, float("nan"))), True),
     ("a tensor holds infinity", lambda v: _shaped(v, lambda t: _spoiled(t, float("inf"))), True),
@@ -168,7 +168,7 @@ def _places(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 
 
 def _changed(value: Any, path: tuple[Any, ...], change: Callable[[Any], Any]) -> Any:
-    """Return a copy with the value at a path as `change` gives it."""
+    """Return a copy in which `change` is applied to the value at a path."""
     if not path:
         return change(value)
     if isinstance(value, tuple):
@@ -181,14 +181,14 @@ def _changed(value: Any, path: tuple[Any, ...], change: Callable[[Any], Any]) ->
 def _changed_contents(
     agents: dict[str, Path], members: dict[str, Members], number: int, chance: random.Random
 ) -> Iterator[Case]:
-    """Yield resumptions and evaluations of checkpoints of which one entry is another one, or is missing."""
+    """Yield resumptions and evaluations of checkpoints with one changed or missing entry."""
     made = 0
     while made < number:
         agent = chance.choice([*agents])
         member = chance.choice([*members[agent], "manifest", "recorder", "rng", "collection"])
         path = chance.choice([*_places(members[agent][member])])
         if (member == "manifest" and path[:2] == ("progress", "config")) or path[:1] == ("members",):
-            continue  # the config has cases of its own
+            continue  # the config has separate cases
         name, change, is_wrong = chance.choice([*CHANGES, ("an entry is missing", _delete, False)])
         try:
             if change is _delete:
@@ -200,7 +200,7 @@ def _changed_contents(
         if member == "manifest" and not _is_json(state):
             continue
         made += 1
-        # An evaluation may leave alone what only training needs.
+        # An evaluation may ignore entries that only training needs.
         way = chance.choice(["resume", "resume", "resume", "checkpoint"])
         is_wrong = is_wrong and (way == "resume" or member == "agent")
         where = ".".join(map(str, (member, *path)))
@@ -235,7 +235,7 @@ def _without(value: Any, path: tuple[Any, ...]) -> Any:
 
 @dataclass(frozen=True)
 class _Resume:
-    """Go on with changed contents, or evaluate them."""
+    """Resume or evaluate changed contents."""
 
     agent: Path
     way: str
@@ -262,7 +262,7 @@ CODE = {
 
 
 def _code(agents: dict[str, Path]) -> Iterator[Case]:
-    """Yield files whose config names code, secrets or other files, for every way in."""
+    """Yield files whose config names code, secrets or other files, for every way to open them."""
     changes = [*_strange_groups(), *_strange_settings()]
     ways = [(way, name) for way in ("eval", "watch", "low.checkpoint") for name in ("checkpoint.zip", "policy.pt")]
     for what, change in changes:
@@ -310,7 +310,7 @@ def _strange_settings() -> Iterator[Change]:
 
 
 def _choice(group: str, name: Any) -> Callable[[dict], None]:
-    """Return a change of the name that was chosen for a group; earlier versions kept it in the group."""
+    """Return a change of the choice of a group, which earlier versions stored in the group."""
 
     def change(config: dict) -> None:
         config.get("choices", config[group])[group if "choices" in config else "name"] = name
@@ -343,7 +343,7 @@ def build(*args, **kwargs): return Canary()
 
 @dataclass(frozen=True)
 class _OpenConfig:
-    """Open a file whose config was changed; nothing that it names may run, and no secret may be written."""
+    """Open a file with a changed config. Nothing that it names may run, and no secret may be written."""
 
     agent: Path
     way: str
@@ -387,7 +387,7 @@ class _OpenConfig:
 
 
 def _links(agents: dict[str, Path]) -> Iterator[Case]:
-    """Yield runs in folders in which a file leads elsewhere by a symbolic or a hard link."""
+    """Yield runs in folders in which a file is a symbolic or hard link to another place."""
     for name in WRITTEN:
         for way in ("resume", "overwrite"):
             for link in ("symbolic", "hard"):
@@ -401,7 +401,7 @@ def _links(agents: dict[str, Path]) -> Iterator[Case]:
 
 @dataclass(frozen=True)
 class _Linked:
-    """Run in a folder in which one file is a link to a file elsewhere, which must stay as it is."""
+    """Run in a folder with a link to a file in another place, which must not change."""
 
     agent: Path
     name: str
@@ -434,7 +434,7 @@ class _Linked:
 
 
 def _bombs(agents: dict[str, Path], members: dict[str, Members]) -> Iterator[Case]:
-    """Yield small files that stand for much memory."""
+    """Yield small files that claim much memory."""
     for agent, state in members.items():
         for member in state:
             if member == "manifest":
@@ -460,7 +460,7 @@ class _Bomb:
     name: str
 
     def __call__(self, folder: Path) -> str:
-        # Written by another process, whose memory does not count.
+        # Another process writes the file, so that its memory does not count.
         writer = os.fork()
         if writer == 0:
             state, value = self.members[self.member], BOMBS[self.name]()
