@@ -58,7 +58,7 @@ def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1
     low, high = axes.get_ylim()
     labels = sorted(labels)
     heights = [(height - low) / (high - low) for height, _, _ in labels]
-    for height, place, (_, text, colour) in zip(heights, _apart(heights, 0.064), labels, strict=True):
+    for height, place, (_, text, colour) in zip(heights, apart(heights, 0.064), labels, strict=True):
         axes.plot(
             [ends, 1.03],
             [height, place],
@@ -71,7 +71,7 @@ def label_ends(axes: Axes, labels: list[tuple[float, str, str]], ends: float = 1
         axes.annotate(text, (1.04, place), xycoords="axes fraction", color=colour, va="center", fontsize=8.5)
 
 
-def _apart(heights: list[float], gap: float) -> list[float]:
+def apart(heights: list[float], gap: float) -> list[float]:
     """Move sorted heights at least `gap` apart. A cluster keeps its mean, and no height exceeds 1."""
     clusters: list[list[float]] = []
     for height in heights:

@@ -25,7 +25,7 @@ def program() -> str:
 def setting(name: str, text: str) -> str:
     """Return `name=text` as one word for the shell, whatever letters the text has."""
     is_plain = _PLAIN.fullmatch(text) and text.lower() not in _NO_TEXT
-    return f"{name}={text}" if is_plain else for_shell(f"{name}={_for_hydra(text)}")
+    return f"{name}={text}" if is_plain else for_shell(f"{name}={for_hydra(text)}")
 
 
 def path_setting(name: str, path: Path) -> str:
@@ -42,7 +42,7 @@ def for_shell(word: str) -> str:
     return f"$'{''.join(letters)}'"
 
 
-def _for_hydra(text: str) -> str:
+def for_hydra(text: str) -> str:
     """Return a text in double quotes, in which only quotes, `${` and backslashes before them are special."""
     text = re.sub(r"(\\*)\$\{", r"\1\1\\${", text)
     text = re.sub(r'(\\*)"', r'\1\1\\"', text)

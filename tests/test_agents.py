@@ -10,7 +10,7 @@ from conftest import choices, compose_config, make_config
 
 from hpamdp.config.errors import ConfigError
 from hpamdp.run import checkpoint
-from hpamdp.run.play import _agent, own_agents
+from hpamdp.run.play import described, own_agents
 from hpamdp.run.players import load_player
 from hpamdp.run.resume import resolve
 from hpamdp.run.train import run
@@ -95,5 +95,5 @@ def test_a_foreign_summary_gives_a_score_or_none(tmp_path):
     player = SimpleNamespace(agent=SimpleNamespace(exported=dict), config=make_config(["high=none"]))
     for text in ('{"score": NaN}', '{"score": "<b>"}', "[1]", "{}", "[" * 99_999, '{"score": null}', '{"score": true}'):
         (tmp_path / "summary.json").write_text(text)
-        agent = _agent(tmp_path, player)
+        agent = described(tmp_path, player)
         assert agent is not None and agent["score"] is None, text[:20]

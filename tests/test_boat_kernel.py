@@ -72,8 +72,9 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
         env.seed_evaluation(seed)
     td = env.reset()
     by_tensors = BoatDockEnv(num_envs, seed=seed, first_env=7, **rules)
-    by_tensors.rows = None
-    by_tensors._streams = env._streams
+    by_tensors.leave_kernel()
+    if is_evaluation:
+        by_tensors.seed_evaluation(seed)
     generator = torch.Generator().manual_seed(seed)
     outcomes, num_different = set(), 0
     for _ in range(num_steps):
@@ -81,7 +82,7 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
         before = env.state
         option = action[keys.OPTION] if env.has_choice else None
         is_idle = before.outcome != physics.SAILING
-        moved, reward, _ = by_tensors._advance(before, option, action[keys.DISCRETE], action[keys.PARAMETERS], is_idle)
+        moved, reward, _ = by_tensors.advance(before, option, action[keys.DISCRETE], action[keys.PARAMETERS], is_idle)
         for name, leaf in action.items():
             if name != keys.OPTION or env.has_choice:
                 td[name] = leaf
@@ -89,15 +90,15 @@ def play(num_envs: int, num_steps: int, seed: int, is_evaluation: bool = False, 
         after = td["next"]
         same = after[keys.OUTCOME] == moved.outcome
         num_different += int((~same).sum())
-        by_tensors._columns = moved
-        reading = by_tensors._read()
+        by_tensors.state = moved
+        reading = by_tensors.read()
         for name in ("observation", "fuel", "done", "terminated", "truncated"):
             left, right = after[name][same].float(), reading[name][same].float()
             assert torch.allclose(left, right, atol=1e-3 if rules.get("observation") == "pixels" else 3e-5), name
         assert torch.allclose(after[keys.REWARD][same, 0], reward[same], atol=1e-5)
         # What starts anew is compared from the same state, too.
         done = after[keys.DONE][:, 0]
-        fresh = by_tensors._restart(moved, done)
+        fresh = by_tensors.restart(moved, done)
         is_other_try = (env.state.start_x - fresh.start_x).abs() > 1.0
         num_different += int((is_other_try & same).sum())
         same = same & ~is_other_try
@@ -217,4 +218,4 @@ def test_a_boat_for_gymnasium_needs_no_torch():
 
 def test_a_change_of_any_source_compiles_kernels_anew():
     cached = kernels.kernel(play)._cache._cache_file
-    assert cached._source_stamp == kernels._sources()
+    assert cached._source_stamp == kernels.sources()

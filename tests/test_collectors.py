@@ -26,7 +26,7 @@ from hpamdp.run import checkpoint
 from hpamdp.run.assemble import assemble
 from hpamdp.run.collection.base import CollectionError, WorkerDiedError
 from hpamdp.run.collection.limits import limit_of
-from hpamdp.run.collection.ray import _check_answers
+from hpamdp.run.collection.ray import check_answers
 from hpamdp.run.collection.worker import (
     EnvShard,
     PolicyCopy,
@@ -36,7 +36,7 @@ from hpamdp.run.collection.worker import (
     WorkingDir,
     packed,
 )
-from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, _call
+from hpamdp.run.collection.workers import WorkerCollection, WorkerOptions, call_worker
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.train import run
 
@@ -71,7 +71,7 @@ def leaves(batch):
 
 
 def policies_of_workers(collection):
-    return collection._on_all(lambda number: _call(collection._workers[number], "policy.policy.state_dict"))
+    return [call_worker(worker, "policy.policy.state_dict") for worker in collection.workers]
 
 
 def assert_same_state(one, other):
@@ -307,8 +307,8 @@ class Mortal(WorkerCollection):
     def _death(self, worker, error):
         return "murder" if isinstance(error, EOFError) else None
 
-    def kill(self, number, at="collect"):
-        self._workers[number].deaths.append(at)
+    def have_die(self, number, at="collect"):
+        self.workers[number].deaths.append(at)
 
 
 def test_a_replaced_worker_begins_new_episodes_and_counts_no_half_ones(tmp_path):
@@ -316,7 +316,7 @@ def test_a_replaced_worker_begins_new_episodes_and_counts_no_half_ones(tmp_path)
         sums, starts = torch.zeros(8), 0
         for i in range(9):
             if i % 3 == 1:
-                collection.kill(i % 2)
+                collection.have_die(i % 2)
             before = collection.state()["root"]["observation"]
             batch = collection.next()
             assert batch.shape == (8, 3)
@@ -340,7 +340,7 @@ def test_a_replaced_worker_begins_new_episodes_and_counts_no_half_ones(tmp_path)
 def test_a_worker_that_dies_while_its_state_is_read_is_replaced_as_a_whole(at, tmp_path):
     with closing(Mortal(tmp_path, 1)) as collection:
         collection.next()
-        collection.kill(0, at)
+        collection.have_die(0, at)
         state = collection.state()
         assert (state["root"][keys.EPISODE_STEPS][:4] == 0).all()
         assert torch.equal(state["root"]["observation"][4:], collection.next()["observation"][4:, 0])
@@ -350,10 +350,10 @@ def test_the_death_after_the_last_restart_ends_the_run_with_the_last_known_state
     with closing(Mortal(tmp_path, 1)) as collection:
         collection.next()
         state = collection.state()
-        collection.kill(1)
+        collection.have_die(1)
         collection.next()
-        collection.kill(1, "env.env_state")
-        collection.kill(1)
+        collection.have_die(1, "env.env_state")
+        collection.have_die(1)
         assert collection.state() is state
         with pytest.raises(WorkerDiedError, match=r"worker 1 of 2 died \(murder\)$"):
             collection.next()
@@ -408,7 +408,7 @@ def test_a_limit_of_the_machine_is_reported_with_its_cure(error, words, tmp_path
 )
 def test_a_cluster_that_does_not_answer_is_reported_in_one_line(address):
     with pytest.raises(CollectionError, match=f"^collector.address={address}: does not answer") as raised:
-        _check_answers(address)
+        check_answers(address)
     assert "\n" not in str(raised.value)
 
 
@@ -430,11 +430,11 @@ def test_a_worker_that_is_killed_is_replaced(workers):
     collection = workers[1]
     collection.options = WorkerOptions(max_restarts=1)
     assert collection.next().shape == (8, 4)
-    first, other = collection._workers
-    collection._kill(first)
+    first, other = collection.workers
+    collection.kill(first)
     batch = collection.next()
     assert batch.shape == (8, 4) and (batch[keys.EPISODE_STEPS][:4, 0] == 0).all()
-    assert collection._workers[0] is not first and collection._workers[1] is other
+    assert collection.workers[0] is not first and collection.workers[1] is other
     (notice,) = collection.notices()
     assert "worker 0 of 2 died (" in notice and notice.endswith("; it was replaced (restart 1 of 1)")
 

@@ -133,7 +133,7 @@ def test_all_problems_come_in_one_line():
         (
             "collector",
             "hpamdp.run.collection.workers.WorkerCollection",
-            "collector=single: WorkerCollection is abstract; choose one of its subclasses, which have _death, _kill",
+            "collector=single: WorkerCollection is abstract; choose one of its subclasses, which have _death, _star",
         ),
         ("data", "hpamdp.run.loggers.CSVLogger", "data=none: CSVLogger is no Demonstrations (hpamdp.data.demonstrat"),
         ("data", "hpamdp.data.demonstrations.Demonstrations", "data=none: Demonstrations is abstract; choose one of "),

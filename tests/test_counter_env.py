@@ -134,7 +134,7 @@ def test_a_finished_episode_stays_finished_and_earns_nothing(problem):
 def test_the_limit_of_a_vehicle_may_terminate_instead(problem, by_kernel):
     env = problem(64, max_steps=2, limit="terminated")
     if not by_kernel:
-        env._columns, env.rows = env.state, None
+        env.leave_kernel()
     last, _ = play(env, random_player(), 2)
     assert (last[keys.OUTCOME] == len(env.outcomes) - 1).any()
     assert last[keys.TERMINATED].all() and last[keys.DONE].all() and not last[keys.TRUNCATED].any()
@@ -253,7 +253,7 @@ def test_a_seed_fixes_the_starts(problem):
 def test_evaluation_draws_starts_and_noise_from_streams_of_its_own_until_the_next_seed(problem):
     env = problem(4)
     # The tensor functions; what the kernels draw is compared with them in test_counter_kernels.
-    env._columns, env.rows = env.state, None
+    env.leave_kernel()
     streams = []
 
     drawn = counter_rng.rng_key

@@ -67,8 +67,8 @@ def play(env, num_steps: int, tolerance: float) -> tuple[set[int], int]:
     for _ in range(num_steps):
         td = env.rand_action(td)
         before = env.state
-        moved, reward, _ = env._advance(before, *env._action_leaves(td), before.outcome != 0)
-        fresh = env._restart(moved, moved.outcome != 0)
+        moved, reward, _ = env.advance(before, *env.action_leaves(td), before.outcome != 0)
+        fresh = env.restart(moved, moved.outcome != 0)
         td, root = env.step_and_maybe_reset(td)
         pairs = [
             *zip(env.state, fresh, strict=True),

@@ -119,7 +119,7 @@ def test_rules_stay_on_their_device(problem):
     # Not those of Goal and Platform, whose ticks go on for as long as a tensor says so.
     env = problem(4)
     if problem is HardMoveEnv:
-        env._motions = env._motions.to(META)
+        env.motions = env.motions.to(META)
     number = torch.zeros(4, dtype=torch.int32, device=META)
     rng = counter_rng.rng_key(counter_rng.seed_tensor(0, META), counter_rng.TRAINING, number, number)
     state = env.start(number, rng)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from hpamdp import figure_style as style
-from hpamdp.analysis.figures import _learning_curves, draw_all
+from hpamdp.analysis.figures import draw_all, learning_curves
 from hpamdp.env.base import Metric
 from hpamdp.env.boatdock import figures as boats
 from hpamdp.env.boatdock.environment import BoatDockEnv
@@ -66,7 +66,7 @@ def test_all_figures_come_from_complete_files(tmp_path):
 def test_learning_curves_show_the_logged_values_between_the_references(tmp_path):
     rows = [{"frames": 10.0 * i, "eval/score": 0.5 * i, "train/score": 0.1 * i} for i in range(4)]
     summary = {"references": {"random": {"score": -0.9}, "human": {"success": 0.9}, "ceiling": {"score": 3.6}}}
-    figure = _learning_curves(rows, summary, (Metric("score", "Score"), Metric("success", "Success", "share")))
+    figure = learning_curves(rows, summary, (Metric("score", "Score"), Metric("success", "Success", "share")))
     (axes,) = [axes for axes in figure.axes if axes.axison]
     assert axes.get_title() == "Score"
     lines = {tuple(line.get_ydata()) for line in axes.lines}
@@ -209,16 +209,16 @@ def test_foreign_files_run_no_code_and_their_figures_are_left_out(tmp_path, caps
 
 def test_labels_stand_apart_near_their_lines_and_in_order():
     heights = [0.1, 0.9, 0.95, 0.96, 0.97, 1.0]
-    placed = style._apart(heights, 0.06)
+    placed = style.apart(heights, 0.06)
     assert np.diff(placed).min() > 0.06 - 1e-9
     assert placed[0] == 0.1 and placed[-1] <= 1.02
-    assert style._apart([0.3, 0.5], 0.06) == [0.3, 0.5]
+    assert style.apart([0.3, 0.5], 0.06) == [0.3, 0.5]
 
 
 def test_the_best_possible_score_is_of_both_boats_only_where_the_agent_chose():
     evaluation = {"score": np.array([2.0]), "controller": np.array([1]), "optimum": np.array([[3.5, 3.0]])}
-    assert boats._episode_title({**evaluation, "option": np.array([1])}, 0) == "2.00 / 3.50  C"
-    assert boats._episode_title({**evaluation, "option": np.array([-1])}, 0) == "2.00 / 3.00  C"
+    assert boats.episode_title({**evaluation, "option": np.array([1])}, 0) == "2.00 / 3.50  C"
+    assert boats.episode_title({**evaluation, "option": np.array([-1])}, 0) == "2.00 / 3.00  C"
 
 
 def test_a_problem_that_draws_nothing_gets_its_learning_curves(tmp_path):
@@ -238,4 +238,4 @@ def test_the_choice_of_other_boats_is_drawn_by_their_names(tmp_path):
         evaluation = dict(arrays)
     figure = boats.draw(evaluation, {"boats": ["a", "b", "c"]})["choices.png"]
     assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == ["a", "b", "c"]
-    assert boats._episode_title(evaluation, 0, ("a", "b", "c")).endswith(("  a", "  b", "  c"))
+    assert boats.episode_title(evaluation, 0, ("a", "b", "c")).endswith(("  a", "  b", "  c"))

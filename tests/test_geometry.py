@@ -49,7 +49,7 @@ def vehicle_columns(env, seen: torch.Tensor) -> dict[str, torch.Tensor]:
 
 def goal_columns(env, seen: torch.Tensor) -> dict[str, torch.Tensor]:
     low, high = torch.tensor(goal_rules.OBSERVATION_LOW), torch.tensor(goal_rules.OBSERVATION_HIGH)
-    raw = low + (seen + 1.0) * 0.5 * (high - low) if env._is_scaled else seen
+    raw = low + (seen + 1.0) * 0.5 * (high - low) if env.options.observation == "scaled" else seen
     columns = dict(zip(goal_rules.OBSERVATION_NAMES, raw.unbind(-1), strict=True))
     return {name: columns.get(name, column) for name, column in env.env_state().items()}
 

@@ -64,7 +64,7 @@ class Opener:
             archive.writestr("manifest.json", manifest if isinstance(manifest, str) else json.dumps(manifest))
         try:
             self.trainer.restore(self.file)
-            self.trainer._continue(self.collection)
+            self.trainer.continue_run(self.collection)
         except ConfigError:
             if not {*changed} & {"collection", "recorder"}:  # which are checked after the agent is complete
                 assert not [part for part in self.replays() if len(part)]

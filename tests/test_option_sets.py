@@ -45,7 +45,7 @@ def test_problems_suggest_options():
     env = HardMoveEnv(n=6)
     quadrants = env.default_options
     assert sorted(number for actions in quadrants.values() for number in actions) == list(range(64))
-    north_east = env._motions[quadrants["north_east"]]
+    north_east = env.motions[quadrants["north_east"]]
     assert len(north_east) > 5 and (north_east >= 0).all()
 
 

@@ -154,7 +154,7 @@ def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
     words = [f"low={low}", f"high={high}", "num_envs=16", "steps_per_batch=4", "total_frames=1024", "log_every=64"]
     words += ["eval.every=0", "eval.layouts=4", f"hydra.run.dir={tmp_path}", "agent.uniform_option_steps=1024"]
     words += ["env=rooms", "agent.termination=learned"] if high == "option_critic" else []
-    settings = make_config([f"low={low}"]).low.options
+    settings = make_config([f"low={low}"]).low.settings
     words += [f"low.{name}={value}" for name, value in FEW.items() if name in settings]
     assert forked(run, [*words, *QUICK.get(low, []), *QUICK.get(high, [])]) == 0
     columns = {name for row in read_rows(tmp_path / "metrics.csv") for name in row}

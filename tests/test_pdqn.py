@@ -376,13 +376,13 @@ def test_rewards_are_stored_scaled():
 
 
 def test_the_published_recipe_has_the_published_settings_and_runs_where_there_are_no_initial_parameters():
-    options = make_config(["low=pdqn_published", "high=none", "env=platform"]).low.options
+    settings = make_config(["low=pdqn_published", "high=none", "env=platform"]).low.settings
     expected = dict(
         bounding="inverting_gradients", max_grad_norm=10.0, critic_lr=1e-3, actor_lr=1e-4, critic_tau=0.1,
         actor_tau=0.001, epsilon_final=0.01, epsilon_episodes=1000, parameter_noise=0.0, twin=False,
         target_smoothing=0.0, policy_delay=1, initial_parameters="domain", multipass=True,
     )  # fmt: skip
-    assert {name: options[name] for name in expected} == expected
-    learner = make(**{name: value for name, value in options.items() if name != "budget"})
+    assert {name: settings[name] for name in expected} == expected
+    learner = make(**{name: value for name, value in settings.items() if name != "budget"})
     learn(learner, 3)
     assert learner.updates > 0

@@ -173,7 +173,7 @@ def test_lines_that_are_no_episodes_are_named_and_the_others_read(tmp_path, caps
             path = tmp_path / "a.jsonl"
             path.write_bytes(b"\xef\xbb\xbf" + f"{good[0]}\r\n".encode() + line + f"\n\n{good[1]}\n{good[2]}".encode())
             assert len(played_file.read(path).episodes) == 3
-            episodes._warn_once.cache_clear()
+            episodes.warn_once.cache_clear()
             said = capsys.readouterr().err
             assert said.startswith(f"{path}: 1 of 4 lines left out: line 2 ({problem}") and said.count("\n") == 1, line
             assert main(["check", str(path)]) == 2

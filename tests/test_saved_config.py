@@ -20,7 +20,7 @@ from hpamdp.config.saved import needs_trust, read_saved
 from hpamdp.config.schema import Config
 from hpamdp.messages import one_line
 from hpamdp.run.checkpoint import progress_of
-from hpamdp.run.play import _permissions
+from hpamdp.run.play import permissions
 from hpamdp.run.resume import check_saved_options
 from hpamdp.run.train import run
 
@@ -216,7 +216,7 @@ def test_play_accepts_a_guarded_setting_if_repeated_or_if_the_file_is_trusted(co
     assert 'env.recording="gone.jsonl": set by' in command(*play)[2]
     # Then the file is looked for.
     assert "there is no such file" in command(*play, "trust=true")[2]
-    assert _permissions(str(tmp_path), make_config([]), ["env.recording=null", "env.slip=0"]) == ["env.recording=null"]
+    assert permissions(str(tmp_path), make_config([]), ["env.recording=null", "env.slip=0"]) == ["env.recording=null"]
 
 
 def test_no_file_gives_itself_trust(of_toy, command, tmp_path):

@@ -22,7 +22,7 @@ from hpamdp.files import replacing
 from hpamdp.messages import say
 from hpamdp.run import train
 from hpamdp.search_path import put_working_directory_last
-from hpamdp.shell import _for_hydra, path_setting, setting
+from hpamdp.shell import for_hydra, path_setting, setting
 
 FOLDERS = [
     "sweep",
@@ -346,9 +346,9 @@ def test_the_commands_of_the_recording_tell_a_full_device_too(tmp_path, capsys, 
 def test_the_printed_command_continues_the_run_when_pasted(command, tmp_path, monkeypatch):
     folder = "my runs/lr=0.1,seed=[1] it's $5"
     small = ["high=fixed", "low=random", "num_envs=2", "steps_per_batch=2", "eval.layouts=2", "film=false"]
-    assert command(*small, "total_frames=4", f"hydra.run.dir={_for_hydra(folder)}")[0] == 0
+    assert command(*small, "total_frames=4", f"hydra.run.dir={for_hydra(folder)}")[0] == 0
     assert (tmp_path / folder / "checkpoint.zip").is_file()
-    err = command(*small, "total_frames=8", f"hydra.run.dir={_for_hydra(folder)}")[2]
+    err = command(*small, "total_frames=8", f"hydra.run.dir={for_hydra(folder)}")[2]
     told = err.partition("continue it with ")[2].partition(", take another")[0]
-    code, out, err = command(*shlex.split(told), "total_frames=8", f"hydra.run.dir={_for_hydra(folder)}")
+    code, out, err = command(*shlex.split(told), "total_frames=8", f"hydra.run.dir={for_hydra(folder)}")
     assert code == 0 and "8 frames" in out, err

@@ -37,7 +37,7 @@ def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
     rows = read_rows(output_dir / "metrics.csv")
     evaluation = _read_evaluation(output_dir / "evaluation.npz")
     with mpl.rc_context(STYLE):
-        curves = _learning_curves(rows, summary, env.curves(summary))
+        curves = learning_curves(rows, summary, env.curves(summary))
         figures = {} if curves is None else {"learning_curves.png": curves}
         figures |= env.draw_figures(evaluation, summary)
         with replacing(output_dir / FIGURES_NAME) as partial:
@@ -77,9 +77,10 @@ def _series(rows: list[dict[str, float]], name: str) -> tuple[np.ndarray, np.nda
     return finite[:, 0], finite[:, 1]
 
 
-def _learning_curves(
+def learning_curves(
     rows: list[dict[str, float]], summary: Mapping[str, Any], metrics: tuple[Metric, ...]
 ) -> Figure | None:
+    """Return one panel per metric that was logged, or None if none was."""
     logged = {name for row in rows for name in row}
     shown = [metric for metric in metrics if {EVALUATION + metric.name, "train/" + metric.name} & logged]
     if not shown:

@@ -147,7 +147,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         )
         self._make_specs(low, high)
         self._place_parameters(low, high)
-        self._pure_step, self._pure_reset, self._pure_observe = self._advance, self._restart, self.observe
+        self._pure_step, self._pure_reset, self._pure_observe = self.advance, self.restart, self.observe
         if self._is_compiled:
             self._compile()
         self._set_seed(seed)
@@ -169,8 +169,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def _compile(self) -> None:
         """Compile the tensor functions."""
         arguments: Any = counter_rng.COMPILE_ARGUMENTS
-        self._pure_step = torch.compile(self._advance, **arguments)
-        self._pure_reset = torch.compile(self._restart, **arguments)
+        self._pure_step = torch.compile(self.advance, **arguments)
+        self._pure_reset = torch.compile(self.restart, **arguments)
         self._pure_observe = torch.compile(self.observe, **arguments)
 
     def kernel_settings(self) -> Sequence[float]:
@@ -200,6 +200,10 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         )
         self.rows.set_seed(int(self._seed), self._streams)
         self._state = state
+
+    def leave_kernel(self) -> None:
+        """Let the tensor functions move the environments from here on."""
+        self._columns, self.rows = self.state, None
 
     @property
     def _state(self) -> EpisodeState:
@@ -396,11 +400,11 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         """Return the keys of the episodes' noise, `[N]`."""
         return counter_rng.rng_key(self._seed, self._streams[1], self._environment, state.episode)
 
-    def _restart(self, state: EpisodeState, mask: Tensor) -> EpisodeState:
+    def restart(self, state: EpisodeState, mask: Tensor) -> EpisodeState:
         """Return the states with new episodes in the rows of `mask` `[N]`."""
         return where(mask, self._start(state.episode + 1), state)
 
-    def _advance(
+    def advance(
         self, state: EpisodeState, option: Tensor | None, discrete: Tensor, parameters: Tensor, is_idle: Tensor
     ) -> tuple[EpisodeState, Tensor, Tensor]:
         """Return the states after one action, with the time limit, the rewards, and whether the actions are valid.
@@ -441,7 +445,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             results = None
         self._has_episodes = True
         self._on_start(mask)
-        return self._read() if results is None else self._reading(results)
+        return self.read() if results is None else self._reading(results)
 
     def _on_start(self, mask: Tensor) -> None:
         """Prepare what the episodes that have just begun, in the rows of `mask` `[N]`, need beside their state."""
@@ -457,7 +461,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_step", None)
         mask = None if mask is None else mask.reshape(self.num_envs)
-        leaves = self._action_leaves(tensordict)
+        leaves = self.action_leaves(tensordict)
         if self.rows is not None:
             return self._reading(self._act(leaves, mask), has_reward=True)
         before = self._state
@@ -468,13 +472,13 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         if not is_valid.all():
             raise self.invalid_action(int((~is_valid).nonzero()[0]), *leaves)
         self._state = after
-        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+        return self.read().set(keys.REWARD, reward.unsqueeze(-1))
 
     def _step_and_maybe_reset(self, tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
         is_plain = self.rows is not None and not self._has_knowledge and tensordict.device == self.device
         if not is_plain or not self._plain_keys.issuperset(tensordict.keys()):
             return super()._step_and_maybe_reset(tensordict)
-        leaves = self._action_leaves(tensordict)
+        leaves = self.action_leaves(tensordict)
         if self.rows is None:  # the parameters require gradients
             return super()._step_and_maybe_reset(tensordict)
         results = self._act(leaves, None, restarts=True)
@@ -489,7 +493,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         root = self._reading(results, number=1, kept=kept)
         return tensordict.set("next", self._reading(results, has_reward=True)), root
 
-    def _action_leaves(self, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor, Tensor]:
+    def action_leaves(self, tensordict: TensorDictBase) -> tuple[Tensor | None, Tensor, Tensor]:
         """Return option, discrete actions and parameters, whose values are still to be checked.
 
         Parameters that require gradients end the use of the kernel.
@@ -503,7 +507,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         action = tensordict.get(keys.ACTION)
         discrete, parameters = action.get("discrete").long(), action.get("parameters").float()
         if self.rows is not None and parameters.requires_grad and torch.is_grad_enabled():
-            self._columns, self.rows = self.state, None
+            self.leave_kernel()
         return tensordict.get(keys.OPTION).long() if self._chooses else None, discrete, parameters
 
     def _act(
@@ -535,7 +539,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             names=self.action_names,
         )
 
-    def _read(self) -> TensorDict:
+    def read(self) -> TensorDict:
+        """Return what is seen of the states, without a reward."""
         if self.rows is not None:
             return self._reading(self.rows.read())
         state = self._state

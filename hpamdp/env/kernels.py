@@ -50,7 +50,7 @@ _TINY = np.float32(1e-38)
 
 
 @cache
-def _sources() -> tuple[str]:
+def sources() -> tuple[str]:
     """Return a hash of all sources that kernels are made from."""
     digest = sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
@@ -74,7 +74,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         # NUMBA_DISABLE_JIT is set. Machine code wraps integers around silently, so NumPy must not warn.
         return np.errstate(over="ignore")(function)
     # Numba keeps the code for as long as the function's own file is unchanged, even if it calls functions of others.
-    compiled._cache._cache_file._source_stamp = _sources()
+    compiled._cache._cache_file._source_stamp = sources()
     return compiled
 
 

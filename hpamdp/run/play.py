@@ -99,7 +99,7 @@ def own_agents(config: Config) -> list[dict[str, Any]]:
     files = sorted(folder.glob(f"*/{POLICY_NAME}"))
     # Most agents are for other problems, and building an agent takes half a second.
     folders = [file.parent for file in files if choices_of(progress_of(file)["config"])["env"] == config.env.name]
-    agents = [_agent(path, load_player(str(path), _ONE_EPISODE)) for path in folders]
+    agents = [described(path, load_player(str(path), _ONE_EPISODE)) for path in folders]
     return [agent for agent in agents if agent is not None]
 
 
@@ -118,8 +118,8 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
     for name in names:
         if name == "none":
             continue
-        player = load_player(name, [*_ONE_EPISODE, *_permissions(name, config, settings)])
-        agent = _agent(Path(name), player)
+        player = load_player(name, [*_ONE_EPISODE, *permissions(name, config, settings)])
+        agent = described(Path(name), player)
         if agent is None:
             raise ConfigError(
                 f"--agent {name}: {player.config.high} over {player.config.low} cannot be taken into a page"
@@ -128,7 +128,7 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
     return agents
 
 
-def _permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]:
+def permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]:
     """Return the user's permissions for an agent's config as words: guarded settings and `trust`."""
     is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
     given = [word.partition("=") for word in settings]
@@ -139,7 +139,8 @@ def _permissions(name: str, config: Config, settings: Sequence[str]) -> list[str
     ]
 
 
-def _agent(path: Path, player: Player) -> dict[str, Any] | None:
+def described(path: Path, player: Player) -> dict[str, Any] | None:
+    """Return what the page needs of an agent; None if its networks cannot be exported."""
     form = player.agent.exported()
     if form is None:
         return None

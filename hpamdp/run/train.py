@@ -221,7 +221,7 @@ class Trainer:
                 config=self.config, parts=self.parts, frames=self.frames
             )
             try:
-                self._continue(collection)
+                self.continue_run(collection)
                 self._loop(collection, request)
             except KeyboardInterrupt:  # the second signal, perhaps in the middle of an update
                 self.recorder.forget_evaluation()
@@ -242,7 +242,7 @@ class Trainer:
             finally:
                 collection.close()
 
-    def _continue(self, collection: Collection) -> None:
+    def continue_run(self, collection: Collection) -> None:
         """Restore the saved state of the collection and the random generators, if there is one."""
         if self._saved is None:
             return

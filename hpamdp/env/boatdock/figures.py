@@ -105,10 +105,11 @@ def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int
     axes.set_xlim(-HARBOUR_RADIUS - 3, HARBOUR_RADIUS + 3)
     axes.set_ylim(HARBOUR_RADIUS + 3, -HARBOUR_RADIUS - 3)  # y points down
     axes.set_aspect("equal")
-    axes.set_title(_episode_title(evaluation, episode, names), fontsize=8.5, fontweight="normal", loc="center", pad=2)
+    axes.set_title(episode_title(evaluation, episode, names), fontsize=8.5, fontweight="normal", loc="center", pad=2)
 
 
-def _episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...] = ()) -> str:
+def episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...] = ()) -> str:
+    """Return the score, the highest possible score if it is known, and the initial of the boat or option."""
     title = f"{evaluation['score'][episode]:.2f}"
     boat = int(evaluation["controller"][episode]) if "controller" in evaluation else NOT_CHOSEN
     if "optimum" in evaluation:

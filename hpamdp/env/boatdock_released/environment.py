@@ -169,7 +169,7 @@ class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
             **columns, keymap=integer_zeros + keymap, steps=integer_zeros, outcome=integer_zeros, episode=episode
         )
 
-    def _restart(self, state: ReleasedState, mask: Tensor) -> ReleasedState:
+    def restart(self, state: ReleasedState, mask: Tensor) -> ReleasedState:
         """Return the states with new episodes in the rows of `mask` `[N]`; they keep more than elsewhere."""
         episode = state.episode + 1
         rng = counter_rng.rng_key(self._seed, counter_rng.TRAINING, self._environment, episode)

@@ -78,12 +78,12 @@ class HardMoveEnv(PointEnv[HardMoveState]):
         self.parameter_low, self.parameter_high = (-1.0,) * 2**n, (1.0,) * 2**n
         self.discrete_names = tuple(f"{number:0{n}b}" for number in range(2**n))
         motions = rules.motions(n, rounded=self.options.rounded_directions)
-        self._motions = motions.to(self.device, torch.float32)
-        self._script = rules.Script(self._motions)
+        self.motions = motions.to(self.device, torch.float32)
+        self._script = rules.Script(self.motions)
 
     def kernel_settings(self) -> Sequence[float]:
         """Return the motions of all sets."""
-        return self._motions.flatten().tolist()
+        return self.motions.flatten().tolist()
 
     @property
     def observation_bounds(self) -> tuple[Sequence[float], Sequence[float]]:
@@ -114,8 +114,8 @@ class HardMoveEnv(PointEnv[HardMoveState]):
     @property
     def geometry(self) -> PlaneGeometry:
         """Where each set pushes; sets that push equally strongly are of one kind, to the rounding of the directions."""
-        strength = self._motions.norm(dim=-1, keepdim=True)
-        directions = torch.where(strength > 1e-6, self._motions / strength.clamp(min=1e-6), 0.0)
+        strength = self.motions.norm(dim=-1, keepdim=True)
+        directions = torch.where(strength > 1e-6, self.motions / strength.clamp(min=1e-6), 0.0)
         kinds = strength.squeeze(-1).round(decimals=2).unique(return_inverse=True)[1]
         return PlaneGeometry(
             vectors=point_agent.VECTORS,
@@ -130,7 +130,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
 
     def act(self, state: HardMoveState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[HardMoveState, Tensor]:
         """Return the states after one action and the rewards `[N]`."""
-        return rules.act(state, action.discrete, action.parameters.squeeze(-1), self._motions)
+        return rules.act(state, action.discrete, action.parameters.squeeze(-1), self.motions)
 
     def observe(self, state: HardMoveState) -> Tensor:
         """Return the observations `[N, 4]`."""

@@ -50,7 +50,8 @@ class MultiCollection(WorkerCollection):
                 auto_register_policy_transforms=False,
             )
 
-    def _kill(self, worker: MultiSyncCollector) -> None:
+    def kill(self, worker: MultiSyncCollector) -> None:
+        """End a worker at once."""
         worker.procs[0].kill()
 
     def _death(self, worker: MultiSyncCollector | None, error: Exception) -> str | None:

@@ -71,7 +71,8 @@ class RayCollection(WorkerCollection):
         finally:
             late.cancel()
 
-    def _kill(self, worker: RayCollector) -> None:
+    def kill(self, worker: RayCollector) -> None:
+        """End a worker at once."""
         import ray
 
         ray.kill(worker.remote_collectors[0])
@@ -119,7 +120,7 @@ def _connect(address: str | None, num_workers: int) -> None:
     # A local Ray takes `num_cpus` as given; with fewer CPUs than actors some actors would wait for ever.
     init: dict[str, Any] = {"address": "local", "num_cpus": num_workers, "include_dashboard": False}
     if address is not None:
-        _check_answers(address)
+        check_answers(address)
         init = {"address": address}
     on_sigterm = signal.getsignal(signal.SIGTERM)  # which Ray replaces
     working_dir = os.getcwd()
@@ -141,7 +142,7 @@ def _connect(address: str | None, num_workers: int) -> None:
         warn(f"collector.num_workers={num_workers}: the cluster has {num_cpus} CPUs; the run waits until more join it")
 
 
-def _check_answers(address: str) -> None:
+def check_answers(address: str) -> None:
     """Check that a server answers at an address of the form `HOST:PORT` or `ray://HOST:PORT`.
 
     Raises:

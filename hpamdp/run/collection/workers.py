@@ -54,7 +54,7 @@ class WorkerCollection(Collection):
     Each worker has a TorchRL collector and a thread that waits for it. If a worker dies, the others keep their episodes
     and their part of the batch. Its replacement begins new episodes, with new seeds, and collects the missing part.
 
-    A subclass starts a worker in `_start`, ends it in `_kill`, and explains its death in `_death`.
+    A subclass starts a worker in `_start`, ends it in `kill`, and explains its death in `_death`.
     """
 
     Options: ClassVar[type[WorkerOptions]] = WorkerOptions
@@ -83,7 +83,7 @@ class WorkerCollection(Collection):
         self._size = config.run.num_envs // num_workers
         self._state: dict[str, Any] = {"env": parts.env.env_state()}
         self._is_idle = False
-        self._workers: list[Any] = [None] * num_workers  # TorchRL's collector of each
+        self.workers: list[Any] = [None] * num_workers  # TorchRL's collector of each
         self._batches: list[TensorDictBase | None] = [None] * num_workers  # the memory that each writes to
         self._cpu_s = [0.0] * num_workers
         self._cpu_s_of_dead = 0.0
@@ -103,7 +103,7 @@ class WorkerCollection(Collection):
         raise NotImplementedError
 
     @abstractmethod
-    def _kill(self, worker: Any) -> None:
+    def kill(self, worker: Any) -> None:
         """End a worker at once."""
         raise NotImplementedError
 
@@ -134,7 +134,7 @@ class WorkerCollection(Collection):
 
     def _start_first(self, number: int) -> None:
         try:
-            self._workers[number] = self._start(self._shard(number))
+            self.workers[number] = self._start(self._shard(number))
         except Exception as error:
             self._raise_explained(number, error)
 
@@ -150,9 +150,9 @@ class WorkerCollection(Collection):
         limit = limit_of(error)
         if limit is not None:
             raise CollectionError(f"{self.name}: {limit}") from error
-        death = self._death(self._workers[number], error)
+        death = self._death(self.workers[number], error)
         if death is not None:
-            raise WorkerDiedError(f"{self.name}: worker {number} of {len(self._workers)} died ({death})") from error
+            raise WorkerDiedError(f"{self.name}: worker {number} of {len(self.workers)} died ({death})") from error
         raise error
 
     def _on(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
@@ -169,10 +169,10 @@ class WorkerCollection(Collection):
 
     def _attempt(self, number: int, call: Callable[[Any], _Returned]) -> _Returned:
         try:
-            if self._workers[number] is None:
+            if self.workers[number] is None:
                 with self._restarting, modules_here_last():
-                    self._workers[number] = self._start(self._shard(number, self._restarts))
-            return call(self._workers[number])
+                    self.workers[number] = self._start(self._shard(number, self._restarts))
+            return call(self.workers[number])
         except Exception as error:
             self._raise_explained(number, error)
 
@@ -194,7 +194,7 @@ class WorkerCollection(Collection):
 
     def _on_all(self, call: Callable[[int], _Returned]) -> list[_Returned]:
         """Call a function with the number of every worker in parallel, and return the results in the workers' order."""
-        futures = [self._threads.submit(call, number) for number in range(len(self._workers))]
+        futures = [self._threads.submit(call, number) for number in range(len(self.workers))]
         wait(futures)
         return [future.result() for future in futures]
 
@@ -219,14 +219,14 @@ class WorkerCollection(Collection):
 
     def _begin(self, policy: bytes) -> list[Future[TensorDictBase]]:
         """Have all workers collect their part of a batch."""
-        return [self._threads.submit(self._collect, number, policy) for number in range(len(self._workers))]
+        return [self._threads.submit(self._collect, number, policy) for number in range(len(self.workers))]
 
     def _finished(self) -> TensorDictBase:
         """Wait for all parts of the batch, and return a copy of them in the workers' order."""
         return torch.cat([part.result() for part in self._coming])
 
     def _collect(self, number: int, policy: bytes) -> TensorDictBase:
-        self._cpu_s[number], batch = self._on(number, lambda worker: _call(worker, "collect", policy))
+        self._cpu_s[number], batch = self._on(number, lambda worker: call_worker(worker, "collect", policy))
         self.cpu_s = self._cpu_s_of_dead + sum(self._cpu_s)
         if batch is not None:
             self._batches[number] = batch
@@ -255,9 +255,12 @@ class WorkerCollection(Collection):
         return self._state
 
     def _state_of(self, worker: Any) -> dict[str, Any]:
-        state = {"env": _call(worker, "env.env_state"), "generator": _call(worker, "policy.generator_state")}
+        state = {
+            "env": call_worker(worker, "env.env_state"),
+            "generator": call_worker(worker, "policy.generator_state"),
+        }
         if self._keeps_episodes:
-            state["root"] = _without_ids(_call(worker, "_carrier.to_dict"))
+            state["root"] = _without_ids(call_worker(worker, "_carrier.to_dict"))
         return state
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -270,11 +273,11 @@ class WorkerCollection(Collection):
 
             def send_to(worker: Any) -> None:
                 if saved.env:  # otherwise the worker continues the episodes that it has just begun
-                    _call(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
+                    call_worker(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
                 if saved.root is not None and self._keeps_episodes:
-                    _call(worker, "_carrier.update", _sliced(saved.root, first, self._size))
-                if len(saved.generators) == len(self._workers):
-                    _call(worker, "policy.set_generator_state", saved.generators[number])
+                    call_worker(worker, "_carrier.update", _sliced(saved.root, first, self._size))
+                if len(saved.generators) == len(self.workers):
+                    call_worker(worker, "policy.set_generator_state", saved.generators[number])
 
             self._on(number, send_to)
 
@@ -288,21 +291,21 @@ class WorkerCollection(Collection):
         """End the workers, after a short wait for the unfinished batch."""
         _, running = wait(self._coming, _PATIENCE_S)
         self._is_closing = True
-        for part, worker in zip(self._coming, self._workers, strict=False):
+        for part, worker in zip(self._coming, self.workers, strict=False):
             if part in running and worker is not None:
-                self._kill(worker)
+                self.kill(worker)
         self._threads.shutdown()
-        with ThreadPoolExecutor(len(self._workers)) as threads:
-            list(threads.map(self._end, range(len(self._workers))))
+        with ThreadPoolExecutor(len(self.workers)) as threads:
+            list(threads.map(self._end, range(len(self.workers))))
 
     def _end(self, number: int) -> None:
-        worker, self._workers[number] = self._workers[number], None
+        worker, self.workers[number] = self.workers[number], None
         if worker is not None:
             worker.shutdown()
             torch.set_num_threads(self._config.run.threads)  # which TorchRL raises
 
 
-def _call(worker: Any, method: str, *arguments: Any) -> Any:
+def call_worker(worker: Any, method: str, *arguments: Any) -> Any:
     """Return what a method of a worker's collector returns."""
     (returned,) = worker.map_fn(method, [arguments])
     return returned

@@ -132,7 +132,7 @@ def read(path: Path) -> dict[int, Episode]:
     """
     episodes, problems = read_with_problems(path)
     if problems:
-        _warn_once(f"{path}: {left_out(len(episodes) + len(problems), problems)}")
+        warn_once(f"{path}: {left_out(len(episodes) + len(problems), problems)}")
     return episodes
 
 
@@ -173,7 +173,7 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
 
 
 @cache
-def _warn_once(message: str) -> None:
+def warn_once(message: str) -> None:
     """Warn once about the lines left out of a file, however many environments read it."""
     warn(message)
 
