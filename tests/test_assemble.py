@@ -13,6 +13,7 @@ from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
+from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.option_choice import OptionChoiceEnv
 from hpamdp.env.rooms.environment import RoomsEnv
 from hpamdp.policies.base import Learner
@@ -152,7 +153,7 @@ def trained(tmp_path_factory) -> Path:
 )
 def test_learners_of_another_kind_or_size_are_refused_in_one_line(words, trained, tmp_path):
     with pytest.raises(ConfigError) as error:
-        make(make_config([*SMALL, *words.split(), f"low.checkpoint={trained}"]), tmp_path)
+        make(make_config([*SMALL, "total_frames=20000", *words.split(), f"low.checkpoint={trained}"]), tmp_path)
     line = str(error.value)
     assert line.startswith(f"low.checkpoint={trained / 'checkpoint.zip'}: ")
     assert "it holds 2 learners, but this agent has 1" in line or "of another class or size than low (" in line
@@ -270,7 +271,9 @@ def test_returns_over_frozen_learners_are_discounted_by_the_step_of_the_episode(
 
 @pytest.mark.parametrize("names", [5, "ab", [1, 2], ("a", "a")])
 def test_names_of_options_that_are_no_list_of_names_are_refused_for_every_environment(names, tmp_path, monkeypatch):
-    for cls, config in ((Crossing, crossing()), (RoomsEnv, make_config([*SMALL, "env=rooms", "low=random"]))):
-        monkeypatch.setattr(cls, "option_names", names)
+    facts = ProblemFacts(title="rooms", option_names=names, has_choice=True)
+    monkeypatch.setattr(Crossing, "option_names", names)
+    monkeypatch.setattr(RoomsEnv, "facts", classmethod(lambda cls, options: facts))
+    for words in (["env=crossing", "low=stepper"], ["env=rooms", "low=random", "high=uniform"]):
         with pytest.raises((ProblemError, ConfigError), match=r"option_names (is .* a list|has a name twice)"):
-            make(config, tmp_path)
+            make(make_config([*SMALL, *words]), tmp_path)

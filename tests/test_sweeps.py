@@ -15,12 +15,13 @@ from conftest import CONF, choices, compose_config
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from hpamdp import cli
+from hpamdp.config.command_line import completed, parse
 from hpamdp.config.components import component
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.messages import warn
 from hpamdp.run import train
+from hpamdp.run.assemble import choose_selector
 
 TINY = ["num_envs=32", "steps_per_batch=4", "eval.layouts=10", "eval.every=0", "film=false", "low=random"]
 
@@ -43,7 +44,7 @@ def jobs(monkeypatch):
 
     def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
         started.append((cfg.seed, stopped_at))
-        (folder / "config.yaml").write_text(read(cfg).to_yaml())
+        (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
         if cfg.seed == 1:
             raise ConfigError("these two\ndo not go together")
         if cfg.seed == 2:
@@ -108,13 +109,13 @@ def test_a_sweep_over_experiments_of_one_study_lies_in_its_folder_and_is_told_at
     assert command(*words)[0] == 0 and not jobs
 
 
-def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it(command, jobs, tmp_path, monkeypatch):
+def test_a_folder_of_experiments_stands_for_a_sweep_over_all_in_it(command, jobs):
     code, out, err = command("experiment=domains", "low=random")
     assert (code, err) == (0, "") and len(jobs) == len(choices("experiment/domains")) == 10
     assert "Job 0: experiment=domains/catch_point low=random\n" in out and "10 jobs: 10 finished\n" in out
-    monkeypatch.setattr(sys, "argv", ["run.py", "--multirun", "experiment=domains", "seed=0,4"])
-    flag, experiments, seeds = cli._folder_written_out(cli._parse(), CONF)[1:]
-    assert (flag, seeds) == ("--multirun", "seed=0,4") and experiments.count(",") == 9
+    line = completed(parse(["--multirun", "experiment=domains", "seed=0,4"], CONF), CONF)
+    experiments, seeds = line.words[-2:]
+    assert line.is_multirun and seeds == "seed=0,4" and experiments.count(",") == 9
 
 
 def test_a_sweep_over_experiments_with_folders_of_their_own_is_refused_until_one_is_given(command, jobs, tmp_path):
@@ -315,7 +316,7 @@ def test_a_search_maximises_the_score_skips_finished_trials_and_survives_failed_
         tried.append(cfg.low.clip)
         if len(tried) == 2:
             raise ZeroDivisionError("a bug")
-        (folder / "config.yaml").write_text(read(cfg).to_yaml())
+        (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
         summary = {"score": cfg.low.clip, "frames": cfg.total_frames, "finished": True}
         (folder / "summary.json").write_text(json.dumps(summary))
 
@@ -338,7 +339,7 @@ def test_a_search_with_a_storage_goes_on_when_it_is_started_again(command, monke
 
     def run(cfg, folder, overrides, stopped_at=None, *, may_overwrite=False, tell=warn):
         tried.append((folder.name, cfg.low.clip, stopped_at is not None))
-        (folder / "config.yaml").write_text(read(cfg).to_yaml())
+        (folder / "config.yaml").write_text(choose_selector(read(cfg)).to_yaml())
         (folder / "checkpoint.zip").touch()
         if len(tried) == 3:
             return train.INTERRUPTED
@@ -384,4 +385,5 @@ def test_every_learner_has_a_search_space_of_allowed_values(name):
         values = values_of(f"{key}={word}")
         assert default in values or min(values) <= default <= max(values), key
         for value in values:
-            component("low", name, OmegaConf.merge(node, {key.removeprefix("low."): value}))
+            settings = OmegaConf.merge(node, {key.removeprefix("low."): value})
+            component("low", name, OmegaConf.to_container(settings, resolve=True))

@@ -196,7 +196,7 @@ def test_a_run_goes_on_in_its_own_folder_with_its_own_rows_before(tmp_path):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["env.controller=congruent"], "high=none"),
+        (["env.controller=congruent", "high=ucb"], "high=none"),
         (["high=none"], "env.controller"),
         (["high=fixed", "high.option=sideways"], "incongruent, congruent"),
         (["resume=/nowhere"], "no checkpoint"),

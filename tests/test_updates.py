@@ -207,7 +207,7 @@ def test_in_bfloat16_parameters_near_a_bound_still_have_a_gradient(name):
     assert gradient[first : first + SPECS.num_parameters].min() > 0.0
 
 
-SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=32", "eval.layouts=4"]
+SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=20000", "eval.layouts=4"]
 
 
 @pytest.mark.parametrize(
