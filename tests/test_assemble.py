@@ -64,8 +64,8 @@ def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(tmp_
         ),
         (
             "high=none",
-            "high=none: env=boatdock needs a selector; use another high or env.controller=congruent, "
-            "incongruent, random",
+            "high=none: env=boatdock needs a selector; use another high or env.controller=congruent (or "
+            "incongruent, random)",
         ),
         (
             "high=ucb agent.termination=steps agent.option_length=3",

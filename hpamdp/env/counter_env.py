@@ -32,11 +32,11 @@ from hpamdp.settings import SettingError, Settings
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
-_SECONDS_A_STEP = 0.25  # in films
+_SECONDS_PER_STEP = 0.25  # in films
 
 
 class EpisodeColumns(Columns, Protocol):
-    """A `NamedTuple` of columns `[N]`, among them int32 `steps`, `outcome` and `episode`."""
+    """A `NamedTuple` of columns `[N]`; the last three are, in this order, int32 `steps`, `outcome` and `episode`."""
 
     @property
     def steps(self) -> Tensor:
@@ -72,14 +72,18 @@ class Action(NamedTuple):
 class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
     """`num_envs` copies of a problem in one batch dimension.
 
-    A subclass sets the attributes below, in its class or in `_prepare`, and defines `start`, `act` and `observe`. The
-    settings `max_steps` and `compile_rules` have their effect here. The parameters of the chosen action are clipped to
+    A subclass sets the attributes below, in its class or in `_prepare`, and defines `start`, `act` and `observe`. This
+    class implements the settings `max_steps` and `compile_rules`. The parameters of the chosen action are clipped to
     their bounds; NaN and infinite ones are refused, and so are unknown actions. The parameters of the other actions are
     never read.
 
-    On the CPU the problem's `row_kernel`, if it has one, does the work of the three functions. The tensor functions do
-    it on other devices, with compiled rules, in subclasses that replace one of the three, and from the first parameters
-    on that require gradients. The scripted action of `oracle` is always a tensor function.
+    On the CPU the problem's `row_kernel`, if it has one, does the work of the three functions. The tensor functions run
+    instead:
+    - on other devices, and with `compile_rules`;
+    - if a subclass overrides one of the three;
+    - after the first action whose parameters require gradients.
+
+    The scripted action of `oracle` is always a tensor function.
 
     Random numbers depend on the seed, the number of the environment and the episode. Training and evaluation draw
     theirs from separate streams, and so do the starts of episodes and the noise within them.
@@ -236,7 +240,8 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
             state: before the action.
             action: what is done.
             rng: keys of the episodes' noise, `[N]`.
-            is_idle: bool `[N]`: rows whose result is thrown away, since their episode is over or their step is masked.
+            is_idle: bool `[N]`: environments that do not step, because their episode is over or
+                their step is masked; their result is discarded.
         """
 
     @abstractmethod
@@ -280,7 +285,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
         states = [type(self._state)(**columns) for columns in track]
         for i in range(1, len(states) + 1):
             picture = np.array(Image.fromarray(self.draw(states[:i])).resize((size, size), Image.Resampling.LANCZOS))
-            yield from itertools.repeat(picture, max(1, round(fps * _SECONDS_A_STEP)))
+            yield from itertools.repeat(picture, max(1, round(fps * _SECONDS_PER_STEP)))
 
     @property
     def has_choice(self) -> bool:

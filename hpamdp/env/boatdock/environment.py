@@ -58,14 +58,14 @@ class BoatDockEnv(CounterEnv[BoatState]):
       an episode's first press and held until its end; with a `switch_cost`, read at every press.
 
     Args:
-        num_envs: number of boats.
+        num_envs: number of environments.
         options: the settings; None for the defaults.
         oracle: also write what the planner knows under `oracle` (`option` `[N]`; `discrete`, `parameters`
             `[N, num_options]`).
         human: also write how often people choose each option under `human` (`option` `[N, num_options]`).
-        device: where the boats live.
+        device: of the tensors.
         seed: of layouts, random controllers and noise; the global generators are neither read nor moved.
-        first_env: number of the first boat, if other processes have those before it.
+        first_env: number of the first environment, if other processes have those before it.
         settings: single settings by name, in place of those in `options`.
 
     `reset` also takes layouts to play: a tensordict with `start` and `goal` `[N, 2]` in screen px and, optionally,
@@ -91,7 +91,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
     row_kernel = staticmethod(kernel.advance)
     choice_setting: ClassVar[str] = "env.controller=choose"
     change_setting: ClassVar[str] = "env.switch_cost=0.2"
-    no_choice_setting: ClassVar[str] = "env.controller=congruent, incongruent, random"
+    no_choice_setting: ClassVar[str] = "env.controller=congruent (or incongruent, random)"
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
         Metric("human_normalised", "random 0, people 1"),
@@ -181,7 +181,7 @@ class BoatDockEnv(CounterEnv[BoatState]):
         differs between boats, only maps remain that keep the boats.
         """
         tables = self._directions()
-        found = []  # the map, which boats the boats become, and which keys their keys become
+        found = []  # (map, permutation of the controllers, permutation of the keys)
         for each in plane_maps(6):
             for order in self._orders(len(tables)):
                 rows = [_as_one_table(each, own, tables[other]) for own, other in zip(tables, order, strict=True)]

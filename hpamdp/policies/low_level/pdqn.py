@@ -19,12 +19,13 @@ Differs from the source:
 - with `search_samples` the actor is also drawn to the best of uniformly random parameters of each discrete action. The
   weight is their gain in value. A gradient alone stays on the hill that it began on;
 - with `layer_norm` the critics' layers are normalised (Ball et al. 2023, arXiv 2302.02948);
-- where only the chosen action's value matters, only its pass is computed; passes share their common terms;
+- critic updates compute only the chosen action's pass, and all passes share the state's part of the first layer;
 - networks start as PyTorch's, not as Kaiming et al. proposed;
-- the defaults are those of TD3: twin critics, whose minimum is Q everywhere, target smoothing and a delayed actor. They
-  add parameters squashed by tanh, one learning rate and one target rate for both networks, gradients of any length, and
-  Gaussian noise on the parameters besides epsilon-random actions. `pdqn_published.yaml` has the settings of Bester et
-  al. instead.
+- the defaults add what TD3 adds to DDPG: twin critics, target smoothing and a delayed actor. The actor, too, increases
+  the minimum of both critics; TD3's actor uses the first one;
+- the defaults squash parameters by tanh, do not clip gradients, and add Gaussian noise to the parameters of actions
+  that are not random. Both networks have one learning rate and one target rate. `pdqn_published.yaml` has the settings of
+  Bester et al. instead.
 
 TorchRL's DQNLoss does not fit: its value network sees the observation alone. Here Q and its target also take the
 parameters, which come from a network with a target and a loss of its own.
@@ -76,7 +77,7 @@ _MAX_TRIED = 1 << 22
 
 
 class PDQNOptions(SearchingActorOptions):
-    """Settings of `PDQN`."""
+    """Settings of `PDQN`; `python run.py low=pdqn --help` shows them together with those of all replay learners."""
 
     multipass: bool = True
     """Show the value of a discrete action its own parameters alone, as in MP-DQN; else all parameters, as in P-DQN."""
@@ -132,11 +133,11 @@ class ParameterActor(nn.Module):
         return before_tanh(self.net(state)) + self.initial(state)
 
     def bounded(self, raw: Tensor) -> Tensor:
-        """Return the parameters of raw ones."""
+        """Return parameters in [-1, 1], given those before they are bounded."""
         return InvertingGradients.apply(raw) if self.is_inverting else raw.tanh()
 
     def unbounded(self, unit: Tensor) -> Tensor:
-        """Return the raw parameters of bounded ones in [-1, 1], or of some close to them."""
+        """Return the inverse of `bounded`, after clamping parameters at a bound to values close to it."""
         return unit if self.is_inverting else unsquashed(unit)
 
 
@@ -245,7 +246,10 @@ class PDQN(ReplayLearner):
         }
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
-        """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars."""
+        """Update the critics; every `policy_delay` updates, also the actor and the targets. Return scalars.
+
+        `ReplayLearner.update` has counted this update, from 1.
+        """
         scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.options.policy_delay == 0:
@@ -255,9 +259,12 @@ class PDQN(ReplayLearner):
         return scalars
 
     def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the squared distance of Q(s, k, x) from r + discount * V(s'), where V is `value`."""
+        """Return the squared TD error, summed over the critics.
+
+        The target is r + discount * V(s'), where V is `value`.
+        """
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
-        loss = (q - self.target(sample)).square().mean(-1).sum()
+        loss = (q - self.target(sample)).square().mean(-1).sum()  # q is [num_critics, B]
         return loss, {"critic": loss, "q": q.mean()}
 
     @torch.no_grad()
@@ -274,7 +281,7 @@ class PDQN(ReplayLearner):
         return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
 
     def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss that falls with the sum of the allowed discrete actions' values."""
+        """Return minus the sum of the allowed discrete actions' values; only the actor gets its gradient."""
         raw = self.actor.raw(state)
         q = self.critics(state, self.actor.bounded(raw)).amin(0)
         value = (q if allowed is None else q * allowed).sum(-1)

@@ -60,7 +60,7 @@ class ReplayLearner(Learner):
     """A learner with its own replay buffer, which makes `updates_per_step` updates for each step that it stores.
 
     `learn` stores the steps and calls `update`, which samples and calls `update_once`. A subclass implements this
-    method: it is the box of the paper, and takes its optimization steps by `gradient_step`. The subclass also fills
+    method: the algorithm box of its paper. It calls `gradient_step` for each optimizer step. The subclass also fills
     `optimizers`, and may extend the other methods:
 
     - `transitions` or `store`: what the buffer holds;
@@ -77,6 +77,8 @@ class ReplayLearner(Learner):
         symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
         stores_own_parameters: true if the buffer holds only the parameters of the discrete action that was taken. This
             saves memory where there are many; samples then have 0 for the others.
+        slots: for each discrete action the places of its parameters among all, int64 `[num_discrete, D]`.
+        owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
         catches_up: true if the first updates make up for the steps of the warm-up.
         reward_scale: factor on the rewards that are stored.
         max_grad_norm: largest gradient norm of a gradient step; if None, there is no limit.
@@ -136,7 +138,7 @@ class ReplayLearner(Learner):
             self.store(batch, mask)
 
     def update(self, num_updates: int) -> dict[str, float]:
-        """Make updates from the stored transitions; none if a data set has no transitions for this learner."""
+        """Make updates from the stored transitions; do nothing if there are none."""
         if len(self.buffer) == 0:
             return {}
         if int(self.frames) == int(self.updates) == 0:
@@ -157,7 +159,8 @@ class ReplayLearner(Learner):
     def gradient_step(self, name: str, loss_of: LossFunction, *inputs: Inputs) -> dict[str, Tensor]:
         """Take one step of the named optimizer down the gradient of a loss; return the scalars of the loss.
 
-        The loss is compiled, in bfloat16 and its gradient clipped, as the run wants it: see `Descent.step`.
+        The settings of the run say whether it is compiled or computed in bfloat16; the gradient is clipped to
+        `max_grad_norm`. See `Descent.step`.
         """
         return self.descent.step(self.optimizers[name], loss_of, *inputs, max_grad_norm=self.max_grad_norm)
 

@@ -1,4 +1,4 @@
-"""PETS for parameterised actions: an ensemble learns the problem, every action is the first one of a plan in it.
+"""PETS for parameterised actions: learn an ensemble of models, and act by model-predictive control (MPC).
 
 Members predict the next state, the reward and the end of an episode. A plan tries every sequence of discrete actions,
 each with Gaussians of its own for their parameters. To explore, an environment follows the plans of a single member
@@ -20,8 +20,8 @@ Differs from the sources:
 - if states are not turned, the change is a linear model, fitted by least squares, plus what the networks add to it
   (`linear_part`), because a few hundred steps teach networks alone little of such a problem;
 - if states are not turned, exploring plans maximise the mean of all members' returns plus their standard deviation
-  (`posterior_sampling`, `optimism`). Single members all predict that actions without a reward so far will never have
-  one, and agree best on actions that hardly do anything;
+  (`posterior_sampling`, `optimism`). Every single member predicts no reward for actions that had none so far, so
+  planning with one member does not explore;
 - `epsilon` makes some exploratory actions random. If no ensemble member has seen a reward, all of them predict none,
   and planning alone never finds it;
 - some entries of the state change linearly with others, such as a target's offset with the agent's own place. They are
@@ -50,7 +50,7 @@ from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.specs import PAMDPSpecs
 
-_LARGEST_COPIES = 16  # of a stored step under the problem's symmetries
+_MAX_COPIES = 16  # of a stored step under the problem's symmetries
 
 
 class PETSOptions(PETSPolicyOptions):
@@ -193,7 +193,7 @@ class PETS(ReplayLearner):
         """Return stored steps under all symmetries, or of many of them each under some."""
         assert self.symmetry is not None
         num_maps = len(self.symmetry.maps)
-        copies = min(num_maps, _LARGEST_COPIES)
+        copies = min(num_maps, _MAX_COPIES)
         number = torch.arange(copies, device=stored.device).repeat_interleave(len(stored))
         if copies < num_maps:
             number = torch.randint(num_maps, number.shape, device=stored.device)
