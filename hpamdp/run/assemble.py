@@ -71,13 +71,13 @@ def assemble(config: Config, output_dir: Path) -> AssembledRun:
     specs = PAMDPSpecs.from_env(env)
     capacity.check_agent(config, specs, learners_of(config, specs), device)
     agent = make_agent(config, specs, device)
-    capacity.check_length(config, agent, with_learners(config, agent))
     if run.mode != "eval":
         set_up_updates(config, agent)
     is_new = run.mode != "eval" and run.resume is None
     data = make_data(config, env, _gamma(agent)) if is_new else None
     if is_new and run.low.checkpoint is not None:
         checkpoint.load_learners(checkpoint.find(run.low.checkpoint, "low.checkpoint"), agent, device)
+    capacity.check_length(config, agent, with_learners(config, agent))
     evaluation = make_evaluation(config, env)
     tracked, policy = acting(env, agent, config)
     return AssembledRun(tracked, policy, agent, evaluation, data, device)

@@ -24,8 +24,8 @@ Differs from the source:
 - the defaults add what TD3 adds to DDPG: twin critics, target smoothing and a delayed actor. The actor, too, increases
   the minimum of both critics; TD3's actor uses the first one;
 - the defaults squash parameters by tanh, do not clip gradients, and add Gaussian noise to the parameters of actions
-  that are not random. Both networks have one learning rate and one target rate. `pdqn_published.yaml` has the settings of
-  Bester et al. instead.
+  that are not random. Both networks have one learning rate and one target rate. `pdqn_published.yaml` has the settings
+  of Bester et al. instead.
 
 TorchRL's DQNLoss does not fit: its value network sees the observation alone. Here Q and its target also take the
 parameters, which come from a network with a target and a loss of its own.
