@@ -142,7 +142,7 @@ def offline_runs_have_data(config: Config) -> str | None:
     return None
 
 
-def levels_learn_from_what_there_is(config: Config) -> str | None:
+def levels_support_the_mode(config: Config) -> str | None:
     """Require learners and a selector that can learn from the run's own steps or data set."""
     mode, has_data = config.run.mode, config.data.cls is not None
     sources = {"train": "its own steps", "offline": "data sets"}
@@ -160,7 +160,7 @@ def levels_learn_from_what_there_is(config: Config) -> str | None:
     return None
 
 
-def sums_of_rewards_fit_a_batch(config: Config) -> str | None:
+def n_step_fits_a_batch(config: Config) -> str | None:
     """Require `low.n_step` to be at most the length of a batch."""
     n_step = max(low.settings.get("n_step", 1) for low in config.learners)
     if config.run.mode == "train" and n_step > config.run.steps_per_batch:
@@ -171,7 +171,7 @@ def sums_of_rewards_fit_a_batch(config: Config) -> str | None:
     return None
 
 
-def learners_have_the_values_that_are_compared(config: Config) -> str | None:
+def compared_learners_have_values(config: Config) -> str | None:
     """Require learners with values if the selector compares them."""
     if not getattr(config.high.cls, "asks_learners", False):
         return None
@@ -187,7 +187,7 @@ def learners_have_the_values_that_are_compared(config: Config) -> str | None:
 # Rules about the collector.
 
 
-def workers_share_the_environments(config: Config) -> str | None:
+def collector_fits_the_run(config: Config) -> str | None:
     """Require of a collector with workers its package, a mode with steps, and an equal share for each worker."""
     collector, run = config.collector, config.run
     if run.mode == "eval":  # which collects nothing
@@ -206,7 +206,7 @@ def workers_share_the_environments(config: Config) -> str | None:
     return None
 
 
-def workers_need_nothing_of_one_another(config: Config, problem: ProblemFacts) -> str | None:
+def shared_scaling_needs_one_process(config: Config, problem: ProblemFacts) -> str | None:
     """Require a single process for environments that learn a common scale."""
     if config.run.mode == "eval" or config.collector.settings.get("num_workers", 1) == 1 or problem.is_shardable:
         return None
@@ -219,7 +219,7 @@ def workers_need_nothing_of_one_another(config: Config, problem: ProblemFacts) -
 # Rules about the problem and its options.
 
 
-def the_problem_has_what_levels_need(config: Config) -> str | None:
+def problem_provides_needs(config: Config) -> str | None:
     """Require a problem with a planner or human data if a level needs one."""
     assert config.env.cls is not None
     there = constructor_arguments(config.env.cls)
@@ -231,7 +231,7 @@ def the_problem_has_what_levels_need(config: Config) -> str | None:
     return None
 
 
-def actions_are_grouped_once(config: Config, problem: ProblemFacts) -> str | None:
+def grouping_fits_levels(config: Config, problem: ProblemFacts) -> str | None:
     """Refuse `env.grouping` with levels that need the problem's own options."""
     if config.run.env.grouping is None:
         return None
@@ -243,7 +243,7 @@ def actions_are_grouped_once(config: Config, problem: ProblemFacts) -> str | Non
     return None
 
 
-def a_choice_has_a_selector(config: Config, problem: ProblemFacts) -> str | None:
+def selector_fits_the_choice(config: Config, problem: ProblemFacts) -> str | None:
     """Require a selector if the agent chooses options, and refuse one otherwise."""
     has_selector, has_choice = config.high.cls is not None, _has_choice(config, problem)
     if has_selector and not has_choice:
@@ -260,7 +260,7 @@ def a_choice_has_a_selector(config: Config, problem: ProblemFacts) -> str | None
     return None
 
 
-def plans_keep_the_option(config: Config, problem: ProblemFacts) -> str | None:
+def plans_fit_the_termination(config: Config, problem: ProblemFacts) -> str | None:
     """Refuse plans that change options if an option lasts for its episode."""
     if config.run.agent.termination != "episode" or not problem.plans_change_options:
         return None
@@ -299,7 +299,7 @@ def options_end_where_they_may(config: Config, problem: ProblemFacts) -> str | N
     return None
 
 
-def learners_of_options_have_an_option(config: Config, problem: ProblemFacts) -> str | None:
+def per_option_names_options(config: Config, problem: ProblemFacts) -> str | None:
     """Require existing options with separate learners in `low.per_option`."""
     names = _option_names(config, problem) if _has_choice(config, problem) else ()
     unknown = [name for name in config.low_of if name not in names]
@@ -333,17 +333,17 @@ RULES: tuple[Rule, ...] = (
     saved_runs_are_named,
     stop_score_needs_evaluations,
     offline_runs_have_data,
-    levels_learn_from_what_there_is,
-    sums_of_rewards_fit_a_batch,
-    learners_have_the_values_that_are_compared,
-    workers_share_the_environments,
-    the_problem_has_what_levels_need,
+    levels_support_the_mode,
+    n_step_fits_a_batch,
+    compared_learners_have_values,
+    collector_fits_the_run,
+    problem_provides_needs,
 )
 PROBLEM_RULES: tuple[ProblemRule, ...] = (
-    actions_are_grouped_once,
-    a_choice_has_a_selector,
-    plans_keep_the_option,
+    grouping_fits_levels,
+    selector_fits_the_choice,
+    plans_fit_the_termination,
     options_end_where_they_may,
-    learners_of_options_have_an_option,
-    workers_need_nothing_of_one_another,
+    per_option_names_options,
+    shared_scaling_needs_one_process,
 )
