@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt, Strict
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, PositiveInt
 from typing_extensions import Self
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -38,9 +38,17 @@ def _check_rate(rate: float) -> float:
 
 
 LearningRate = Annotated[float, AfterValidator(_check_rate)]
-# A tuple, so that the model cannot change. Python code may pass a list.
-Widths = Annotated[tuple[PositiveInt, ...], Strict(False)]
-Indices = Annotated[tuple[NonNegativeInt, ...], Strict(False)]
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+# For a tuple that Python code may give as a list, but not as anything without an order.
+FromList = BeforeValidator(_as_tuple)
+# Tuples, so that the model cannot change.
+Widths = Annotated[tuple[PositiveInt, ...], FromList]
+Indices = Annotated[tuple[NonNegativeInt, ...], FromList]
 
 
 class SettingError(ValueError):

@@ -20,6 +20,8 @@ MISTAKES = [
     (["experiment=domains/foo"], "experiment=domains/foo: no such choice; conf/experiment has domains, domains/catch"),
     (["hihg=ucb"], "hihg: no such group or value of the run (conf/config.yaml); did you mean high? It has "),
     (["~low"], "low: nothing chosen; set low=NAME"),
+    (["~low.tau"], "~low.tau: a setting cannot be removed; give it a value"),
+    (["~film"], "~film: a setting cannot be removed; give it a value"),
     # A key that isn't there.
     (["sed=3"], "sed: no such group or value of the run (conf/config.yaml); did you mean seed? It has "),
     (["+sed=3"], "sed: no such value of the run (conf/config.yaml); did you mean seed? It has "),
@@ -34,7 +36,6 @@ MISTAKES = [
     (["high=ucb", "+high.windw=3"], "high.windw: no such setting of UCB (conf/high/ucb.yaml); did you mean window? It"),
     (["high=none", "high.window=3"], "high.window: no such setting of none (conf/high/none.yaml); it has none"),
     (["low.lrr=1"], "low.lrr: no such setting of HyAR (conf/low/hyar.yaml); it has actor_lr, "),
-    (["~low.tua"], "low.tua: no such setting of HyAR (conf/low/hyar.yaml); did you mean tau? It has "),
     (["hydra.run.dri=x"], "hydra.run.dri: no such value of hydra.run; did you mean dir? It has dir"),
     # A name that leaves its group.
     (["low=../env/boatdock"], "low=../env/boatdock: no such choice; conf/low has bc, "),

@@ -321,3 +321,10 @@ def test_an_earlier_checkpoint_without_the_names_of_its_options_is_compared_only
     swapped = ["env.boats=[incongruent1,congruent]", "high=uniform"]
     assert "its agent chooses among incongruent, congruent, but" in warning(tmp_path / "boats", *swapped)
     assert "its options cannot be compared" in warning(of_toy, *swapped)
+
+
+def test_old_names_are_read_in_the_learners_of_options_too():
+    saved = make_config(["low=random"]).to_dict()
+    saved["low"]["per_option"] = {"congruent": {"name": "pdqn", "warmup_frames": 77, "twin_q": False}}
+    learner = read_saved(saved).low_of["congruent"]
+    assert learner.settings["warmup_steps"] == 77 and learner.settings["twin"] is False

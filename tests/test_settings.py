@@ -28,3 +28,9 @@ def test_a_model_and_a_single_setting_give_the_same_learner():
 def test_a_range_of_deviations_must_not_be_empty(cls):
     with pytest.raises(ValueError, match=r"min_scale=2.0: must be less than max_scale=1.0"):
         cls(SPECS, min_scale=2.0)
+
+
+def test_widths_are_a_list_or_a_tuple_and_never_a_set():
+    assert HPPO.Options(hidden_dims=[8, 4]).hidden_dims == (8, 4)
+    with pytest.raises(ValueError, match="hidden_dims"):
+        HPPO.Options(hidden_dims={8, 4})

@@ -62,3 +62,21 @@ except SystemExit as end:
 """
     done = python("-c", program, cwd=tmp_path)
     assert done.stdout == "2 False False\n" and done.stderr.count("\n") == 1, done.stderr
+
+
+def test_classes_of_a_user_are_imported_without_stand_ins(tmp_path):
+    (tmp_path / "conf/low").mkdir(parents=True)
+    (tmp_path / "conf/low/mine.yaml").write_text("_target_: mine.Mine\nbudget: {eval_every: 0}\n")
+    (tmp_path / "mine.py").write_text(
+        "from abc import ABC\nimport numpy as np\nfrom hpamdp.policies.low_level.random import Random\n\n\n"
+        "class Mine(Random, ABC):\n    def __init__(self, specs, *, weight: float = float(np.sqrt(4.0))):\n"
+        "        super().__init__(specs)\n        self.weight = weight\n"
+    )
+    words = ["--config-dir", "conf", "low=mine", "env=platform"]
+    short = ["total_frames=64", "num_envs=4", "steps_per_batch=8", "eval.layouts=4", "film=false"]
+    run = "import sys\nfrom hpamdp.cli import main\nsys.path.insert(0, '.')\nmain()\n"
+    (tmp_path / "go.py").write_text(run)
+    done = python("go.py", *words, *short, "hydra.run.dir=out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert yaml.safe_load((tmp_path / "out/config.yaml").read_text())["low"]["weight"] == 2.0
+    assert "low=mine has the settings weight" in python("go.py", *words, "--help", cwd=tmp_path).stdout

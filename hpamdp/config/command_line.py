@@ -21,7 +21,7 @@ from hpamdp import __version__
 from hpamdp.config.components import GROUPS
 from hpamdp.config.compose import beginning_of, choosing
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.config.schema import RESUME_AUTO, RunConfig
 from hpamdp.messages import first_line
 from hpamdp.shell import setting
 
@@ -154,6 +154,8 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
             raise ConfigError(f"{override.input_line}: {GRAMMAR}")
         if override.is_delete() and override.key_or_group in GROUPS:
             raise ConfigError(f"{override.key_or_group}: nothing chosen; set {override.key_or_group}=NAME")
+        if override.is_delete() and override.key_or_group.partition(".")[0] in (*GROUPS, *RunConfig.model_fields):
+            raise ConfigError(f"{override.input_line}: a setting cannot be removed; give it a value")
         is_text = override.is_sweep_override() or isinstance(override.value(), str | QuotedString | None)
         if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
             raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")

@@ -113,13 +113,14 @@ class Component:
         return ", ".join(f"{self.group}.{name}={as_json(sizes[name])}" for name in reversed(largest)) or str(self)
 
 
-def component(group: str, name: str, given: Mapping[str, Any]) -> Component:
+def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "") -> Component:
     """Check the class and the settings of a group without building the object.
 
     Args:
         group: the group, such as `low`.
         name: name of the chosen yaml file.
         given: the group's part of the config as plain values, with its `_target_`.
+        prefix: what precedes the name of a setting in messages; by default the group and a dot.
 
     Raises:
         ConfigError: a class or a setting is wrong; the message lists all mistakes in one line.
@@ -141,7 +142,7 @@ def component(group: str, name: str, given: Mapping[str, Any]) -> Component:
             f"rename the setting ({file})"
         )
     where = f"{cls.__name__}, {file}"
-    checked = validated(model, settings, f"{group}.", f"setting of {cls.__name__} ({file})", where)
+    checked = validated(model, settings, prefix or f"{group}.", f"setting of {cls.__name__} ({file})", where)
     return Component(group, name, cls, dict(checked))
 
 

@@ -75,7 +75,10 @@ def help_page(line: CommandLine, conf: Path) -> str:
 
 
 def _explained_choice(line: CommandLine, group: str) -> str:
-    cfg = compose_words([word for word in line.words if not word.startswith("hydra.")])
+    words = [word for word in line.words if not word.startswith("hydra.") or word.startswith("hydra.searchpath=")]
+    if line.flags["config-dir"] is not None:
+        words.append(f"hydra.searchpath=['{Path(line.flags['config-dir']).absolute()}']")
+    cfg = compose_words(words)
     name = str(cfg.hydra.runtime.choices[group])
     try:
         with quick_imports():

@@ -62,6 +62,9 @@ def read_saved(
     for group in groups:
         renamed = with_new_names(group, saved[group], today[group])
         values[group] = {**today[group], **renamed, TARGET: today[group][TARGET]}
+    per_option = values.get("low", {}).get("per_option")
+    if isinstance(per_option, Mapping):
+        values["low"]["per_option"] = {option: _with_new_names(choice) for option, choice in per_option.items()}
     for name, value in given.items():
         _set(values, name.split("."), value)
     config = check(values, {**choices, **names})
@@ -73,6 +76,17 @@ def read_saved(
             "the command line, or add trust=true if you trust the file"
         )
     return config
+
+
+def _with_new_names(choice: Any) -> Any:
+    """Return a choice of `low.per_option` with today's names of its settings."""
+    if not isinstance(choice, Mapping) or not is_name(choice.get("name")):
+        return choice
+    try:
+        known = plain_groups(compose([choosing("low", choice["name"])]), {}, ["low"])["low"]
+    except MissingChoiceError:  # the check of the config reports it
+        return choice
+    return with_new_names("low", choice, known)
 
 
 def needs_trust(config: Config) -> bool:

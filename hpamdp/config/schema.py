@@ -255,7 +255,7 @@ def checked_config(
     low_of = {}
     for option, (name, low) in learners.items():
         check_kind("low", name, low.get(TARGET))
-        low_of[option] = component("low", name, low)
+        low_of[option] = component("low", name, low, f"low.per_option.{option}.")
     if low_of:
         # With all their settings, so that a saved run keeps them if their yaml files change.
         in_full = {option: {**low.settings, "name": low.name} for option, low in low_of.items()}

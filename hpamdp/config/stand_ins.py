@@ -37,6 +37,11 @@ _PACKAGE = __name__.partition(".")[0]
 _modules: dict[str, ModuleType] = {}
 
 
+def is_readable(dotted: str) -> bool:
+    """Return whether a class may be imported with stand-ins: only this package is written for them."""
+    return dotted.partition(".")[0] == _PACKAGE
+
+
 @contextmanager
 def quick_imports() -> Iterator[None]:
     """Import modules of this package with stand-ins for slow libraries, unless torch has been imported already."""

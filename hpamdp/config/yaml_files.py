@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from omegaconf import DictConfig, Node, OmegaConf
 from hpamdp.config.components import GROUPS, TARGET, defaults_of, load_class, options_model
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RunConfig
-from hpamdp.config.stand_ins import quick_imports
+from hpamdp.config.stand_ins import is_readable, quick_imports
 
 _MOST_VALUES, _MOST_LEVELS = 100_000, 50
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -51,7 +52,7 @@ def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
     if not isinstance(target, Node) or not isinstance(target._value(), str):
         return {}
     try:
-        with quick_imports():
+        with quick_imports() if is_readable(target._value()) else nullcontext():
             return defaults_of(options_model(load_class(target._value()), GROUPS[group]))
     except ConfigError:  # which the check of the config raises again, with the name of the file
         return {}

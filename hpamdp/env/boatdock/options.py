@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from hpamdp.env.boatdock.task import (
@@ -19,9 +19,9 @@ from hpamdp.env.boatdock.task import (
     Rules,
 )
 from hpamdp.env.facts import ProblemFacts
-from hpamdp.settings import Fraction, Settings
+from hpamdp.settings import Fraction, FromList, Settings
 
-Degrees = Annotated[tuple[float, ...], Strict(False)]
+Degrees = Annotated[tuple[float, ...], FromList]
 _MOST_MOTOR_NOISE = 10.0
 _RESERVED = ("choose", "random")  # other values of `controller`
 
@@ -40,13 +40,13 @@ class BoatDockOptions(Settings):
     """`paper`: progress at each press, 5 x the fuel left on success, -1 on failure. `sparse`: only the success term."""
     observation: ObservationForm = "scaled"
     """`scaled` to about [-1, 1] with goal - boat appended, `[N, 16]`, or `pixels` as in the paper, `[N, 14]`."""
-    motor_noise: float | Annotated[tuple[float, ...], Strict(False)] = 0.0
+    motor_noise: float | Annotated[tuple[float, ...], FromList] = 0.0
     """Standard deviation of the log of the executed duration; [a, b]: a for the first boat, b for the second."""
     sensor_noise: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
     """Standard deviation of the observed positions, in pixels."""
     slip: Fraction = 0.0
     """Probability that a uniformly random key is pressed instead."""
-    boats: Annotated[tuple[str, ...], Field(min_length=1), Strict(False)] | None = None
+    boats: Annotated[tuple[str, ...], Field(min_length=1), FromList] | None = None
     """Names of the boats, from `controllers`. If None, people's two: incongruent (with its key map) and congruent."""
     controllers: dict[str, Degrees] = CONTROLLER_DEGREES
     """For each controller the directions in which its three keys push, in degrees: 0 to the right, 90 down.

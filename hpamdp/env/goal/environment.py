@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveInt, Strict
+from pydantic import Field, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -23,7 +23,7 @@ from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.goal import kernel, rendering, rules
 from hpamdp.env.goal.rules import Aim, GoalState
 from hpamdp.geometry import Symmetries, make_symmetries
-from hpamdp.settings import Settings
+from hpamdp.settings import FromList, Settings
 
 Slip = Literal["kick_to", "goal_distance", "keeper_projection"]
 HardSlip = Literal["kick_to", "goal_distance", "keeper_projection", "middle_shots"]
@@ -38,7 +38,7 @@ class GoalOptions(Settings):
     """`scaled` to [-1, 1], which orientations and the ball can leave, or `raw` positions, velocities and angles."""
     noise: Annotated[float, Field(ge=0.0, le=5.0)] = 1.0
     """Factor on the published noise of all motions; 0 means no noise. From about 10 on, a run might never end."""
-    repaired: Annotated[tuple[Slip, ...], Strict(False)] = ()
+    repaired: Annotated[tuple[Slip, ...], FromList] = ()
     """Slips of the published code to take out. With any of them, published scores do not compare.
 
     `kick_to`: a kick to (x, y) goes to (x, x), so that y is never read. `goal_distance`: below the goal and behind its
@@ -52,7 +52,7 @@ class GoalOptions(Settings):
 class HardGoalOptions(GoalOptions):
     """Settings of `HardGoalEnv`."""
 
-    repaired: Annotated[tuple[HardSlip, ...], Strict(False)] = ()  # type: ignore[assignment]
+    repaired: Annotated[tuple[HardSlip, ...], FromList] = ()  # type: ignore[assignment]
     """Slips of the published code to take out, those of Goal and `middle_shots`.
 
     `middle_shots`: the middle stretch is a single point, y = 1.402, and not [-1.402, 1.402], so that no shot goes to

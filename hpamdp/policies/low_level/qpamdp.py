@@ -32,7 +32,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, Strict, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -45,7 +45,7 @@ from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
 from hpamdp.policies.shared.sized_by_data import SizedByData
-from hpamdp.settings import Fraction, PositiveFraction, SettingError, Settings
+from hpamdp.settings import Fraction, FromList, PositiveFraction, SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
 
 # The policy also writes the sampled parameters before clipping, in units where the bounds are [-1, 1].
@@ -62,12 +62,12 @@ PARAMETERS = 1
 class QPAMDPOptions(Settings):
     """Settings of `QPAMDP`. Means and standard deviations are in units where the parameters' bounds are [-1, 1]."""
 
-    features: Annotated[tuple[NonNegativeInt, ...], Strict(False)] | None = None
+    features: Annotated[tuple[NonNegativeInt, ...], FromList] | None = None
     """Entries of the observation that the features see, as in [8, 9]; null: all entries that vary in the warm-up.
 
     With `agent.sharing=shared` add the entries of the one-hot option, which come last.
     """
-    feature_range: Annotated[tuple[float, float], Strict(False)] | None = None
+    feature_range: Annotated[tuple[float, float], FromList] | None = None
     """Range to which these entries are clipped and scaled, as in [-1, 1]; null: the range seen in the warm-up.
 
     Give it if random actions do not lead everywhere: states beyond the warm-up's range all look the same.
