@@ -103,7 +103,7 @@ def _reworded(message: str, value: Any) -> str:
     message = message.replace("an object", "a mapping").replace(" or None", " or null")
     length = len(value) if isinstance(value, list) else None
     message = message.removesuffix(f" after validation, not {length}")
-    return re.sub("^(Input|String|List|Tuple) should", "must", message)
+    return re.sub("^(Input|String|List|Tuple|Value) should", "must", message)
 
 
 def _shortened(complaints: list[str]) -> list[str]:

@@ -147,6 +147,7 @@ def _from_first_form(saved: Mapping[str, Any]) -> dict[str, Any]:
         choices[group] = saved[group].get("name")
     known = _settings_of(choices)
     for group, settings in groups.items():
+        groups[group] = settings = with_new_names(group, settings, known[group])
         if "name" in known[group] or not settings.keys() <= known[group]:
             for name in names_of(group):
                 its_own = _settings_of({group: name})[group]
