@@ -87,6 +87,15 @@ class CommandLine:
         """Return the settings by their names."""
         return {override.key_or_group: override for override in self.overrides}
 
+    @property
+    def search_path(self) -> list[str]:
+        """The word that adds the command line's own folders of yaml files, if it has any."""
+        given = self.given().get("hydra.searchpath")
+        if given is not None:
+            return [given.input_line or ""]
+        folder = self.flags["config-dir"]
+        return [] if folder is None else [f"hydra.searchpath=['{Path(folder).absolute()}']"]
+
     def with_words(self, words: Sequence[str]) -> CommandLine:
         """Return the command line with more words in front of its settings."""
         return replace(self, overrides=(*_parsed(words), *self.overrides))
@@ -252,16 +261,11 @@ def _sweep_folder(line: CommandLine, conf: Path) -> list[str]:
         return []
     if experiments is None or not experiments.is_discrete_sweep():
         return []
-    search_path: list[str] = []
-    if "hydra.searchpath" in given:
-        search_path = [given["hydra.searchpath"].input_line or ""]
-    elif line.flags["config-dir"] is not None:
-        search_path = [f"hydra.searchpath=['{Path(line.flags['config-dir']).absolute()}']"]
     folders: dict[str, None] = {}
     for choice in written_out(experiments):
         try:
             with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-                cfg = hydra.compose("config", [choice, *search_path], return_hydra_config=True)
+                cfg = hydra.compose("config", [choice, *line.search_path], return_hydra_config=True)
         except (HydraException, OmegaConfBaseException):
             return []  # which Hydra will report
         settings: Any = OmegaConf.to_container(cfg.hydra.sweep, resolve=False)

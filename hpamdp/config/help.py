@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from omegaconf import DictConfig
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
@@ -69,16 +70,20 @@ def help_page(line: CommandLine, conf: Path) -> str:
     return _PAGE.format(
         program=program(),
         groups="\n".join(groups),
-        chosen="".join(_explained_choice(line, group) for group in line.given() if group in GROUPS),
+        chosen="".join(_explained_choices(line)),
         values="\n".join(_explained(RunConfig, "", {})),
     )
 
 
-def _explained_choice(line: CommandLine, group: str) -> str:
-    words = [word for word in line.words if not word.startswith("hydra.") or word.startswith("hydra.searchpath=")]
-    if line.flags["config-dir"] is not None:
-        words.append(f"hydra.searchpath=['{Path(line.flags['config-dir']).absolute()}']")
-    cfg = compose_words(words)
+def _explained_choices(line: CommandLine) -> Iterator[str]:
+    """Yield the settings of each choice on the command line."""
+    groups = [group for group in line.given() if group in GROUPS]
+    if groups:
+        cfg = compose_words([*(word for word in line.words if not word.startswith("hydra.")), *line.search_path])
+        yield from (_explained_choice(cfg, group) for group in groups)
+
+
+def _explained_choice(cfg: DictConfig, group: str) -> str:
     name = str(cfg.hydra.runtime.choices[group])
     try:
         with quick_imports():

@@ -29,8 +29,12 @@ _SLOW = frozenset(
         "ray",
         "scipy",
         "tensorboard",
+        "tensordict",
+        "torch",
+        "torchrl",
+        "tqdm",
+        "wandb",
     }
-    | {"tensordict", "torch", "torchrl", "tqdm", "wandb"}
 )
 _PACKAGE = __name__.partition(".")[0]
 # Modules of this package that were imported with stand-ins, and the stand-ins themselves.
