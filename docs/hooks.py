@@ -198,10 +198,10 @@ def fields_of(path: str, target: str | None) -> dict[str, tuple[str, object, str
     """Return the values, the default and the sentence of each setting of a yaml's class."""
     if target is None or not target.startswith("hpamdp."):
         return {}
-    from hpamdp.config.components import GROUPS, defaults_of, load_class, options_model
+    from hpamdp.config.components import SUPPLIED_ARGUMENTS, defaults_of, load_class, settings_model
 
     group = Path(path).parent.name
-    model = options_model(load_class(target), GROUPS.get(group, ()))
+    model = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(group, ()))
     schema = model.model_json_schema()
     defaults = defaults_of(model)
     return {

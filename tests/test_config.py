@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
 from hpamdp.config import schema
-from hpamdp.config.components import GROUPS, component, defaults_of, load_class, options_model
+from hpamdp.config.components import GROUPS, SUPPLIED_ARGUMENTS, component, defaults_of, load_class, settings_model
 from hpamdp.config.compose import plain, read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import read_saved
@@ -226,7 +226,7 @@ def test_a_yaml_and_its_class_have_the_same_options(group, name):
     in_yaml = set(cfg[group]) - {"_target_", "budget", "checkpoint", "freeze", "per_option", "grouping"}
     assert chosen.name == name and set(chosen.settings) == in_yaml
     if chosen.cls is not None:
-        assert in_yaml == options_model(chosen.cls, GROUPS[group]).model_fields.keys()
+        assert in_yaml == settings_model(chosen.cls, SUPPLIED_ARGUMENTS[group]).model_fields.keys()
     assert ("budget" in cfg[group]) == (group == "low")
     assert group != "low" or set(cfg[group].budget) == {"num_envs", "steps_per_batch", "total_frames", "eval_every"}
 
@@ -315,7 +315,7 @@ def test_a_yaml_holds_only_what_differs_from_its_class(group, name):
     given.pop("budget", None)
     target = given.pop("_target_")
     if target is not None:
-        defaults = defaults_of(options_model(load_class(target), GROUPS[group]))
+        defaults = defaults_of(settings_model(load_class(target), SUPPLIED_ARGUMENTS[group]))
         assert given.keys() <= defaults.keys()
         assert not [setting for setting, value in given.items() if value == defaults[setting]]
 
@@ -324,7 +324,7 @@ def test_a_yaml_holds_only_what_differs_from_its_class(group, name):
 def test_every_setting_has_its_meaning_in_the_model(group, name):
     target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())["_target_"]
     if target is not None:
-        fields = options_model(load_class(target), GROUPS[group]).model_fields
+        fields = settings_model(load_class(target), SUPPLIED_ARGUMENTS[group]).model_fields
         assert not [setting for setting, field in fields.items() if not field.description]
 
 

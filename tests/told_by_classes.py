@@ -3,17 +3,17 @@
 import json
 import sys
 
-from hpamdp.config.components import GROUPS, defaults_of, load_class, options_model
+from hpamdp.config.components import SUPPLIED_ARGUMENTS, defaults_of, load_class, settings_model
 from hpamdp.config.stand_ins import quick_imports
 
 # Facts of classes that the rules of `hpamdp.run.compatibility` read.
-FACTS = ("modes", "needs", "is_bandit", "ends_options", "asks_learners", "value_option", "guarded_settings")
+FACTS = ("modes", "needs", "is_bandit", "ends_options", "asks_learners", "value_setting", "guarded_settings")
 
 
 def told(cls: type, group: str) -> dict:
     """Return the settings' defaults and the facts of a class as JSON values."""
     facts = {name: list(value) if isinstance(value := getattr(cls, name, None), tuple) else value for name in FACTS}
-    return {"defaults": defaults_of(options_model(cls, GROUPS[group])), "facts": facts}
+    return {"defaults": defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group])), "facts": facts}
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ from hpamdp.memory import is_about_memory
 from hpamdp.messages import first_line
 from hpamdp.settings import SettingError, Settings
 
-# The groups of conf/, and the constructor arguments that the program supplies; all others are set in the yaml.
-GROUPS: dict[str, tuple[str, ...]] = {
+# Arguments that the run supplies to the constructor of a group's class. All others are settings.
+SUPPLIED_ARGUMENTS: dict[str, tuple[str, ...]] = {
     "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
@@ -27,14 +27,16 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "logger": ("output_dir", "config", "earlier"),
     "collector": ("config", "parts", "frames"),
 }
+# The groups of conf/ in which a class is chosen.
+GROUPS = tuple(SUPPLIED_ARGUMENTS)
 TARGET = "_target_"
-# Entries of a group that belong to the run, not to the group's class.
-RUN_ENTRIES: dict[str, tuple[str, ...]] = {
+# Values of a group that the run reads itself. The group's class does not get them.
+RUN_VALUES: dict[str, tuple[str, ...]] = {
     "low": ("budget", "checkpoint", "freeze", "per_option"),
     "env": ("grouping",),
 }
-# The base class of each group's classes. If it is a protocol, a class only needs its methods.
-_KINDS = {
+# The base class that a group's classes must have. If it is a protocol, a class only needs its methods.
+_BASE_CLASSES = {
     "env": "hpamdp.env.base.PAMDPEnv",
     "high": "hpamdp.policies.base.Selector",
     "low": "hpamdp.policies.base.Learner",
@@ -66,11 +68,11 @@ class Component:
         return f"{self.group}={self.name}"
 
     @property
-    def options(self) -> Any:
-        """The settings as the class's own model; None if it has no model."""
-        if self.cls is None or not takes_options(self.cls):
+    def as_model(self) -> Any:
+        """The settings as an instance of the class's `Options`; None if it has no model."""
+        if self.cls is None or not takes_settings_model(self.cls):
             return None
-        return options_model(self.cls)(**self.settings)
+        return settings_model(self.cls)(**self.settings)
 
     def is_guarded(self, name: str, value: object) -> bool:
         """Return whether a saved config needs the user's permission to give a setting this value.
@@ -94,8 +96,8 @@ class Component:
             return None
         accepted = constructor_arguments(self.cls)
         supplied = {name: value for name, value in context.items() if name in accepted}
-        options = self.options
-        settings = self.settings if options is None else {"options": options}
+        model = self.as_model
+        settings = self.settings if model is None else {"options": model}
         try:
             return self.cls(**supplied, **settings)
         except SettingError as error:
@@ -125,8 +127,8 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
     Raises:
         ConfigError: a class or a setting is wrong; the message lists all mistakes in one line.
     """
-    own = RUN_ENTRIES.get(group, ())
-    settings = {setting: value for setting, value in given.items() if setting not in (TARGET, *own)}
+    of_run = RUN_VALUES.get(group, ())
+    settings = {setting: value for setting, value in given.items() if setting not in (TARGET, *of_run)}
     file = file_of(group, name)
     target = given.get(TARGET)
     if target is None and group in _CAN_BE_NONE:
@@ -134,8 +136,8 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
         validated(model, settings, f"{group}.", f"setting of none ({file})", f"none, {file}")
         return Component(group, name, None, {})
     cls = _load_target(group, target, file)
-    model = options_model(cls, GROUPS[group])
-    taken = [entry for entry in (TARGET, *own) if entry in model.model_fields]
+    model = settings_model(cls, SUPPLIED_ARGUMENTS[group])
+    taken = [value for value in (TARGET, *of_run) if value in model.model_fields]
     if taken:
         raise ConfigError(
             f"{group}={name}: {cls.__name__} has a setting {taken[0]}, but {group}.{taken[0]} is a value of the run; "
@@ -146,7 +148,7 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
     return Component(group, name, cls, dict(checked))
 
 
-def check_kind(group: str, name: str, target: object) -> None:
+def check_base_class(group: str, name: str, target: object) -> None:
     """Refuse a class that does not fit the group, or that is abstract.
 
     Raises:
@@ -155,18 +157,18 @@ def check_kind(group: str, name: str, target: object) -> None:
     if target is None and group in _CAN_BE_NONE:
         return
     file = file_of(group, name)
-    cls, kind = _load_target(group, target, file), load_class(_KINDS[group])
-    of_kind = f"{kind.__name__} ({kind.__module__})"
+    cls, base = _load_target(group, target, file), load_class(_BASE_CLASSES[group])
+    named_base = f"{base.__name__} ({base.__module__})"
     given = f"{group}={name}: {cls.__name__}"
-    if getattr(kind, "_is_protocol", False):
-        methods = [method for method in vars(kind) if not method.startswith("_")]
+    if getattr(base, "_is_protocol", False):
+        methods = [method for method in vars(base) if not method.startswith("_")]
         lacks = [method for method in methods if not callable(getattr(cls, method, None))]
         if lacks:
-            raise ConfigError(f"{given} is no {of_kind}; it lacks {', '.join(lacks)} ({file})")
-    elif not issubclass(cls, kind):
-        raise ConfigError(f"{given} is no {of_kind}; derive it from {kind.__name__} ({file})")
+            raise ConfigError(f"{given} is no {named_base}; it lacks {', '.join(lacks)} ({file})")
+    elif not issubclass(cls, base):
+        raise ConfigError(f"{given} is no {named_base}; derive it from {base.__name__} ({file})")
     left = [method for method in dir(cls) if getattr(getattr(cls, method, None), "__isabstractmethod__", False)]
-    if left or cls is kind:
+    if left or cls is base:
         missing = f", which have {', '.join(left)}" if left else ""
         raise ConfigError(f"{given} is abstract; choose one of its subclasses{missing} ({file})")
 
@@ -206,12 +208,12 @@ def constructor_arguments(cls: type) -> dict[str, inspect.Parameter]:
     return dict(list(inspect.signature(constructor).parameters.items())[1:])
 
 
-def takes_options(cls: type) -> bool:
+def takes_settings_model(cls: type) -> bool:
     """Return whether the constructor takes a model of settings."""
     return hasattr(cls, "Options") and "options" in constructor_arguments(cls)
 
 
-def options_model(cls: type, supplied: Iterable[str] = ()) -> type[BaseModel]:
+def settings_model(cls: type, supplied: Iterable[str] = ()) -> type[BaseModel]:
     """Return the model of a class's settings: its `Options`, or one made of its constructor's arguments.
 
     Args:
@@ -221,7 +223,7 @@ def options_model(cls: type, supplied: Iterable[str] = ()) -> type[BaseModel]:
     Raises:
         ConfigError: `Options` is no settings model, or an argument has a type that yaml cannot hold.
     """
-    if takes_options(cls):
+    if takes_settings_model(cls):
         model = cls.Options  # type: ignore[attr-defined]
         if not (inspect.isclass(model) and issubclass(model, Settings)):
             raise ConfigError(f"{cls.__name__}.Options: must be a subclass of {Settings.__module__}.Settings")

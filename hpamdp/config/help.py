@@ -90,9 +90,9 @@ def _explained_choice(cfg: DictConfig, group: str) -> str:
             chosen = component(group, name, plain(cfg[group], group))
     except ConfigError:
         return ""
-    if chosen.options is None:
+    if chosen.as_model is None:
         return f"{group}={name} has the settings {', '.join(chosen.settings) or 'of its class alone: none'}\n\n"
-    lines = _explained(type(chosen.options), f"{group}.", dict(chosen.settings))
+    lines = _explained(type(chosen.as_model), f"{group}.", dict(chosen.settings))
     return "\n".join([f"Settings of {group}={name}", *lines, "", ""])
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hpamdp.config.components import GROUPS, RUN_ENTRIES, TARGET
+from hpamdp.config.components import GROUPS, RUN_VALUES, TARGET
 from hpamdp.config.compose import check, choosing, compose, is_name, names_of, plain_groups
 from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json
 from hpamdp.config.renamed import with_new_names
@@ -158,7 +158,7 @@ def _from_first_form(saved: Mapping[str, Any]) -> dict[str, Any]:
 
 def _settings_of(choices: Mapping[str, Any]) -> dict[str, set[str]]:
     """Return the possible entries of each group: the settings of its yaml file and the values of the run."""
-    of_any = {group: {*RUN_ENTRIES.get(group, ())} for group in choices}
+    of_any = {group: {*RUN_VALUES.get(group, ())} for group in choices}
     try:
         if all(map(is_name, choices.values())):
             cfg = compose([choosing(group, name) for group, name in choices.items()])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
 
-from hpamdp.config.components import GROUPS, TARGET, Component, check_kind, component, file_of
+from hpamdp.config.components import GROUPS, TARGET, Component, check_base_class, component, file_of
 from hpamdp.config.errors import ConfigError, as_json, validated
 from hpamdp.settings import Settings
 
@@ -250,11 +250,11 @@ def checked_config(
         ConfigError: a wrong value.
     """
     for group in GROUPS:
-        check_kind(group, names[group], given[group].get(TARGET))
+        check_base_class(group, names[group], given[group].get(TARGET))
     components = {group: component(group, names[group], given[group]) for group in GROUPS}
     low_of = {}
     for option, (name, low) in learners.items():
-        check_kind("low", name, low.get(TARGET))
+        check_base_class("low", name, low.get(TARGET))
         low_of[option] = component("low", name, low, f"low.per_option.{option}.")
     if low_of:
         # With all their settings, so that a saved run keeps them if their yaml files change.

@@ -12,7 +12,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig, Node, OmegaConf
 
-from hpamdp.config.components import GROUPS, TARGET, defaults_of, load_class, options_model
+from hpamdp.config.components import GROUPS, SUPPLIED_ARGUMENTS, TARGET, defaults_of, load_class, settings_model
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RunConfig
 from hpamdp.config.stand_ins import is_readable, quick_imports
@@ -53,7 +53,7 @@ def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
         return {}
     try:
         with quick_imports() if is_readable(target._value()) else nullcontext():
-            return defaults_of(options_model(load_class(target._value()), GROUPS[group]))
+            return defaults_of(settings_model(load_class(target._value()), SUPPLIED_ARGUMENTS[group]))
     except ConfigError:  # which the check of the config raises again, with the name of the file
         return {}
 

@@ -377,7 +377,7 @@ class Learner(Level, nn.Module):
         policy: the module that acts.
         modes: what the learner can learn from: transitions that the agent collects (`train`), or a data set
             (`offline`, for `mode=offline` and for `data=...` with `mode=train`).
-        value_option: setting that must be true for `value` to work. If None, `value` always works.
+        value_setting: setting that must be true for `value` to work. If None, `value` always works.
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
             counters. They start afresh if a new run takes over the learner.
         next_options: which options follow one that ended, and their values. The agent sets it.
@@ -385,7 +385,7 @@ class Learner(Level, nn.Module):
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train",)
-    value_option: ClassVar[str | None] = None
+    value_setting: ClassVar[str | None] = None
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 
     policy: TensorDictModuleBase

@@ -56,7 +56,7 @@ def check_problem(config: Config, facts: ProblemFacts) -> None:
 def facts_of(config: Config) -> ProblemFacts | None:
     """Return the facts about the problem that follow from its settings; None if only a built environment has them."""
     facts = getattr(config.env.cls, "facts", None)
-    options = config.env.options
+    options = config.env.as_model
     return None if facts is None or options is None else facts(options)
 
 
@@ -176,7 +176,7 @@ def compared_learners_have_values(config: Config) -> str | None:
     if not getattr(config.high.cls, "asks_learners", False):
         return None
     for low in config.learners:
-        setting = getattr(low.cls, "value_option", None)
+        setting = getattr(low.cls, "value_setting", None)
         if setting is not None and not low.settings[setting]:
             return f"{config.high}: {low} has no value to compare without low.{setting}=true"
         if not _overrides(low.cls, "value", base="hpamdp.policies.base"):

@@ -107,7 +107,7 @@ class DLPA(ReplayLearner):
 
     Options = DLPAOptions
     modes: ClassVar[tuple[str, ...]] = ("train",)
-    value_option = "end_values"
+    value_setting = "end_values"
     catches_up = True
 
     options: DLPAOptions
