@@ -1,4 +1,4 @@
-"""Smooth drawing in NumPy pictures, for `render`."""
+"""Antialiased drawing with Pillow, for `render`."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ FAINT = "#7d8b92"
 GOOD, GOOD_EDGE = "#c3e3c6", "#3c8a55"
 BAD, BAD_EDGE = "#f1cbbd", "#b9503a"
 
-# Shapes are drawn SMOOTH times too large and averaged down. Text is written afterwards: Pillow smooths it itself.
+# Shapes are drawn SMOOTH times too large and then averaged down. Text is written afterwards, because Pillow smooths
+# text itself.
 SMOOTH = 3
-PAPER = 480.0  # units of paper from edge to edge, whatever the size of the picture
-_TILE = 48 * SMOOTH  # px from edge to edge of the squares that are smoothed together
-_MARGIN = 2.0  # px by which shapes may reach beyond where they are
+PAPER = 480.0  # width and height of every picture in units of paper
+_TILE = 48 * SMOOTH  # width and height (px) of a tile, the unit of smoothing
+_MARGIN = 2.0  # px by which Pillow may draw beyond a shape's outline
 
 
 class Canvas:
-    """A picture addressed in units of paper, so that the same code draws every size."""
+    """A picture addressed in units of paper, so the same code draws pictures of every size."""
 
     def __init__(self, image: Image.Image) -> None:
         self.image = image
@@ -36,15 +37,15 @@ class Canvas:
 
     @classmethod
     def for_shapes(cls, size: int) -> Canvas:
-        """Return an empty canvas for shapes, of which `smoothed` makes a picture of `size` px."""
+        """Return an empty canvas for shapes. Its method `smoothed` returns a picture of `size` px."""
         return cls(Image.new("RGB", (size * SMOOTH, size * SMOOTH), BACKGROUND))
 
     def smoothed(self, earlier: Image.Image | None = None) -> Canvas:
         """Return a canvas for labels, with the shapes averaged down.
 
         Args:
-            earlier: this canvas, smoothed before the first of its shapes was drawn, if there was anything on it. Only
-                what they have touched is smoothed again.
+            earlier: smoothed picture of the image with which this canvas started. If given, only the tiles drawn on
+                since then are smoothed again.
         """
         if earlier is None:
             return Canvas(self.image.reduce(SMOOTH))
@@ -68,7 +69,7 @@ class Canvas:
         self._pen.line((start_x, start_y, end_x, end_y), colour, round(width * self._unit))
         for x, y in ((start_x, start_y), (end_x, end_y)):
             self._pen.ellipse((x - r, y - r, x + r, y + r), colour)
-        # Piece by piece: the box around a long slanting line is mostly empty.
+        # Mark tiles piece by piece, because the box around a long slanted line is mostly empty.
         num_pieces = math.ceil(max(abs(end_x - start_x), abs(end_y - start_y), 1.0) / _TILE)
         step_x, step_y = (end_x - start_x) / num_pieces, (end_y - start_y) / num_pieces
         for piece in range(num_pieces):
@@ -82,25 +83,25 @@ class Canvas:
         self._note_drawn([x for x, _ in scaled], [y for _, y in scaled], width * self._unit)
 
     def bar(self, box: tuple[float, float, float, float], colour: str) -> None:
-        """Draw a bar with round ends; `box` is left, top, right, bottom."""
+        """Draw a bar with round ends. `box` is (left, top, right, bottom)."""
         left, top, right, bottom = (self._unit * value for value in box)
         radius = min(right - left, bottom - top) / 2.0
         self._pen.rounded_rectangle((left, top, right, bottom), radius, colour)
         self._note_drawn((left, right), (top, bottom))
 
     def _note_drawn(self, x: Sequence[float], y: Sequence[float], reach: float = 0.0) -> None:
-        """Note the tiles around places (px) as drawn on; `reach` is what is drawn on around them."""
+        """Mark the tiles within `reach` px of the places (px) as drawn on."""
         columns = self._tiles(min(x) - reach, max(x) + reach)
         rows = self._tiles(min(y) - reach, max(y) + reach)
         self._drawn_on.update(itertools.product(columns, rows))
 
     def _tiles(self, low: float, high: float) -> range:
-        """Return the columns, or rows, of tiles between two places (px)."""
+        """Return the columns or rows of tiles between two places (px)."""
         first, last = int(low - _MARGIN) // _TILE, int(high + _MARGIN) // _TILE
         return range(max(first, 0), min(last, self._last_tile) + 1)
 
     def write(self, place: Point, text: str, colour: str = INK, size: float = 14.0, anchor: str = "lm") -> None:
-        """Write a line of text; `anchor` as Pillow has it, `lm` for the middle of the left edge."""
+        """Write a line of text. `anchor` is Pillow's: `lm` is the middle of the left edge."""
         x, y = place
         self._pen.text((x * self._unit, y * self._unit), text, colour, _font(size * self._unit), anchor)
 

@@ -1,8 +1,10 @@
 """Random numbers that are pure functions of integer counters.
 
-`torch.rand` reads one stream, so what one environment gets depends on how often the others were reset, and a number
-for every row costs more than a step of the physics. Here each number is a hash of (seed, stream, environment, episode,
-index): the episodes of an environment do not depend on the batch, and no global generator is touched.
+`torch.rand` reads one stream. The numbers of one environment would depend on how often the others were reset. Drawing
+a number for every row would also cost more than a step of the physics.
+
+Here each number is a hash of (seed, stream, environment, episode, index). The episodes of an environment do not depend
+on the batch, and the global generators are not used.
 """
 
 from __future__ import annotations
@@ -15,9 +17,10 @@ from torch import Tensor
 
 from hpamdp.env.rng_streams import EVALUATION, EVALUATION_NOISE, NOISE, STEPS, TRAINING
 
-# How to compile functions that draw random numbers. Each operation of the hash reads its input twice, and the
-# compiler's default of inlining them into one another takes it two minutes. Measured with 16,384 environments: with
-# these thresholds compiling takes 4 s, and step and reset make 50 million steps/s; with (8, 2) and (20, 4) 21 million.
+# Arguments for compiling functions that draw random numbers. Each operation of the hash reads its input twice. By
+# default the compiler inlines these operations into one another, which takes two minutes.
+# Measured with 16,384 environments: with these thresholds compiling takes 4 s, and step and reset run at 50 million
+# steps/s. With thresholds (8, 2) and (20, 4) they run at 21 million steps/s.
 COMPILE_ARGUMENTS: dict[str, Any] = {
     "fullgraph": True,
     "dynamic": False,
@@ -26,11 +29,11 @@ COMPILE_ARGUMENTS: dict[str, Any] = {
 
 
 class RngKey(NamedTuple):
-    """What all random numbers of an episode derive from.
+    """The key from which all random numbers of an episode derive.
 
     Attributes:
-        bits: int32 `[*B]`, the hash of the seed, the environment and the episode.
-        step: of the stream.
+        bits: hash of the seed, the stream, the environment and the episode, int32 `[*B]`.
+        step: step of the stream, from `STEPS`.
     """
 
     bits: Tensor
@@ -38,7 +41,7 @@ class RngKey(NamedTuple):
 
 
 def _shift_right(h: Tensor, bits: int) -> Tensor:
-    """Shift int32 right without copying the sign."""
+    """Shift int32 right without extending the sign."""
     return (h >> bits) & ((1 << (32 - bits)) - 1)
 
 
@@ -53,10 +56,10 @@ def rng_key(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> 
     """Return the key `[*B]` of an episode.
 
     Args:
-        seed: int32 scalar, from `seed_tensor`.
+        seed: int32 scalar from `seed_tensor`.
         stream: TRAINING, EVALUATION, NOISE or EVALUATION_NOISE.
-        environment: int32 `[*B]`, the numbers of the environments.
-        episode: int32 `[*B]`, the numbers of their episodes.
+        environment: numbers of the environments, int32 `[*B]`.
+        episode: numbers of their episodes, int32 `[*B]`.
     """
     h = _mix(seed ^ (0x2545F491 + 0x01234567 * stream))
     h = _mix(h ^ environment)
@@ -64,8 +67,11 @@ def rng_key(seed: Tensor, stream: int, environment: Tensor, episode: Tensor) -> 
 
 
 def uniform(key: RngKey, index: int | Tensor) -> Tensor:
-    """Return float32 in (0, 1): number `index` of each key; an `index` that is an int32 tensor broadcasts with them."""
-    # 23 bits: with 24, adding a half would round up to 1 in the upper half of the interval.
+    """Return uniform number `index` of each key, float32 in (0, 1).
+
+    An int32 tensor `index` broadcasts against the keys.
+    """
+    # Use 23 bits. With 24, adding 0.5 could round the largest values up to 1.
     bits = _shift_right(_mix(key.bits + index * key.step), 9)
     return (bits.to(torch.float32) + 0.5) * 2.0**-23
 
@@ -77,7 +83,7 @@ def normal(key: RngKey, index: int | Tensor) -> Tensor:
 
 
 def seed_tensor(seed: int, device: torch.device | None = None) -> Tensor:
-    """Fold a Python integer of any size into the int32 scalar that `rng_key` takes."""
+    """Fold a Python integer of any size into the int32 scalar for `rng_key`."""
     folded = (seed ^ (seed >> 32)) & 0xFFFFFFFF
     signed = folded - (1 << 32) if folded >= 1 << 31 else folded
     return torch.tensor(signed, dtype=torch.int32, device=device)

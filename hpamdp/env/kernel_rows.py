@@ -12,15 +12,19 @@ from hpamdp.env.kernels import ACT, ACT_AND_RESTART, ACT_OR_RESTART, RESTART
 from hpamdp.env.rng_streams import NOISE, TRAINING
 from hpamdp.messages import invalid_action
 
-# Moves all rows; its arguments are those of `KernelRows.advance`, in this order.
+# A kernel that moves all rows. `KernelRows.advance` passes its arguments.
 Advance = Callable[..., int]
 
 
 class Results(NamedTuple):
-    """What R readings of N rows say; R is 2 where rows that are over started anew, before and after that.
+    """R readings of N rows. R is 2 if finished rows were restarted: one reading before, one after.
 
-    `observations` float32 `[R, N, D]`, `outcomes` int64 `[R, N]`, `entries` float32 `[R, E, N]` (what a problem reports
-    besides), `flags` bool `[R, 3, N]` (done, terminated, truncated) and `rewards` float32 `[N]`.
+    Attributes:
+        observations: float32 `[R, N, D]`.
+        outcomes: int64 `[R, N]`.
+        entries: further entries that a problem reports, float32 `[R, E, N]`.
+        flags: done, terminated and truncated, bool `[R, 3, N]`.
+        rewards: float32 `[N]`.
     """
 
     observations: np.ndarray
@@ -35,13 +39,13 @@ class KernelRows:
 
     Args:
         advance: the kernel of the problem.
-        num_rows: N.
-        num_columns: how many float32 and how many int32 columns the state has.
-        reading_dims: D and E.
+        num_rows: number of rows N.
+        num_columns: number of float32 columns and number of int32 columns of the state.
+        reading_dims: D and E of `Results`.
         parameter_dims: number of parameters of each discrete action.
         bounds: lowest and highest values of all parameters, `[2, P]`.
-        settings: MAX_STEPS, NUM_OPTIONS (0 if the agent does not choose) and the problem's own.
-        first_env: number of the first row, if other processes have those before it.
+        settings: MAX_STEPS, NUM_OPTIONS (0 if the agent does not choose) and the problem's own settings.
+        first_env: number of the first row. It is above 0 if other processes hold earlier rows.
     """
 
     def __init__(
@@ -66,7 +70,7 @@ class KernelRows:
         self._bounds = np.ascontiguousarray(bounds, np.float32)
         self._settings = np.array([0.0, 0.0, 0.0, first_env, *settings])
         self._all = np.ones(num_rows, np.bool_)
-        # What a start reads of actions.
+        # Stand-ins for the action when rows restart.
         self._no_choice = np.zeros(num_rows, np.int64)
         self._no_parameters = np.zeros((num_rows, sum(parameter_dims)), np.float32)
 
@@ -76,7 +80,7 @@ class KernelRows:
         self._settings[kernels.EPISODE_STREAM], self._settings[kernels.NOISE_STREAM] = streams
 
     def begin(self, seed: int) -> None:
-        """Put every row before its first episode of training with this seed."""
+        """Put every row before its first training episode with this seed."""
         self.floats[:] = 0.0
         self.integers[:] = 0
         self.integers[kernels.EPISODE_ROW] = -1
@@ -91,36 +95,41 @@ class KernelRows:
         mask: np.ndarray | None = None,
         restarts: bool = False,
     ) -> Results | int:
-        """Take an action in every row; those whose episode is over stay as they are.
+        """Take an action in every row. Rows whose episode is over stay unchanged.
 
         Args:
-            option: int64 `[N]`; None if the agent does not choose.
-            discrete: int64 `[N]`.
-            parameters: float32 `[N, P]`, of all discrete actions, side by side.
-            mask: bool `[N]`, the rows that move; all by default.
-            restarts: read the rows, start new episodes where they are over, and read them again.
+            option: options, int64 `[N]`, or None if the agent does not choose.
+            discrete: discrete actions, int64 `[N]`.
+            parameters: parameters of all discrete actions side by side, float32 `[N, P]`.
+            mask: rows that move, bool `[N]`. If None, all rows.
+            restarts: whether to restart finished rows and read all rows again.
 
         Returns:
-            The results, or the number of the first row whose action is invalid, where nothing has changed.
+            The results. If an action is invalid, the number of the first such row, and the state is unchanged.
         """
         return self.advance(ACT_AND_RESTART if restarts else ACT, option, discrete, parameters, mask)
 
     def act_or_restart(self, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> Results | int:
-        """Take an action, and instead start a new episode where one is over; actions are not read there."""
+        """Take an action in every row, but start a new episode in finished rows, whose actions are ignored."""
         return self.advance(ACT_OR_RESTART, option, discrete, parameters, None)
 
     def restart(self, mask: np.ndarray | None = None) -> Results:
-        """Start new episodes, in the rows of `mask` bool `[N]` or in all."""
+        """Start new episodes in the rows of `mask`, bool `[N]`. If None, in all rows."""
         results = self.advance(RESTART, None, self._no_choice, self._no_parameters, mask)
         assert not isinstance(results, int)
         return results
 
     def read(self) -> Results:
-        """Return what is observed."""
+        """Return a reading of all rows, which stay unchanged."""
         return self.restart(~self._all)
 
     def put(self, columns: Mapping[int, np.ndarray], mask: np.ndarray | None) -> None:
-        """Set columns of the state, by their places among floats and then integers, in the rows of `mask` or in all."""
+        """Set columns of the state in the rows of `mask`. If None, in all rows.
+
+        Args:
+            columns: new values by the column's place. Places count the floats first, then the integers.
+            mask: bool `[N]`.
+        """
         state = [*self.floats, *self.integers]
         for place, column in columns.items():
             np.copyto(state[place], column, where=True if mask is None else mask)
@@ -133,7 +142,7 @@ class KernelRows:
         parameters: np.ndarray,
         mask: np.ndarray | None,
     ) -> Results | int:
-        """Call the kernel."""
+        """Call the kernel and return its results, or the number of the first row with an invalid action."""
         num_readings, n = 2 if mode == ACT_AND_RESTART else 1, self._num_rows
         results = Results(
             np.empty((num_readings, n, self._observation_dim), np.float32),
@@ -171,11 +180,11 @@ def invalid_choice(
     """Return the error for an invalid action of a row.
 
     Args:
-        row: its number.
+        row: number of the row.
         option, discrete, parameters: the action, with the parameters of all discrete actions.
         parameter_dims: number of parameters of each discrete action.
-        num_options: how many options there are.
-        names: what the error calls `discrete` and `parameters`.
+        num_options: number of options.
+        names: names of `discrete` and `parameters` in the message.
     """
     values: dict[str, tuple[object, str]] = {}
     if option is not None:

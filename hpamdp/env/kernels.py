@@ -1,12 +1,13 @@
 """Kernels: loops over the rows of a batch that Numba compiles for one core of the CPU.
 
-The rules of a problem are tensor functions. They run on CPU and CUDA, compile and differentiate. Without compilation
-each of their operations reads and writes whole columns, and takes microseconds even for one row. A kernel states the
-same rules for one row and takes all rows through a whole step, so one environment and a million are both fast. A test
-compares the two.
+The rules of a problem are tensor functions, which run on CPU and CUDA, compile and differentiate. Without compilation
+each operation reads and writes whole columns, and takes microseconds even for one row.
 
-Random numbers are those of `counter_rng`, bit for bit. Machine code is kept on disk, so only the first run on a machine
-compiles.
+A kernel states the same rules for one row, and takes each row through a whole step. So it is fast with one environment
+and with a million. A test compares each kernel with its tensor functions.
+
+Random numbers equal those of `counter_rng` bit for bit. Numba caches the machine code on disk, so only the first run on
+a machine compiles.
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ TURN = np.float32(2.0 * math.pi)
 _UNIT = np.float32(2.0**-23)
 _MINUS_TWO = np.float32(-2.0)
 
-# Of cos and sin: 2/pi, and pi/2 in two parts, so that the remainder is exact. The series are as in Cephes.
+# For `sin_cos`: 2/pi, and pi/2 in two parts, so that the remainder is exact. The series are those of Cephes.
 _QUARTERS = np.float32(2.0 / math.pi)
 _QUARTER_HIGH = np.float32(1.5703125)
-_ROUNDING = np.float32(1.5 * 2.0**23)  # added and taken away again, it rounds to an integer
+_ROUNDING = np.float32(1.5 * 2.0**23)  # adding and subtracting it rounds to an integer
 _QUARTER_LOW = np.float32(math.pi / 2.0 - 1.5703125)
 _SIN_3, _SIN_5, _SIN_7 = np.float32(-1.6666654611e-1), np.float32(8.3321608736e-3), np.float32(-1.9515295891e-4)
 _COS_4, _COS_6, _COS_8 = np.float32(4.1666645683e-2), np.float32(-1.3887316255e-3), np.float32(2.4433157118e-5)
-# Of the arc tangent: the polynomial that approximates (arctan(s) - s) / s^3 in s^2 for s in [0, 1], relative to the arc
-# tangent within 2e-8.
+# For `atan2`: a polynomial in s^2 that approximates (arctan(s) - s) / s^3 for s in [0, 1]. The error relative to the
+# arc tangent is below 2e-8.
 _ATAN_3, _ATAN_5, _ATAN_7 = np.float32(-0.33333153), np.float32(0.19993773), np.float32(-0.14211056)
 _ATAN_9, _ATAN_11, _ATAN_13 = np.float32(0.106660046), np.float32(-0.07552215), np.float32(0.043211862)
 _ATAN_15, _ATAN_17 = np.float32(-0.016367929), np.float32(0.0029206923)
@@ -51,15 +52,15 @@ _TINY = np.float32(1e-38)
 
 @cache
 def sources() -> tuple[str]:
-    """Return a hash of all sources that kernels are made from."""
+    """Return a hash of all source files that kernels may depend on."""
     digest = sha256()
     for path in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(path.read_bytes())
     return (digest.hexdigest(),)
 
 
-# What compiling and running have in common; division by 0 is as in NumPy. A wrapper to call a function from C, or from
-# Python, takes LLVM as long as the function itself.
+# Division by 0 follows NumPy. Wrappers for calls from C or Python are left out where possible, because LLVM takes as
+# long for a wrapper as for the function itself.
 _OPTIONS: Any = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
 _PART_OPTIONS: Any = {**_OPTIONS, "no_cpython_wrapper": True}
 
@@ -68,32 +69,36 @@ def kernel(function: Callable[..., Any]) -> Any:
     """Compile a function at its first call and keep the machine code on disk."""
     try:
         compiled: Any = njit(function, cache=True, **_OPTIONS)
-    except RuntimeError:  # there is no folder for it
+    except RuntimeError:  # there is no writable folder for the cache
         return njit(function, **_OPTIONS)
     if compiled is function:
-        # NUMBA_DISABLE_JIT is set. Machine code wraps integers around silently, so NumPy must not warn.
+        # NUMBA_DISABLE_JIT is set. Integers overflow silently in machine code, so NumPy must not warn either.
         return np.errstate(over="ignore")(function)
-    # Numba keeps the code for as long as the function's own file is unchanged, even if it calls functions of others.
+    # By default Numba reuses cached code while the function's own file is unchanged, although functions that it calls
+    # in other files may have changed. This stamp covers all files.
     compiled._cache._cache_file._source_stamp = sources()
     return compiled
 
 
 def part(function: Callable[..., Any]) -> Any:
-    """Compile a function that kernels call for many rows; Python cannot call it."""
+    """Compile a function that kernels call for many rows. Python cannot call it."""
     return njit(function, **_PART_OPTIONS)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Compile a function that kernels call for one row; inlined, since a loop with a call is not vectorised."""
+    """Compile a function that kernels call for one row.
+
+    The function is inlined, because LLVM does not vectorise loops that contain calls.
+    """
     return njit(function, forceinline=True, **_PART_OPTIONS)
 
 
 @inlined
 def unsigned(index: Any) -> Any:
-    """Return an index that is not negative, unsigned.
+    """Return a nonnegative index as an unsigned integer.
 
-    A signed sum may be negative for all that Numba knows, which then tests whether to count from the array's end. With
-    this test a loop does not become vector instructions.
+    Numba cannot know that a signed sum is nonnegative, so it tests whether to count from the array's end. That test
+    keeps a loop from being vectorised.
     """
     return uint64(index)
 
@@ -113,13 +118,13 @@ def _mix(h: Any) -> Any:
 
 @inlined
 def stream_hash(seed: Any, stream: Any) -> Any:
-    """Return what a folded seed and a stream contribute to the keys of all episodes."""
+    """Return the hash of a folded seed and a stream, from which the keys of all episodes derive."""
     return _mix(uint32(seed) ^ uint32(0x2545F491 + 0x01234567 * stream))
 
 
 @inlined
 def stream_step(stream: Any) -> Any:
-    """Return the step of a stream, which `uniform` takes."""
+    """Return the step of a stream, for `uniform` and `normal`."""
     return uint32(_STREAM_STEPS[stream])
 
 
@@ -131,7 +136,7 @@ def episode_hash(key: Any, environment: Any, episode: Any) -> Any:
 
 @inlined
 def uniform(bits: Any, step: Any, index: Any) -> Any:
-    """Return float32 in (0, 1): number `index` of a key."""
+    """Return uniform number `index` of a key, float32 in (0, 1)."""
     drawn = _mix(uint32(bits + uint32(uint32(index) * step))) >> uint32(9)
     return (np.float32(int32(drawn)) + HALF) * _UNIT
 
@@ -145,7 +150,10 @@ def normal(bits: Any, step: Any, index: Any) -> Any:
 
 @inlined
 def sin_cos(angle: Any) -> Any:
-    """Return sine and cosine of a float32 angle of a few turns, to float32 accuracy; without a branch or a call."""
+    """Return sine and cosine of a float32 angle of up to a few turns, to float32 accuracy.
+
+    The function has no branch and no call, so that loops over it are vectorised.
+    """
     quarters = (angle * _QUARTERS + _ROUNDING) - _ROUNDING
     rest = (angle - quarters * _QUARTER_HIGH) - quarters * _QUARTER_LOW
     square = rest * rest
@@ -160,10 +168,13 @@ def sin_cos(angle: Any) -> Any:
 
 @inlined
 def atan2(y: Any, x: Any) -> Any:
-    """Return the angle of a finite float32 vector, within 2.5 units in the last place; without a branch or a call."""
+    """Return the angle of a finite float32 vector, within 2.5 units in the last place.
+
+    The function has no branch and no call, so that loops over it are vectorised.
+    """
     width, height = abs(x), abs(y)
     ratio = min(width, height) / max(max(width, height), _TINY)
-    # Pairs of terms do not wait for one another.
+    # Evaluated in pairs of terms, which the processor can compute in parallel.
     square = ratio * ratio
     fourth = square * square
     low = (_ATAN_3 + square * _ATAN_5) + fourth * (_ATAN_7 + square * _ATAN_9)
@@ -175,16 +186,15 @@ def atan2(y: Any, x: Any) -> Any:
     return -angle if np.signbit(y) else angle
 
 
-# What the kernels of all `CounterEnv`s share: the modes, the first places in their settings, and the last rows of their
-# integers.
+# All kernels share the following: the modes, the first places of the settings, and the last rows of the integers.
 #
 # Each kernel has its own loop over the rows. A factory that closes over the problem's functions would compile the loop
-# anew in every process, because Numba's cache on disk never hits for closures over compiled functions.
+# again in every process, because Numba's cache on disk never hits for closures over compiled functions.
 ACT, ACT_OR_RESTART, ACT_AND_RESTART, RESTART = range(4)
 SEED, EPISODE_STREAM, NOISE_STREAM, FIRST_ENV, MAX_STEPS, NUM_OPTIONS, OWN = range(7)
 STEPS_ROW, OUTCOME_ROW, EPISODE_ROW = -3, -2, -1
 
-_FEW = 16  # parameters of a row that lie within a line of the cache
+_FEW = 16  # number of parameters that fit one cache line
 
 
 @part
@@ -198,7 +208,7 @@ def all_below(numbers: Any, limit: Any) -> Any:
 
 @part
 def all_finite(values: Any) -> Any:
-    """Return whether all values `[N, P]`, which lie one after another in memory, are finite."""
+    """Return whether all values `[N, P]`, contiguous in memory, are finite."""
     are_finite = True
     given = values.reshape(-1)
     for place in range(len(given)):
@@ -210,20 +220,21 @@ def all_finite(values: Any) -> Any:
 def invalid_row(
     option: Any, discrete: Any, parameters: Any, places: Any, integers: Any, settings: Any, mode: Any
 ) -> Any:
-    """Return the first row whose option or action is unknown or has a parameter that is not finite, or -1.
+    """Return the first row with an unknown option, an unknown action or a parameter that is not finite, or -1.
 
     Args:
-        option: int64 `[N]`; it counts if the agent chooses among options.
-        discrete: int64 `[N]`.
-        parameters: float32 `[N, P]`, of all actions, side by side.
-        places: int64 `[K + 1]`; the parameters of action k are those from `places[k]` to `places[k + 1]`.
-        integers: of the state.
-        settings: of the problem.
-        mode: with ACT_OR_RESTART, rows that start anew may have any action; with RESTART, all rows may.
+        option: options, int64 `[N]`, read only if the agent chooses among options.
+        discrete: discrete actions, int64 `[N]`.
+        parameters: parameters of all actions side by side, float32 `[N, P]`.
+        places: int64 `[K + 1]`. The parameters of action k lie from `places[k]` to before `places[k + 1]`.
+        integers: integer columns of the state.
+        settings: settings of the problem.
+        mode: with ACT_OR_RESTART, rows that start an episode may have any action. With RESTART, all rows may.
     """
     if mode == RESTART:
         return -1
-    # All at once: a branch on each row's action cost a sixth of Catch Point's step. The loop below finds the row.
+    # First check all rows at once: a branch on each row's action took a sixth of Catch Point's step. The loop below
+    # finds the row.
     num_options = settings[NUM_OPTIONS]
     are_known = all_below(discrete, len(places) - 1) and (num_options == 0 or all_below(option, num_options))
     if parameters.shape[1] <= _FEW and are_known and all_finite(parameters):
@@ -241,7 +252,7 @@ def invalid_row(
 
 @inlined
 def parameter(parameters: Any, row: Any, number: Any, action: Any, places: Any, bounds: Any) -> Any:
-    """Return a parameter of the chosen action, clipped to its bounds `[2, P]`; 0 where it has none of this number."""
+    """Return a parameter of the chosen action, clipped to its bounds `[2, P]`, or 0 if it has no such parameter."""
     place = places[action] + number
     if place >= places[action + 1]:
         return ZERO
@@ -257,13 +268,13 @@ def _row_rng(settings: Any, stream_place: Any, row: Any, episode: Any) -> Any:
 
 @inlined
 def noise_rng(settings: Any, row: Any, episode: Any) -> Any:
-    """Return bits and step of the random numbers within an episode, which `uniform` and `normal` take."""
+    """Return bits and step of the random numbers within an episode, for `uniform` and `normal`."""
     return _row_rng(settings, NOISE_STREAM, row, episode)
 
 
 @inlined
 def new_episode(integers: Any, row: Any, settings: Any) -> Any:
-    """Count a row's new episode, with no steps yet; return bits and step of the random numbers of its start."""
+    """Begin a row's next episode and return bits and step of the random numbers of its start."""
     episode = integers[EPISODE_ROW, row] + 1
     integers[STEPS_ROW, row], integers[OUTCOME_ROW, row], integers[EPISODE_ROW, row] = 0, 0, episode
     return _row_rng(settings, EPISODE_STREAM, row, episode)
@@ -271,7 +282,7 @@ def new_episode(integers: Any, row: Any, settings: Any) -> Any:
 
 @inlined
 def end_step(integers: Any, row: Any, outcome: Any, num_outcomes: Any, settings: Any) -> None:
-    """Count a row's step, and keep its outcome; an episode that would go on may run out of time."""
+    """Count a row's step and store its outcome, which is the time limit if an unfinished episode reaches it."""
     steps = integers[STEPS_ROW, row] + 1
     is_late = (outcome == 0) & (steps >= settings[MAX_STEPS])
     integers[STEPS_ROW, row], integers[OUTCOME_ROW, row] = steps, num_outcomes - 1 if is_late else outcome
@@ -279,7 +290,7 @@ def end_step(integers: Any, row: Any, outcome: Any, num_outcomes: Any, settings:
 
 @inlined
 def report(outcome: Any, num_outcomes: Any, row: Any, outcomes: Any, flags: Any) -> None:
-    """Write an outcome int64 `[N]` and the flags bool `[3, N]`: done, terminated, truncated."""
+    """Write a row's outcome, int64 `[N]`, and flags, bool `[3, N]`: done, terminated, truncated."""
     outcomes[row] = outcome
     is_late = outcome == num_outcomes - 1
     flags[0, row] = outcome != 0
@@ -289,7 +300,15 @@ def report(outcome: Any, num_outcomes: Any, row: Any, outcomes: Any, flags: Any)
 
 @inlined
 def must_restart(mode: Any, reading: Any, was_over: Any, outcome: Any, is_marked: Any) -> Any:
-    """Return whether a row starts anew before a reading, given how its episode was before the action and is now."""
+    """Return whether a row starts a new episode before a reading.
+
+    Args:
+        mode: mode of the kernel.
+        reading: number of the reading, 0 or 1.
+        was_over: whether the row's episode was over before the action.
+        outcome: outcome of the row now.
+        is_marked: whether the caller asked the row to restart.
+    """
     if mode == RESTART:
         return is_marked
     if mode == ACT_OR_RESTART:

@@ -1,4 +1,4 @@
-"""A point agent in the plane and a fixed target: what Catch Point and Hard Move have in common.
+"""A point agent in the plane and a fixed target: the rules that Catch Point and Hard Move share.
 
 Source: the code of Li et al. 2022 (HyAR), arXiv:2109.05490.
 """
@@ -14,49 +14,49 @@ from hpamdp.env import counter_rng
 from hpamdp.env.counter_rng import RngKey
 
 OBSERVATION_NAMES = ("vx", "vy", "target_dx", "target_dy")
-VECTORS = ((0, 1), (2, 3))  # of the observation
+VECTORS = ((0, 1), (2, 3))  # places of (x, y) pairs in the observation
 HIT_RADIUS = 0.2
 HIT_REWARD = 20.0
-TOP_SPEED = 0.8  # full force against the drag, in lengths a unit of time
+TOP_SPEED = 0.8  # length per unit of time at which full force and drag balance
 _DRAG, _GAIN, _TICK = 0.75, 0.1, 0.1
-# An agent that is let go covers this many times its speed.
+# Without force, an agent glides this many times its speed until it rests.
 GLIDE = _DRAG * _TICK / (1.0 - _DRAG)
-# In the next step alone it covers this many times its speed.
+# In the next step alone it glides this many times its speed.
 NEXT_GLIDE = _DRAG * _TICK
-# What a unit of force adds to the place where the agent comes to rest.
+# Distance by which one unit of force moves the point where the agent comes to rest.
 REACH = _GAIN * _TICK / (1.0 - _DRAG)
 
 
 class Located(Protocol):
-    """Columns `[N]`, among them the places of the agents."""
+    """Columns `[N]` that include the positions of the agents."""
 
     @property
     def x(self) -> Tensor:
-        """Of the agent."""
+        """The agents' x."""
 
     @property
     def y(self) -> Tensor:
-        """Of the agent."""
+        """The agents' y."""
 
 
 class PointState(Located, Protocol):
-    """Columns `[N]`, among them places and velocities of the agents, and the places of their targets."""
+    """Columns `[N]` that include the agents' positions and velocities, and the targets' positions."""
 
     @property
     def vx(self) -> Tensor:
-        """Of the agent."""
+        """The agents' velocity in x."""
 
     @property
     def vy(self) -> Tensor:
-        """Of the agent."""
+        """The agents' velocity in y."""
 
     @property
     def target_x(self) -> Tensor:
-        """Of the target."""
+        """The targets' x."""
 
     @property
     def target_y(self) -> Tensor:
-        """Of the target."""
+        """The targets' y."""
 
 
 def start(rng: RngKey) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -66,25 +66,25 @@ def start(rng: RngKey) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def move(state: PointState, force_x: Tensor, force_y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return x, y, vx and vy after one step with the force, `[N]` each."""
+    """Return x, y, vx and vy after one step under a force, `[N]` each."""
     vx = _DRAG * state.vx + _GAIN * force_x
     vy = _DRAG * state.vy + _GAIN * force_y
     return state.x + _TICK * vx, state.y + _TICK * vy, vx, vy
 
 
 def squared_distance(state: PointState, x: Tensor, y: Tensor) -> Tensor:
-    """Return the squared distance `[N]` of the target from an agent at (x, y)."""
+    """Return the squared distance `[N]` between the target and an agent at (x, y)."""
     return (state.target_x - x).square() + (state.target_y - y).square()
 
 
 def observe(state: PointState) -> Tensor:
-    """Return the observation `[N, 4]`, whose entries are OBSERVATION_NAMES."""
+    """Return the observation `[N, 4]` with the entries OBSERVATION_NAMES."""
     return torch.stack([state.vx, state.vy, state.target_x - state.x, state.target_y - state.y], -1)
 
 
 def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:
-    """Return the lowest and the highest observation that can come up within this many steps."""
-    # A little more than what full force reaches, for rounding.
+    """Return the lowest and the highest observation that this many steps can reach."""
+    # The factor 1.001 allows for rounding.
     speed = 1.001 * TOP_SPEED
     offset = 2.0 + speed * _TICK * max_steps
     high = [speed, speed, offset, offset]
@@ -92,5 +92,8 @@ def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:
 
 
 def rest_offset(state: PointState, glide: float) -> tuple[Tensor, Tensor]:
-    """Return where the target lies from the place that the agent reaches by `glide` times its speed, `[N]` each."""
+    """Return the x and y offset of the target from the point `glide` times the velocity ahead of the agent, `[N]` each.
+
+    With GLIDE that is the point where the agent comes to rest, with NEXT_GLIDE its position after the next step.
+    """
     return state.target_x - state.x - glide * state.vx, state.target_y - state.y - glide * state.vy

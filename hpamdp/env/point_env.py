@@ -18,24 +18,25 @@ from hpamdp.settings import Settings
 
 
 class PointColumns(EpisodeColumns, Located, Protocol):
-    """Columns `[N]` of episodes, among them the places of the agents and of their targets."""
+    """Columns `[N]` of episodes that include the positions of the agents and of their targets."""
 
     @property
     def target_x(self) -> Tensor:
-        """Of the target."""
+        """The targets' x."""
 
     @property
     def target_y(self) -> Tensor:
-        """Of the target."""
+        """The targets' y."""
 
 
 PointEpisode = TypeVar("PointEpisode", bound=PointColumns)
 
 
 class PointEnv(CounterEnv[PointEpisode], Generic[PointEpisode]):
-    """`num_envs` copies of a problem with a point and a target.
+    """A batch of environments in which a point must reach a target.
 
-    With `oracle`, the action of a hand-written player is written under `oracle` (`discrete`, `parameters` `[N, 1]`).
+    If `oracle` is true, the environment writes the action of a scripted player under `oracle` (`discrete`,
+    `parameters` `[N, 1]`).
     For the other arguments and errors see `CounterEnv`.
     """
 
@@ -58,16 +59,16 @@ class PointEnv(CounterEnv[PointEpisode], Generic[PointEpisode]):
 
     @classmethod
     def facts(cls, options: Any) -> ProblemFacts:
-        """Return what these settings tell of the problem."""
+        """Return the facts about the problem under these settings."""
         return ProblemFacts(title=cls.__name__, has_oracle=True)
 
     @property
     def position(self) -> Tensor:
-        """Where the agents are, `[N, 2]`."""
+        """The agents' positions, `[N, 2]`."""
         return torch.stack([self.state.x, self.state.y], -1)
 
     def draw(self, track: Sequence[PointEpisode]) -> np.ndarray:
-        """Return a picture of the agent's way to the target, uint8 `[480, 480, 3]`."""
+        """Return a picture of the agent's path to the target, uint8 `[480, 480, 3]`."""
         last = track[-1]
         outcome = int(last.outcome)
         return point_pictures.draw(
@@ -87,8 +88,11 @@ class PointEnv(CounterEnv[PointEpisode], Generic[PointEpisode]):
 
     @abstractmethod
     def picture_note(self, state: PointEpisode) -> str:
-        """Return what a picture says of the state of one environment, columns `[1]`, beside the number of steps."""
+        """Return a note for the picture of one environment's state, columns `[1]`.
+
+        The picture shows it beside the number of steps.
+        """
 
     def heading(self, state: PointEpisode) -> float | None:
-        """Return where the agent of one environment looks, rad; None where it has no front."""
+        """Return the heading (rad) of one environment's agent, or None if the agent has no front."""
         return None

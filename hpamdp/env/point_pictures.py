@@ -1,4 +1,4 @@
-"""Pictures of a point's way to a target in the square [-1, 1]^2, and around it where the point leaves it."""
+"""Pictures of a point's path to a target in the square [-1, 1]^2. The view widens if the point leaves the square."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ _FIELD, _RIM = "#ffffff", "#c9c5ba"
 _PATH, _BODY = "#2f6690", "#1d3f58"
 _TARGET, _TARGET_EDGE = "#f4dfb0", "#c8963e"
 _MARGIN = 44.0  # units of paper around the square
-_SCALE = PAPER / 2.0 - _MARGIN  # units of paper for each unit of length, while all are near the square
-_VISIBLE = 1.15  # coordinates that the margin has room for; beyond them, the picture shows a wider field
+_SCALE = PAPER / 2.0 - _MARGIN  # units of paper per unit of length, unless the view widens
+_VISIBLE = 1.15  # the margin shows coordinates up to this; beyond it, the view widens
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a picture shows, y up.
+    """The content of a picture, with y pointing up.
 
     Attributes:
         path: the agent's positions so far, at least one.
-        target, radius: the target's centre and the distance that counts as a hit.
-        outcome: its name, written once the episode is over.
-        is_over, is_success: whether the episode has ended, and well.
+        target, radius: the target's centre, and the distance that counts as a hit.
+        outcome: name of the outcome, shown once the episode is over.
+        is_over, is_success: whether the episode has ended, and whether it succeeded.
         steps: number of actions so far.
-        note: written beside it.
-        heading: where the agent looks, rad; None where it has no front.
+        note: text shown beside the number of steps.
+        heading: heading of the agent, rad. None if the agent has no front.
         has_walls: whether the agent must stay within the square.
     """
 
@@ -50,7 +50,7 @@ def draw(scene: Scene, size: int = 480) -> np.ndarray:
     """Return a picture of the scene, uint8 `[size, size, 3]`."""
     canvas = Canvas.for_shapes(size)
     farthest = max(abs(coordinate) for point in (*scene.path, scene.target) for coordinate in point)
-    scale = _SCALE / max(1.0, farthest / _VISIBLE)  # units of paper for each unit of length
+    scale = _SCALE / max(1.0, farthest / _VISIBLE)  # units of paper per unit of length
 
     def on_paper(point: Point) -> Point:
         return PAPER / 2.0 + point[0] * scale, PAPER / 2.0 - point[1] * scale
@@ -63,7 +63,7 @@ def draw(scene: Scene, size: int = 480) -> np.ndarray:
     path = [on_paper(point) for point in scene.path]
     for start, end in itertools.pairwise(path):
         canvas.line(start, end, _PATH, 2.0)
-    # Of a long way, single steps cannot be told apart.
+    # On a long path, dots for single steps would merge.
     for point in path[1:-1] if len(path) < 60 else ():
         canvas.disc(point, 2.0, _PATH)
     canvas.disc(path[0], 5.0, BACKGROUND, INK, 2.0)

@@ -1,4 +1,4 @@
-"""States as named tuples of columns: tensors with one row for each environment."""
+"""States as named tuples of columns. A column is a tensor with one row per environment."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ State = TypeVar("State", bound=Columns)
 
 def where(mask: Tensor, new: State, old: State) -> State:
     """Return `new` in the rows of `mask` `[N]` and `old` in the others."""
-    # A column that both states share needs no `torch.where`.
+    # Skip columns that both states share.
     return type(old)(*(o if n is o else torch.where(mask, n, o) for n, o in zip(new, old, strict=True)))
 
 
 def replaced(state: State, **columns: Tensor) -> State:
-    """Return the state with other columns in the place of those of the same names."""
+    """Return the state with some columns replaced by name."""
     return type(state)(*{**state._asdict(), **columns}.values())
 
 
 def from_arrays(kind: type[State], arrays: Iterable[np.ndarray]) -> State:
-    """Return a state whose columns share the memory of the arrays, `[N]` each."""
+    """Return a state whose columns share memory with the arrays, `[N]` each."""
     return kind(*(torch.from_numpy(array) for array in arrays))
 
 
@@ -54,10 +54,10 @@ def overwrite(state: State, new: State) -> None:
 
 
 def check_range(columns: Mapping[str, Tensor], limits: Mapping[str, tuple[int, int]]) -> None:
-    """Refuse columns with numbers below their first limit, or at or above their second one.
+    """Check that every column lies within its limits (lowest value, highest value + 1).
 
     Raises:
-        ValueError: the message names the first such column.
+        ValueError: a column lies outside. The message names the first such column.
     """
     for name, (low, high) in limits.items():
         column = columns[name]
@@ -66,15 +66,15 @@ def check_range(columns: Mapping[str, Tensor], limits: Mapping[str, tuple[int, i
 
 
 def restored(saved: Mapping[str, Tensor], current: State, owner: str) -> State:
-    """Return the state that was saved as `_asdict`, with the dtypes and devices of the current one.
+    """Return the state saved by `_asdict`, with the dtypes and devices of the current state.
 
     Args:
-        saved: the columns by name.
+        saved: columns by name.
         current: a state of the same environments.
         owner: name of the environment's class, for the error.
 
     Raises:
-        ValueError: a column is missing, unknown, or of another number of environments.
+        ValueError: a column is missing or unknown, or has another shape.
     """
     if set(saved) != set(current._fields):
         raise ValueError(f"{owner}: the state has {', '.join(current._fields)}, not {', '.join(saved)}")

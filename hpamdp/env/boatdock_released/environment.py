@@ -1,10 +1,12 @@
-"""The boat-docking environment that was released with the benchmark's paper, whose rules differ from the paper's.
+"""The boat-docking environment released with the benchmark's paper. Its rules differ from the paper's.
 
 Source: the code released with *A Benchmark for Hierarchical Parameterized Action Markov Decision Process*. It is kept
-to put the paper's table in context; `experiments/released` shows why returns here do not measure skill. It shares
-none of its rules with `BoatDockEnv`.
-Differs from the source: many boats at once; layouts come from counters instead of NumPy's global generator; `scaled`
-observations and a new layout for each episode are possible.
+to put the paper's table in context. `experiments/released` shows why returns here do not measure skill. It shares no
+rules with `BoatDockEnv`.
+Differs from the source:
+- It simulates many boats at once.
+- Layouts come from counters instead of NumPy's global generator.
+- Observations may be `scaled`, and each episode may have a new layout.
 """
 
 from __future__ import annotations
@@ -33,52 +35,59 @@ class ReleasedBoatDockOptions(Settings):
     """Settings of `ReleasedBoatDockEnv`."""
 
     controller: Literal["congruent", "incongruent"] = "congruent"
-    """Which boat it is. The agent cannot choose, so use high=none."""
+    """The boat. The agent cannot choose it, so use high=none."""
     keymap: Literal[0, 1] = 0
-    """Key map of the incongruent boat: 1, or 0, which is sampled from {0, 1} at every reset until it is 1.
+    """Key map of the incongruent boat. If 0, it is sampled from {0, 1} at every reset until it is 1.
 
-    0 has the keys of key map 2 of env=boatdock. The congruent boat observes -1.
+    Key map 0 has the keys of key map 2 in env=boatdock. The congruent boat observes -1.
     """
     test_mode: Literal[0, 1, None] = None
-    """1: only layouts whose bearing is within 30 degrees of the incongruent boat's directions; 0: only the others.
+    """If 1, only layouts with a bearing within 30 degrees of the incongruent boat's directions. If 0, only the others.
 
     If None, all layouts.
     """
     frozen_layouts: bool = True
-    """Whether an environment keeps the layout of its first reset, as released, or has a new one every episode."""
+    """Keep the layout of the first reset for all episodes, as released. If false, every episode has a new layout."""
     observation: Literal["pixels", "scaled"] = "pixels"
-    """`pixels` `[N, 15]` as released, or `scaled` to about [-1, 1] with goal - boat appended, `[N, 17]`.
+    """`pixels` `[N, 15]` as released, or `scaled` `[N, 17]` to about [-1, 1] with goal - boat appended.
 
     If scaled, fuel is log(1 + fuel / 5).
     """
     max_steps: PositiveInt = 999
-    """Steps after which an episode is truncated; released: 999."""
+    """Number of steps after which an episode is truncated. The released code uses 999."""
 
 
 class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
-    """Dock boats by the rules of the released code in `num_envs` environments at once.
+    """A batch of boats under the rules of the released code.
 
-    Action leaves: `("action", "discrete")` int64 `[N]`, the key, in {0, 1, 2}; `("action", "parameters")` float32
-    `[N, 3]`, a duration u in [-1, 1] for each key. Only the pressed key's duration counts; outside its bounds it is
-    clipped, NaN and infinity are refused. A press takes 2.5 (u + 1) seconds and u fuel, so u < 0 *re*fuels.
+    Action leaves:
+    - `("action", "discrete")`: the key, in {0, 1, 2}, int64 `[N]`.
+    - `("action", "parameters")`: a duration u in [-1, 1] for each key, float32 `[N, 3]`. Only the pressed key's
+      duration counts. It is clipped to its bounds. NaN and infinity are errors.
 
-    Docking earns 10 x fuel / 5, an empty tank -1, the left and the upper wall and the time limit 0; any other press
-    earns the decrease of the distance to the goal, as a share of the distance at the start. The step that ends an
-    episode shows the boat and the distance from before it.
+    A press takes 2.5 (u + 1) seconds and burns u units of fuel, so u < 0 *re*fuels.
 
-    An environment keeps its controller for life, so that no selector goes with it.
+    Rewards:
+    - Docking gives 10 x fuel / 5.
+    - An empty tank gives -1.
+    - The left wall, the upper wall and the time limit give 0.
+    - Any other press gives the decrease of the distance to the goal, as a fraction of the distance at the start.
+
+    The observation after an episode's last step shows the boat and the distance from before that step.
+
+    An environment always keeps its controller, so no selector can be used with it.
 
     Args:
         num_envs: number of boats.
         options: the settings; None for the defaults.
-        dtype: `float32` or `float64`, of the computation and its results; durations are always rounded in float32.
-        device: of the tensors.
-        seed: of layouts and key maps; the global generators are neither read nor moved.
-        first_env: number of the first boat, if other processes have those before it.
-        settings: single settings by name, in place of those in `options`.
+        dtype: `float32` or `float64`, of the computation and its results. Durations are always rounded in float32.
+        device: device of the tensors.
+        seed: seed of layouts and key maps. The global generators are not used.
+        first_env: number of the first boat. It is above 0 if other processes hold earlier boats.
+        settings: single settings by name, which replace those in `options`.
 
-    `reset` also takes layouts to play, and keep: a tensordict with `start` and `goal` `[N, 2]` in screen px and, for
-    the incongruent boat, optionally `keymap` int `[N]`.
+    `reset` also takes layouts, which the environments keep: a tensordict with `start` and `goal` `[N, 2]` in screen px
+    and, for the incongruent boat, optionally `keymap` int `[N]`.
 
     Raises:
         ValueError: an argument, action or layout is invalid; the state is unchanged.
@@ -117,11 +126,11 @@ class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
         self._directions = torch.tensor(directions, dtype=self.float_type, device=self.device)
 
     def seed_evaluation(self, seed: int) -> None:
-        """Seed the key maps of an evaluation, whose layouts are those of `fixed_episodes`."""
+        """Seed the key maps of an evaluation. Its layouts come from `fixed_episodes`."""
         PAMDPEnv.seed_evaluation(self, seed)
 
     def fixed_episodes(self, seed: int) -> TensorDict:
-        """Return layouts to `reset` with, one for each boat, from another stream than those of training."""
+        """Return evaluation layouts for `reset`, one per boat. Their random stream is not that of training."""
         episode = torch.zeros_like(self._environment)
         seed_tensor = counter_rng.seed_tensor(seed, self.device)
         rng = counter_rng.rng_key(seed_tensor, counter_rng.EVALUATION, self._environment, episode)
@@ -130,37 +139,40 @@ class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
         return TensorDict(layout, batch_size=self.batch_size, device=self.device)
 
     def describe(self) -> dict[str, Tensor]:
-        """Return `start` and `goal` `[N, 2]` of the episodes, screen px."""
+        """Return `start` and `goal` of the episodes, `[N, 2]` screen px."""
         points = torch.stack(self._state[:4], -1)
         return {"start": points[:, :2], "goal": points[:, 2:]}
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
-        """Return `outcome` and `success` `[M]`; the score is the return, as there is no measure of skill."""
+        """Return `outcome` and `success` `[M]`. There is no score of its own, so the return serves as the score."""
         outcome = last.get(keys.OUTCOME)
         return {"outcome": outcome, "success": outcome == released.SUCCESS}
 
     def summary_entries(self) -> dict[str, str]:
-        """Return which `controller` the boats have."""
+        """Return the `controller` of the boats."""
         return {"controller": self.options.controller}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
-        """Return the shares of the outcomes other than success. There is no ceiling: idling refuels without limit."""
+        """Return the fraction of episodes with each outcome but success.
+
+        There is no ceiling, because idling refuels without limit.
+        """
         return {
             released.OUTCOMES[code]: float((played["outcome"] == code).mean())
             for code in (released.WALL, released.OUT_OF_FUEL, released.TIME_LIMIT)
         }
 
     def check_env_state(self, columns: Mapping[str, Tensor]) -> None:
-        """Refuse key maps, counters and outcomes that do not exist.
+        """Check that key maps, counters and outcomes are valid.
 
         Raises:
-            ValueError: a number is invalid.
+            ValueError: a number is out of range.
         """
         super().check_env_state(columns)
         check_range(columns, {"keymap": (released.NO_KEYMAP, 2)})
 
     def start(self, episode: Tensor, rng: RngKey) -> ReleasedState:
-        """Return boats that have no layout yet."""
+        """Return the states of boats that have no layout yet."""
         integer_zeros = torch.zeros_like(episode)
         zeros = integer_zeros.to(self.float_type)
         keymap = released.NO_KEYMAP if self._is_congruent else self.options.keymap
@@ -170,7 +182,10 @@ class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
         )
 
     def restart(self, state: ReleasedState, mask: Tensor) -> ReleasedState:
-        """Return the states with new episodes in the rows of `mask` `[N]`; they keep more than elsewhere."""
+        """Return the states with new episodes in the rows of `mask` `[N]`.
+
+        As released, boats keep their velocity, a key map of 1, and by default their layout.
+        """
         episode = state.episode + 1
         rng = counter_rng.rng_key(self._seed, counter_rng.TRAINING, self._environment, episode)
         points = torch.stack(state[:4], -1)
@@ -187,7 +202,7 @@ class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
             goal_y=goal_y,
             x=start_x,
             y=start_y,
-            # As released, the velocity stays that of the previous episode's last press.
+            # As released, the velocity of the previous episode's last press remains.
             fuel=torch.full_like(state.fuel, released.TANK),
             keymap=torch.where(state.keymap == 0, sampled, state.keymap),
             steps=torch.zeros_like(state.steps),

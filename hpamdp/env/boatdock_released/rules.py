@@ -1,8 +1,10 @@
-"""The rules of the boat-docking environment that was released with the benchmark's paper, as pure functions on columns.
+"""The rules of the boat-docking environment released with the benchmark's paper, as pure functions on columns.
 
 Source: the code released with *A Benchmark for Hierarchical Parameterized Action Markov Decision Process*. All oddities
-are that code's own. Rules that never apply are left out: that code also ends episodes more than 125 px from the centre
-and at walls on the right and below, but holds the boat within 109 px of the centre and short of these walls.
+are that code's own.
+Differs from the source: rules that can never apply are left out. The released code also ends episodes more than 125 px
+from the centre, and at the right and lower walls. But it keeps the boat within 109 px of the centre and off these
+walls.
 """
 
 from __future__ import annotations
@@ -36,7 +38,7 @@ OBSERVATION_NAMES = (
 )
 SCALED_NAMES = (*OBSERVATION_NAMES, "to_goal_x", "to_goal_y")
 
-# Screen px. Start and goal are whole numbers in [LOW, LOW + SIZE); the boat is held in [LOW, HIGH].
+# Screen px. Start and goal are integers in [LOW, LOW + SIZE); the boat is clamped to [LOW, HIGH].
 CENTRE = (640.0, 512.0)
 RADIUS = 120.0
 LOW = (563.0, 435.0)
@@ -45,12 +47,12 @@ SIZE = 154
 MIN_SEPARATION = 100.0
 DOCK = 10.0  # half the side of the square around the goal in which a boat docks
 TANK = 5.0
-EMPTY = 1e-6  # with no more fuel than this the tank is empty
+EMPTY = 1e-6  # the tank counts as empty at or below this
 SUCCESS_REWARD = 10.0
-NO_KEYMAP = -1  # what the congruent boat observes
+NO_KEYMAP = -1  # the key map that the congruent boat observes
 _TICK = 0.02  # seconds
-_COS30 = 0.866  # sic
-# Directions by key map (the congruent boat has only one) and key.
+_COS30 = 0.866  # rounded in the released code
+# Directions by key map and key. The congruent boat has only one key map.
 DIRECTIONS = {
     "congruent": (((-_COS30, 0.5), (0.0, -1.0), (_COS30, 0.5)),),
     "incongruent": (
@@ -58,19 +60,19 @@ DIRECTIONS = {
         ((_COS30, -0.5), (-_COS30, -0.5), (0.0, 1.0)),
     ),
 }
-# Test mode 1 has the layouts whose bearings (y down) are within 30 degrees of one of these.
+# Test mode 1 keeps the layouts whose bearing (y down) lies within 30 degrees of one of these.
 _TEST_BEARINGS = ((0.0, 1.0), (-math.sqrt(3.0) / 2.0, -0.5), (math.sqrt(3.0) / 2.0, -0.5))
-# Indices of an episode's random numbers: one for the key map, then four for each try at a layout.
+# Indices of an episode's random numbers: one for the key map, then four for each candidate layout.
 INDEX_KEYMAP = 0
 _INDEX_LAYOUT = 1
-_TRIES = 32  # at a layout, made together
+_TRIES = 32  # candidate layouts that are sampled together
 
 
 class ReleasedState(NamedTuple):
-    """Columns `[N]`.
+    """The state of N boats, columns `[N]`.
 
-    `x` and `y` are where the boat is *shown*: at the start, even outside its bounds, until the first move. `episode` is
-    -1 before an environment's first reset, when it has no layout yet.
+    `x` and `y` are the *displayed* position. Until the first move it is the start, even if that lies outside the boat's
+    bounds. `episode` is -1 before an environment's first reset, when it has no layout yet.
     """
 
     start_x: Tensor
@@ -89,11 +91,11 @@ class ReleasedState(NamedTuple):
 
 
 def sample_layouts(rng: counter_rng.RngKey, test_mode: int | None) -> Tensor:
-    """Sample starts and goals `[M, 4]` (screen px, float64) that are far enough apart and of the test mode.
+    """Sample starts and goals `[M, 4]` (screen px, float64) that are far enough apart and match the test mode.
 
     Args:
-        rng: `[M]` from `counter_rng.rng_key`.
-        test_mode: see `ReleasedBoatDockEnv`.
+        rng: random-number keys `[M]` from `counter_rng.rng_key`.
+        test_mode: the setting of `ReleasedBoatDockEnv`.
     """
     low = torch.tensor([*LOW, *LOW], dtype=torch.float64, device=rng.bits.device)
     layout = low.repeat(len(rng.bits), 1)
@@ -115,32 +117,35 @@ def sample_layouts(rng: counter_rng.RngKey, test_mode: int | None) -> Tensor:
 
 
 def is_within_30_degrees(points: Tensor) -> Tensor:
-    """Return whether layouts `[*B, 4]`, clamped to the boat's bounds, have a bearing of test mode 1."""
+    """Return whether layouts `[*B, 4]`, clamped to the boat's bounds, belong to test mode 1."""
     low = torch.tensor([*LOW, *LOW], dtype=points.dtype, device=points.device)
     high = torch.tensor([*HIGH, *HIGH], dtype=points.dtype, device=points.device)
     points = points.clamp(low, high)
     bearing = torch.nn.functional.normalize(points[..., 2:] - points[..., :2], dim=-1)
     cosines = bearing @ torch.tensor(_TEST_BEARINGS, dtype=points.dtype, device=points.device).T
-    # Exactly 30 degrees, the offset of horizontal bearings, count as outside.
+    # Horizontal bearings are off by exactly 30 degrees. They count as outside.
     return cosines.amax(-1) > math.cos(math.radians(30.0)) + 1e-9
 
 
 def reach(seconds: Tensor) -> Tensor:
-    """Return the px that a press moves the boat: forwards up to .3 s, beyond that further and further backwards."""
+    """Return the distance (px) that a press moves the boat.
+
+    It is positive up to 0.3 s. Longer presses move the boat backwards, the longer the further.
+    """
     ticks = seconds / _TICK
     return 10.0 * _TICK * ticks.square() * (10.0 - 0.6667 * ticks)
 
 
 def press(state: ReleasedState, direction: Tensor, duration: Tensor, max_steps: int) -> tuple[ReleasedState, Tensor]:
-    """Return the states after a press, and its rewards `[N]`.
+    """Return the states after a press, and the rewards `[N]`.
 
     Args:
-        state: before the press.
-        direction: of the key, `[N, 2]`.
-        duration: the parameter u in [-1, 1], float32 `[N]`; the press takes 2.5 (u + 1) seconds.
-        max_steps: of an episode.
+        state: states before the press.
+        direction: unit direction of the key, `[N, 2]`.
+        duration: the parameter u in [-1, 1], float32 `[N]`. The press takes 2.5 (u + 1) seconds.
+        max_steps: steps after which an episode is truncated.
     """
-    # Rounded in float32 and in this order, whatever the dtype of the rest.
+    # As released, the duration is rounded in float32 and in this order, whatever the dtype of the state.
     seconds = ((duration + 1.0) / 2.0 * 5.0).to(state.fuel)
     distance = reach(seconds)
     dir_x, dir_y = direction.unbind(-1)
@@ -152,7 +157,7 @@ def press(state: ReleasedState, direction: Tensor, duration: Tensor, max_steps: 
     is_docked = (x - state.goal_x.clamp(LOW[0], HIGH[0])).abs() <= DOCK
     is_docked &= (y - state.goal_y.clamp(LOW[1], HIGH[1])).abs() <= DOCK
     outcome = torch.where(is_docked, SUCCESS, SAILING)
-    # Where several apply, the last one counts.
+    # If several outcomes apply, the last one counts.
     outcome = torch.where((x <= LOW[0]) | (y <= LOW[1]), WALL, outcome)
     outcome = torch.where(fuel <= EMPTY, OUT_OF_FUEL, outcome)
     outcome = torch.where(steps >= max_steps, TIME_LIMIT, outcome).to(state.outcome)
@@ -173,14 +178,14 @@ def press(state: ReleasedState, direction: Tensor, duration: Tensor, max_steps: 
 
 
 def _distance(state: ReleasedState) -> Tensor:
-    """Return the distance from the shown boats to their goals as a share of that from the starts, `[N]`."""
+    """Return the displayed boats' distance to the goal as a fraction of the distance at the start, `[N]`."""
     to_goal = torch.hypot(state.goal_x - state.x, state.goal_y - state.y)
     at_start = torch.hypot(state.goal_x - state.start_x, state.goal_y - state.start_y)
-    return to_goal / at_start.clamp(min=1.0)  # under 1 px only before the first reset
+    return to_goal / at_start.clamp(min=1.0)  # the clamp acts only before the first reset
 
 
 def observe(state: ReleasedState, is_congruent: bool, is_scaled: bool) -> Tensor:
-    """Return the observation, whose entries are OBSERVATION_NAMES or, if scaled, SCALED_NAMES."""
+    """Return the observation with the entries OBSERVATION_NAMES or, if scaled, SCALED_NAMES."""
     ones = torch.ones_like(state.fuel)
     fuel = state.fuel / TANK
     if is_scaled:

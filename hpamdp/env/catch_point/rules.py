@@ -1,7 +1,8 @@
 """The rules of Catch Point as pure functions on columns, in the dtype of the state.
 
 Source: Fan et al. 2019, arXiv:1903.01344; constants and rules as in the code of Li et al. 2022 (HyAR),
-arXiv:2109.05490. Differs from the source: an agent that hits the target's centre to the last digit does not lose.
+arXiv:2109.05490.
+Differs from the source: a catch at a distance of exactly 0 succeeds. In the source it loses.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ _FORCE = 2.0
 
 
 class CatchPointState(NamedTuple):
-    """Columns `[N]`: places and speeds of the agent, place of the target, catches that missed; the rest is int32."""
+    """The state of N environments, columns `[N]`.
+
+    It holds the agent's position and velocity, the target's position, and int32 counters. `misses` counts failed
+    catches.
+    """
 
     x: Tensor
     y: Tensor
@@ -40,7 +45,7 @@ class CatchPointState(NamedTuple):
 
 
 def start(episode: Tensor, rng: RngKey) -> CatchPointState:
-    """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
+    """Return the initial states of the episodes with these numbers, int32 `[N]`."""
     x, y, target_x, target_y = point_agent.start(rng)
     zeros = torch.zeros_like(x)
     none = torch.zeros_like(episode)
@@ -53,11 +58,12 @@ def act(
     """Return the states after one action in every environment, and the rewards, `[N]`.
 
     Args:
-        state: before the action.
+        state: states before the action.
         discrete: MOVE or CATCH, `[N]`.
-        parameter: direction of a move as a share of half a turn, clockwise from +y, `[N]`.
-        catches: that an episode allows.
-        late_end: whether an episode without catches ends a step after the last one, as published, in which it earns 0.
+        parameter: direction of a move as a fraction of half a turn, clockwise from +y, `[N]`.
+        catches: number of failed catches that end an episode.
+        late_end: whether the episode ends one step after the last failed catch, as published. The reward of that step
+            is 0.
     """
     is_catch = discrete == CATCH
     force = torch.where(is_catch, 0.0, _FORCE).to(parameter.dtype)
@@ -76,7 +82,7 @@ def act(
 
 
 def observe(state: CatchPointState, *, progress: bool) -> Tensor:
-    """Return the observation `[N, 4]` (speed, and target - agent) and, with `progress`, misses and time `[N, 6]`."""
+    """Return the observation `[N, 4]`: velocity, and target - agent. With `progress` add misses and time, `[N, 6]`."""
     seen = point_agent.observe(state)
     if not progress:
         return seen
@@ -86,9 +92,10 @@ def observe(state: CatchPointState, *, progress: bool) -> Tensor:
 
 
 def scripted_action(state: CatchPointState) -> tuple[Tensor, Tensor]:
-    """Return the action of a hand-written player and its parameter, `[N]` each.
+    """Return the discrete action and the parameter of a scripted player, `[N]` each.
 
-    It catches where that hits, and else pushes towards the target as seen from where the agent would glide to a halt.
+    It catches if the catch will succeed. Otherwise it pushes, in the direction from where the agent would come to rest
+    to the target.
     """
     miss_x, miss_y = point_agent.rest_offset(state, point_agent.NEXT_GLIDE)
     can_hit = miss_x.square() + miss_y.square() <= point_agent.HIT_RADIUS * point_agent.HIT_RADIUS

@@ -2,9 +2,9 @@
 
 Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644, section on the Robot Soccer Goal domain. Constants, bounds
 and rules as in gym-goal, the version of Bester, James & Konidaris 2019, arXiv:1905.04388, with the three observations
-that their learners add; the shots of Hard Goal as in HyAR, Li et al. 2022, arXiv:2109.05490.
-Differs from the source: the reach has a slack, since at the start the ball lies on its rim, where rounding would put
-every fifth ball out of reach in float32; where two bodies are in the same place, none is pushed away.
+that their learners add. The shots of Hard Goal are as in HyAR, Li et al. 2022, arXiv:2109.05490.
+Differs from the source: the player's reach has a small tolerance. At the start the ball lies exactly at the reach, and
+rounding in float32 would put every fifth ball outside. Two bodies in exactly the same place do not push each other.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ PARAMETER_LOW = (0.0, -HALF_WIDTH, -_FLOAT32_GOAL, -_FLOAT32_GOAL)
 PARAMETER_HIGH = (2.0 * LENGTH, HALF_WIDTH, _FLOAT32_GOAL, _FLOAT32_GOAL)
 PLAYER_SIZE, KEEPER_SIZE, BALL_SIZE = 0.9, 0.9, 0.4
 REACH = 1.6
-CATCH = 2.0  # distance at which the keeper has the ball
+CATCH = 2.0  # the keeper catches a ball nearer than this
 _REACH_SLACK = 1e-5
-_PLAYER_DECAY, _BALL_DECAY = 0.4, 0.94  # of the velocities, a tick
+_PLAYER_DECAY, _BALL_DECAY = 0.4, 0.94  # factors on the velocities after each tick
 _PLAYER_NOISE, _BALL_NOISE = 0.1, 0.05
-_PLAYER_SPEED, _BALL_SPEED = 1.0, 2.7  # limits of velocities and of their change in a tick, in x and in y
-_PLAYER_RATE, _BALL_RATE = 0.006, 0.027  # change of velocity for each unit of power
+_PLAYER_SPEED, _BALL_SPEED = 1.0, 2.7  # limits of velocities, and of their change in a tick, in x and in y
+_PLAYER_RATE, _BALL_RATE = 0.006, 0.027  # change of velocity per unit of power
 _MAX_POWER = 100.0
 _DASH, _SAVE, _FOLLOW = 10.0 * _PLAYER_RATE, 20.0 * _PLAYER_RATE, 8.0 * _PLAYER_RATE
 _FACING = math.pi / 8
-_SHOT_DEPTH = 0.4  # how far behind the line shots are aimed
+_SHOT_DEPTH = 0.4  # distance behind the goal line at which shots are aimed
 _KEEPER_START = 14.5
-_KEEPER_MARGIN = 2.0  # how far beside the goal the keeper still goes for a shot
-_STILL = 0.1  # speed of the ball at which a kick is over
-_COAST = 1.0 - _BALL_DECAY  # a rolling ball still covers velocity / _COAST
+_KEEPER_MARGIN = 2.0  # the keeper defends shots up to this far beside the goal
+_STILL = 0.1  # a kick is over when the ball is this slow
+_COAST = 1.0 - _BALL_DECAY  # a ball rolls another velocity / _COAST before it stops
 
 COLUMNS = (
     "player_x",
@@ -89,34 +89,35 @@ _BODY_LOW, _BODY_HIGH = (0.0, -HALF_WIDTH, -1.0, -1.0, -_FLOAT32_PI), (LENGTH, H
 OBSERVATION_LOW = (*_BODY_LOW, *_BODY_LOW, 0.0, -HALF_WIDTH, -3.0, -3.0, -1.0, -1.0, -_FLOAT32_GOAL)
 OBSERVATION_HIGH = (*_BODY_HIGH, *_BODY_HIGH, LENGTH, HALF_WIDTH, 3.0, 3.0, 1.0, 1.0, 2.0 * _FLOAT32_GOAL)
 
-# The shots of Hard Goal: stretches of the goal line, from -1 to 1, once for each foot.
+# The shots of Hard Goal: intervals of the goal line, scaled to [-1, 1]. Each interval exists once for either foot.
 STRETCHES = ((-1.0, -0.6), (-0.6, -0.2), (0.2, 0.2), (0.2, 0.6), (0.6, 1.0))
 HARD_GOAL_ACTIONS = ("kick to", *(f"shoot {side} {stretch}" for side in ("left", "right") for stretch in range(1, 6)))
 _MIDDLE = 2
 REPAIRED_MIDDLE = (-0.2, 0.2)
 
-# Random numbers of an action, six a tick: it has less than 400 ticks.
+# Random numbers of an action: six per tick, and fewer than 400 ticks.
 NUMBERS_PER_TICK = 6
 _NUMBERS_PER_ACTION = 1 << 13
-# Ticks that are simulated before it is looked up which actions are over. More: fewer look-ups, more idle ticks.
+# Ticks between two checks of which actions are over. More ticks need fewer checks but simulate more finished actions.
 _TICKS_AT_ONCE = 8
-_FEW_ROWS = 64  # of so few, leaving out those that are over saves nothing
+_FEW_ROWS = 64  # with this few rows, dropping finished ones saves nothing
 
-# How to compile `masked_tick` and `random_numbers`. They work on columns throughout, so that the compiler makes one
-# vectorised loop of a tick; with vectors `[2, M]` it makes many, and takes three times as long.
+# Arguments for compiling `masked_tick` and `random_numbers`. Both work on columns, so the compiler turns a tick into
+# one vectorised loop. With vectors `[2, M]` it makes many loops, which take three times as long.
 COMPILE_ARGUMENTS: dict[str, Any] = {"dynamic": True, "fullgraph": True}
 
 Vector = tuple[Tensor, Tensor]  # x and y, `[M]` each
 Bodies = tuple[Tensor, ...]  # the COLUMNS, `[M]` each
-# Returns the numbers in (-1, 1) `[K, 6, M]` of the ticks `[K]` of the actions in the rows `[M]`.
+# Maps ticks `[K]` and rows `[M]` to random numbers in (-1, 1) `[K, 6, M]`.
 Numbers = Callable[[Tensor, Tensor], Tensor]
-_GOING = -1  # the end of an action that is not over
+_GOING = -1  # `Motion.end` of an action that is not over
 
 
 class GoalState(NamedTuple):
-    """Columns `[N]`: positions, velocities and orientations (radians), float32 or float64; then int32.
+    """The state of N environments, columns `[N]`.
 
-    The player's orientation is not wrapped: it may leave [-pi, pi].
+    Positions, velocities and orientations (radians) are float32 or float64. The counters are int32. The player's
+    orientation is not wrapped, so it may leave [-pi, pi].
     """
 
     player_x: Tensor
@@ -139,7 +140,10 @@ class GoalState(NamedTuple):
 
 
 class Aim(NamedTuple):
-    """What the players do: where to, `[N]` each, and whether it is a kick, which ends when the ball lies still."""
+    """The point that each player kicks to, and whether it is a kick rather than a shot, `[N]` each.
+
+    A kick is over when the ball lies still.
+    """
 
     x: Tensor
     y: Tensor
@@ -147,9 +151,9 @@ class Aim(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Actions in progress, columns `[M]`: the bodies, what the players do, the outcome so far, and the ticks.
+    """Actions in progress, columns `[M]`: the bodies, the players' aims, the outcome and the number of ticks.
 
-    `end` is -1 while the action goes on, and else an outcome: PLAYING where only the action is over.
+    `end` is -1 until the action is over. Then it is an outcome: PLAYING if the episode goes on.
     """
 
     player_x: Tensor
@@ -173,16 +177,16 @@ class Motion(NamedTuple):
     ticks: Tensor
 
 
-Tick = Callable[[Motion, Tensor, float], Motion]  # as `masked_tick`
+Tick = Callable[[Motion, Tensor, float], Motion]  # the signature of `masked_tick`
 
 
 def start(episode: Tensor, rng: RngKey, dtype: torch.dtype = torch.float32) -> GoalState:
-    """Return the states in which the episodes with these numbers, int32 `[N]`, begin.
+    """Return the initial states of episodes.
 
     Args:
         episode: numbers of the episodes, int32 `[N]`.
-        rng: their keys `[N]` from `counter_rng.rng_key`.
-        dtype: of the positions.
+        rng: random-number keys `[N]` from `counter_rng.rng_key`.
+        dtype: dtype of positions, velocities and orientations.
     """
     zeros = torch.zeros_like(episode, dtype=dtype)
     integer_zeros = torch.zeros_like(episode)
@@ -218,9 +222,9 @@ def goal_aim(discrete: Tensor, parameters: Tensor, *, kicks_to_point: bool = Fal
 
     Args:
         discrete: KICK_TO, SHOOT_LEFT or SHOOT_RIGHT, `[N]`.
-        parameters: of the chosen action, `[N, 2]`: the point to kick to, or y on the goal line and a number that is
-            not read; clipped to their bounds.
-        kicks_to_point: kick to (x, y); the published code kicks to (x, x) and reads no y.
+        parameters: parameters of the chosen action, `[N, 2]`, clipped to their bounds. For a kick, the point to kick
+            to. For a shot, y on the goal line and an unused number.
+        kicks_to_point: whether a kick goes to (x, y). In the published code it goes to (x, x).
     """
     return _aim(discrete == KICK_TO, parameters[:, 0], parameters[:, 1], parameters[:, 0], kicks_to_point)
 
@@ -232,10 +236,11 @@ def hard_goal_aim(
 
     Args:
         discrete: 0 to kick, 1 to 5 and 6 to 10 to shoot at the STRETCHES of the goal line, `[N]`.
-        parameters: of the chosen action, `[N, 2]` in [-1, 1]: two of a kick; one of a shot, whose sign is reversed
-            (1 is the stretch's lower end), and a number that is not read.
+        parameters: parameters of the chosen action, `[N, 2]` in [-1, 1]. A kick has two. A shot has one, with reversed
+            sign (1 is the lower end of the stretch), and an unused number.
         kicks_to_point: as for `goal_aim`.
-        has_middle: shoot at all of the middle stretch; in the published code that is one point beside the middle.
+        has_middle: whether the middle shot covers its whole stretch. In the published code it is a single point beside
+            the middle.
     """
     stretches = list(STRETCHES)
     if has_middle:
@@ -243,8 +248,8 @@ def hard_goal_aim(
     low, high = parameters.new_tensor(stretches).unbind(-1)
     stretch = (discrete - 1).clamp(min=0).remainder(len(stretches))
     first, second = parameters.unbind(-1)
-    share = 0.5 * (low + high)[stretch] - first * (0.5 * (high - low))[stretch]
-    return _aim(discrete == 0, LENGTH * (first + 1.0), HALF_WIDTH * second, _FLOAT32_GOAL * share, kicks_to_point)
+    fraction = 0.5 * (low + high)[stretch] - first * (0.5 * (high - low))[stretch]
+    return _aim(discrete == 0, LENGTH * (first + 1.0), HALF_WIDTH * second, _FLOAT32_GOAL * fraction, kicks_to_point)
 
 
 def _aim(is_kick: Tensor, kick_x: Tensor, kick_y: Tensor, shot: Tensor, kicks_to_point: bool) -> Aim:
@@ -258,12 +263,12 @@ def _aim(is_kick: Tensor, kick_x: Tensor, kick_y: Tensor, shot: Tensor, kicks_to
 
 
 def random_numbers(rng: RngKey, steps: Tensor, ticks: Tensor) -> Tensor:
-    """Return the numbers in (-1, 1), float32 `[K, 6, M]`, of ticks of the next action.
+    """Return random numbers in (-1, 1), float32 `[K, 6, M]`, for ticks of the next action.
 
     Args:
-        rng: keys `[M]` from `counter_rng.rng_key`.
-        steps: how many actions the episode has had, int32 `[M]`.
-        ticks: int32 `[K]`.
+        rng: random-number keys `[M]` from `counter_rng.rng_key`.
+        steps: number of actions so far in the episode, int32 `[M]`.
+        ticks: numbers of the ticks, int32 `[K]`.
     """
     place = torch.arange(NUMBERS_PER_TICK, dtype=torch.int32, device=ticks.device)
     index = (ticks.unsqueeze(-1) * NUMBERS_PER_TICK + place).unsqueeze(-1) + steps * _NUMBERS_PER_ACTION
@@ -280,18 +285,19 @@ def act(
     max_steps: int = 100,
     tick: Tick | None = None,
 ) -> tuple[GoalState, Tensor]:
-    """Return the states after one action, and how many ticks it took, int32 `[N]`.
+    """Return the states after one action, and the number of ticks that it took, int32 `[N]`.
 
-    The ticks of all environments run side by side; most rows whose action is over are left out of the later ones.
+    The ticks of all environments run side by side. Most finished rows are dropped from the later ticks.
 
     Args:
-        state: before the action.
-        aim: what the players do.
-        moves: bool `[N]`; the other rows stay as they are.
-        numbers: the random numbers.
+        state: states before the action.
+        aim: aims of the players.
+        moves: which rows act, bool `[N]`. The other rows stay unchanged.
+        numbers: source of the random numbers.
         noise: factor on the published noise.
-        max_steps: the action with this number is not played: it ends the episode at once, as in the published code.
-        tick: the function `masked_tick`, or a compiled one.
+        max_steps: number of the action that ends the episode. As in the published code, it ends at once and that
+            action is not simulated.
+        tick: `masked_tick`, or a compiled version of it.
     """
     steps = torch.where(moves, state.steps + 1, state.steps)
     is_late = moves & (steps >= max_steps)
@@ -305,12 +311,12 @@ def act(
 
 
 def _run(motion: Motion, rows: Tensor, first: int, numbers: Numbers, noise: float, tick: Tick) -> Motion:
-    """Return the motion in these rows `[M]` at the end of its actions, whose next tick is number `first`."""
+    """Return the motion of these rows `[M]` at the end of their actions, from tick number `first` on."""
     while True:
         going = (motion.end == _GOING).nonzero().squeeze(-1)
         if not len(going):
             return motion
-        # Not down to one row, for which a compiled tick would be compiled anew.
+        # Never shrink to one row: the compiler would specialise and compile the tick again.
         if len(rows) > _FEW_ROWS and 1 < len(going) <= len(rows) // 2:
             rest = Motion(*(column[going] for column in motion))
             rest = _run(rest, rows[going], first, numbers, noise, tick)
@@ -325,8 +331,8 @@ def masked_tick(motion: Motion, numbers: Tensor, noise: float) -> Motion:
     """Return the motion after one tick of the actions that are not over.
 
     Args:
-        motion: before it.
-        numbers: in (-1, 1), `[6, M]`.
+        motion: motion before the tick.
+        numbers: random numbers in (-1, 1), `[6, M]`.
         noise: factor on the published noise.
     """
     bodies = tick(motion[: len(COLUMNS)], motion.aim_x, motion.aim_y, numbers, noise)
@@ -338,13 +344,16 @@ def masked_tick(motion: Motion, numbers: Tensor, noise: float) -> Motion:
 
 
 def _end(bodies: Bodies, is_kick: Tensor) -> Tensor:
-    """Return the outcome after a tick, int32 `[M]`: PLAYING where only the action is over, _GOING where it goes on."""
+    """Return the outcome after a tick, int32 `[M]`.
+
+    It is _GOING while the action goes on, and PLAYING if the action is over but the episode is not.
+    """
     player_x, player_y, keeper_x, keeper_y, ball_x, ball_y, _, _, _, _, ball_vx, ball_vy, _, _ = bodies
     is_still = _length(ball_vx, ball_vy) <= _STILL
     in_reach = _length(player_x - ball_x, player_y - ball_y) <= REACH + _REACH_SLACK
     end = torch.where(is_kick & is_still & in_reach, PLAYING, _GOING)
     beside = ball_y.abs()
-    # Asked this way round, a position that is not finite ends the episode.
+    # Written as a positive test, so that NaN and infinite positions end the episode.
     is_inside = (ball_x >= 0.0) & (ball_x <= LENGTH) & (beside <= HALF_WIDTH)
     end = torch.where(is_inside, end, OUT)
     end = torch.where(_length(keeper_x - ball_x, keeper_y - ball_y) < CATCH, CAUGHT, end)
@@ -357,8 +366,9 @@ def tick(bodies: Bodies, aim_x: Tensor, aim_y: Tensor, numbers: Tensor, noise: f
 
     Args:
         bodies: the COLUMNS, `[M]` each.
-        aim_x, aim_y: where the players kick to, `[M]`.
-        numbers: in (-1, 1), `[6, M]`: for angle and push in x and y, of the player or the ball, then of the keeper.
+        aim_x, aim_y: point that the players kick to, `[M]`.
+        numbers: random numbers in (-1, 1), `[6, M]`. The first three are for the angle and the push in x and y of the
+            player or the ball, the last three for those of the keeper.
         noise: factor on the published noise.
     """
     player_x, player_y, keeper_x, keeper_y, ball_x, ball_y, *velocities, player_angle, keeper_angle = bodies
@@ -388,9 +398,10 @@ def _play(
     numbers: Sequence[Tensor],
     noise: float,
 ) -> tuple[Vector, Vector, Tensor]:
-    """Return the velocities of player and ball and the player's orientation after the player's move.
+    """Return the velocities of player and ball, and the player's orientation, after the player's move.
 
-    With the ball in reach, the player kicks it; else it turns towards the ball or, when it faces it, dashes.
+    If the ball is in reach, the player kicks it. Otherwise the player dashes if it faces the ball, or else turns
+    towards it.
     """
     to_ball_x, to_ball_y = ball[0] - player[0], ball[1] - player[1]
     distance = _length(to_ball_x, to_ball_y)
@@ -402,10 +413,10 @@ def _play(
     is_dash = is_facing & ~in_reach
     wish_x = _COAST * (aim[0] - player[0]) - ball_v[0]
     wish_y = _COAST * (aim[1] - player[1]) - ball_v[1]
-    # Power is lost by kicking sideways or from afar.
-    share = 1.0 - 0.25 / math.pi * off - 0.25 / REACH * distance
-    kick = _length(wish_x, wish_y).minimum(_MAX_POWER * _BALL_RATE * share)
-    # Not by `torch.where` between two numbers, which gives float32.
+    # Kicks sideways or from afar lose power.
+    efficiency = 1.0 - 0.25 / math.pi * off - 0.25 / REACH * distance
+    kick = _length(wish_x, wish_y).minimum(_MAX_POWER * _BALL_RATE * efficiency)
+    # Blended by multiplication, because `torch.where` between two Python numbers returns float32.
     of_ball = in_reach.to(angle.dtype)
     pushed_x, pushed_y = _accelerate(
         (torch.where(in_reach, ball_v[0], player_v[0]), torch.where(in_reach, ball_v[1], player_v[1])),
@@ -428,14 +439,15 @@ def _keep(
 ) -> tuple[Vector, Tensor]:
     """Return the velocity and the orientation of the keeper after its move.
 
-    It goes to where the ball will lie still or, when the ball will come near the goal, quickly into its way.
+    If the ball will come near the goal, the keeper rushes to block its line. Otherwise it walks to where the ball will
+    come to rest.
     """
     roll_x, roll_y = ball_v[0] / _COAST, ball_v[1] / _COAST
     end_x, end_y = ball[0] + roll_x, ball[1] + roll_y
     slope = torch.where(roll_x == 0.0, 0.0, roll_y / roll_x)
     height = ball[1] + slope * (LENGTH - ball[0])
     is_shot = (end_x > LENGTH) & (height.abs() <= GOAL_HALF_WIDTH + _KEEPER_MARGIN) & (slope != 0.0)
-    # The way to the ball's line is across it; only the direction matters.
+    # The shortest way to the ball's line is perpendicular to it. Only the direction matters.
     side = roll_x * (ball[1] - keeper[1]) - roll_y * (ball[0] - keeper[0])
     way_x = torch.where(is_shot, -side * roll_y, end_x - keeper[0])
     way_y = torch.where(is_shot, side * roll_x, end_y - keeper[1])
@@ -455,12 +467,12 @@ def _accelerate(
     """Return the velocities after a push.
 
     Args:
-        velocity: before it.
-        effort: the change of velocity it is meant to make, `[M]`.
-        angle: in which direction, `[M]`; noise multiplies it.
-        numbers: in (-1, 1), three of `[M]`: for the angle and the push in x and in y.
-        noise: share of the angle and of the speed that the noise takes at most, a number or `[M]`.
-        limit: largest change of a velocity in x and in y, and largest velocity in x and in y, a number or `[M]`.
+        velocity: velocities before the push.
+        effort: intended change of velocity, `[M]`.
+        angle: direction of the push, `[M]`, to which multiplicative noise is added.
+        numbers: random numbers in (-1, 1), three of `[M]`, for the angle and for the push in x and in y.
+        noise: amplitude of the noise as a fraction of the angle and of the speed, a number or `[M]`.
+        limit: bound in x and in y of the velocity and of its change, a number or `[M]`.
     """
     angle = angle + angle * noise * numbers[0]
     jolt = noise * _length(*velocity)
@@ -470,24 +482,24 @@ def _accelerate(
 
 
 def _roll(place: Vector, velocity: Vector, decay: float) -> tuple[Vector, Vector]:
-    """Return where a body is after a tick, and its velocity then."""
+    """Return the position and the velocity of a body after a tick."""
     return (place[0] + velocity[0], place[1] + velocity[1]), (velocity[0] * decay, velocity[1] * decay)
 
 
 def _collide(
     one: Vector, other: Vector, one_v: Vector, other_v: Vector, touch: float
 ) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return positions and velocities of two bodies after they have bounced off each other, if they overlap.
+    """Return positions and velocities of two bodies. If they overlap, they bounce off each other.
 
     Args:
         one, other: positions.
         one_v, other_v: velocities.
-        touch: distance below which they overlap.
+        touch: distance below which the bodies overlap.
     """
     apart_x, apart_y = one[0] - other[0], one[1] - other[1]
     distance = _length(apart_x, apart_y)
-    share = (0.5 * (touch - distance)).clamp(min=0.0) / distance.clamp(min=1e-12)
-    shift_x, shift_y = apart_x * share, apart_y * share
+    fraction = (0.5 * (touch - distance)).clamp(min=0.0) / distance.clamp(min=1e-12)
+    shift_x, shift_y = apart_x * fraction, apart_y * fraction
     sign = 1.0 - 2.0 * (distance < touch).to(distance.dtype)
     return (
         (one[0] + shift_x, one[1] + shift_y),
@@ -499,17 +511,17 @@ def _collide(
 
 def _length(x: Tensor, y: Tensor) -> Tensor:
     """Return the lengths of vectors, `[M]`."""
-    # The compiler does not vectorise `hypot`; uncompiled, it is one operation instead of four.
+    # The compiler does not vectorise `hypot`. Without compilation, `hypot` is one operation instead of four.
     return (x * x + y * y).sqrt() if torch.compiler.is_compiling() else torch.hypot(x, y)
 
 
 def goal_distance(state: GoalState, *, is_repaired: bool = False) -> Tensor:
-    """Return how far the ball is from the goal, `[N]`.
+    """Return the distance of the ball from the goal, `[N]`.
 
     Args:
-        state: of the episodes.
-        is_repaired: right also for a ball behind the goal line and below the goal, for which the published code gives
-            2 x 7.01 too much.
+        state: states of the episodes.
+        is_repaired: whether to correct an error of the published code. For a ball behind the goal line and below the
+            goal, that code's distance is 2 x 7.01 too large.
     """
     beside = state.ball_y.abs() - GOAL_HALF_WIDTH
     depth = LENGTH - state.ball_x
@@ -521,26 +533,29 @@ def goal_distance(state: GoalState, *, is_repaired: bool = False) -> Tensor:
 
 
 def reward(before: GoalState, after: GoalState, *, repairs_distance: bool = False) -> Tensor:
-    """Return the reward of an action `[N]`: 50 for a goal, less the ball's goal distance for any other end.
+    """Return the reward of an action `[N]`.
+
+    A goal gives 50. Any other end of the episode gives minus the ball's distance from the goal.
 
     Args:
-        before, after: the states around the action.
+        before, after: states before and after the action.
         repairs_distance: as `is_repaired` of `goal_distance`.
     """
     ended = (after.outcome != PLAYING) & (before.outcome == PLAYING)
-    earned = torch.where(after.outcome == GOAL, GOAL_REWARD, -goal_distance(after, is_repaired=repairs_distance))
-    return torch.where(ended, earned, 0.0)
+    final = torch.where(after.outcome == GOAL, GOAL_REWARD, -goal_distance(after, is_repaired=repairs_distance))
+    return torch.where(ended, final, 0.0)
 
 
 def observe(state: GoalState, *, is_scaled: bool = True, repairs_projection: bool = False) -> Tensor:
-    """Return the observation `[N, 17]`, whose entries are OBSERVATION_NAMES.
+    """Return the observation `[N, 17]` with the entries OBSERVATION_NAMES.
 
     Args:
-        state: of the episodes.
-        is_scaled: from OBSERVATION_LOW and _HIGH to [-1, 1]; orientations and the ball can leave their bounds.
-        repairs_projection: clip `keeper_projection`, where the line from the ball through the keeper meets the goal
-            line, to the goal's width. The published code lets it reach twice as far on the upper side. It is scaled by
-            the same bounds either way.
+        state: states of the episodes.
+        is_scaled: whether to scale OBSERVATION_LOW and OBSERVATION_HIGH to [-1, 1]. Orientations and the ball can leave
+            these bounds.
+        repairs_projection: whether to clip `keeper_projection` to the goal's width. This entry is the point where the
+            line from the ball through the keeper meets the goal line. In the published code it reaches twice as far on
+            the upper side. The scaling bounds are the same in both cases.
     """
     across, along = state.ball_y - state.keeper_y, state.ball_x - state.keeper_x
     distance = torch.hypot(along, across).clamp(min=1e-12)

@@ -1,7 +1,8 @@
 """The rules of Moving and Sliding as pure functions on columns, in the dtype of the state.
 
 Source: Xiong et al. 2018, arXiv:1810.06394, and Fan et al. 2019, arXiv:1903.01344, in the version of gym-hybrid
-(T. Hirtz). Differs from gym-hybrid: at the start of an episode the course of Sliding is the heading.
+(T. Hirtz).
+Differs from gym-hybrid: in Sliding, an episode starts with the course equal to the heading.
 """
 
 from __future__ import annotations
@@ -32,22 +33,23 @@ OBSERVATION_NAMES = (
     "inside",
     "time_share",
 )
-VECTORS = ((0, 1), (3, 4), (5, 6))  # of the observation
+VECTORS = ((0, 1), (3, 4), (5, 6))  # places of (x, y) pairs in the observation
 PUBLISHED_STEPS = 201
 TARGET_RADIUS = 0.1
-LARGEST_PUSH = 0.5  # what an acceleration adds to the speed at most
-STEP = 0.005  # covered in a step at speed 1
+LARGEST_PUSH = 0.5  # the most that an acceleration adds to the speed
+STEP = 0.005  # distance covered in a step at speed 1
 _BRAKE = 0.1
 _TURN = math.pi / 2.0
-_START_BOUND = 0.9  # of the target
+_START_BOUND = 0.9  # bound of the target's coordinates
 _STEP_COST = 0.001
 _SUCCESS_REWARD, _FAILURE_REWARD = 1.0, -1.0
 
 
 class VehicleState(NamedTuple):
-    """Columns `[N]`: the place of the vehicle, its speed, heading and course (rad), the target; the rest is int32.
+    """The state of N environments, columns `[N]`.
 
-    In Moving the course is the heading.
+    It holds the vehicle's position, speed, heading and course (rad), the target's position, and int32 counters. In
+    Moving the course equals the heading.
     """
 
     x: Tensor
@@ -63,7 +65,7 @@ class VehicleState(NamedTuple):
 
 
 def start(episode: Tensor, rng: RngKey) -> VehicleState:
-    """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
+    """Return the initial states of the episodes with these numbers, int32 `[N]`."""
     target_x, target_y = (_START_BOUND * (2.0 * counter_rng.uniform(rng, index) - 1.0) for index in range(2))
     x, y = (2.0 * counter_rng.uniform(rng, index) - 1.0 for index in range(2, 4))
     heading = 2.0 * math.pi * counter_rng.uniform(rng, 4)
@@ -77,11 +79,12 @@ def act(
     """Return the states after one action in every environment, and the rewards, `[N]`.
 
     Args:
-        state: before the action.
+        state: states before the action.
         discrete: ACCELERATE, TURN or BRAKE, `[N]`.
-        parameter: of the chosen action, within its bounds, `[N]`.
+        parameter: parameter of the chosen action, within its bounds, `[N]`.
         slides: whether the vehicle keeps its course when it turns (Sliding).
-        max_steps: actions that an episode allows; the last one costs as much as a failure unless it succeeds.
+        max_steps: number of actions after which an episode ends. Unless the last one succeeds, its reward is that of a
+            failure.
     """
     steer = _slide if slides else _follow
     speed, heading, course = steer(state, discrete, parameter)
@@ -103,7 +106,7 @@ def act(
 
 
 def _follow(state: VehicleState, discrete: Tensor, parameter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return speed, heading and course in Moving."""
+    """Return speed, heading and course after an action in Moving."""
     faster = state.speed + LARGEST_PUSH * parameter
     speed = torch.where(discrete == ACCELERATE, faster, _braked(state.speed, discrete))
     heading = _turned(state.heading, discrete, parameter)
@@ -111,14 +114,17 @@ def _follow(state: VehicleState, discrete: Tensor, parameter: Tensor) -> tuple[T
 
 
 def _slide(state: VehicleState, discrete: Tensor, parameter: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return speed, heading and course in Sliding, where an acceleration adds to the velocity as a vector."""
+    """Return speed, heading and course after an action in Sliding.
+
+    An acceleration adds a vector along the heading to the velocity.
+    """
     is_push = discrete == ACCELERATE
     push = LARGEST_PUSH * parameter
     drift = state.course - state.heading
     along = push + state.speed * drift.cos()
     across = state.speed * drift.sin()
     squared = push.square() + state.speed.square() + 2.0 * push * state.speed * drift.cos()
-    # Rounding can make it negative.
+    # Rounding can make the square negative.
     faster = squared.clamp(min=0.0).sqrt()
     speed = torch.where(is_push, faster, _braked(state.speed, discrete))
     heading = _turned(state.heading, discrete, parameter)
@@ -141,7 +147,7 @@ def distance(state: VehicleState) -> Tensor:
 
 
 def observe(state: VehicleState, max_steps: int) -> Tensor:
-    """Return the observation `[N, 10]`, whose entries are OBSERVATION_NAMES; `max_steps` actions are an episode."""
+    """Return the observation `[N, 10]` with the entries OBSERVATION_NAMES, for episodes of `max_steps` actions."""
     left = distance(state)
     inside = (left <= TARGET_RADIUS).to(left.dtype)
     time = state.steps.to(left.dtype) / max(max_steps - 1, 1)
@@ -151,9 +157,9 @@ def observe(state: VehicleState, max_steps: int) -> Tensor:
 
 
 def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:
-    """Return the lowest and the highest observation that can come up within this many steps."""
+    """Return the lowest and the highest observation that this many steps can reach."""
     speed = LARGEST_PUSH * max_steps
-    # The last step may lead out of the field; a little more, for rounding.
+    # The last step may leave the field. The extra 0.001 allows for rounding.
     edge = 1.001 + STEP * speed
     furthest = math.sqrt(2.0) * (edge + _START_BOUND)
     latest = 1.001 * max_steps / max(max_steps - 1, 1)
@@ -162,16 +168,16 @@ def observation_bounds(max_steps: int) -> tuple[list[float], list[float]]:
     return low, high
 
 
-# The hand-written player's speed on the way, what it takes for a wrong heading (rad), and where it starts to brake.
+# Of the scripted player: its travelling speed, the tolerated error of the heading (rad), and the margin for braking.
 _CRUISE = 2.5
 _TOLERANCE = 0.01
 _MARGIN = 0.05
 
 
 def scripted_action(state: VehicleState) -> tuple[Tensor, Tensor]:
-    """Return the action of a hand-written player, `[N]` each: it turns, speeds up, and brakes in time for the target.
+    """Return the discrete action and the parameter of a scripted player, `[N]` each.
 
-    It turns at rest alone, which serves Sliding, too.
+    It turns towards the target, accelerates, and brakes in time. It turns only at rest, so it also works in Sliding.
     """
     left = distance(state)
     bearing = torch.atan2(state.target_y - state.y, state.target_x - state.x)
@@ -179,7 +185,7 @@ def scripted_action(state: VehicleState) -> tuple[Tensor, Tensor]:
     stops_within = 0.5 * STEP / _BRAKE * state.speed * (state.speed + _BRAKE) + _MARGIN
     must_brake = left <= stops_within
     must_turn = (error.abs() > _TOLERANCE) & (state.speed == 0.0)
-    # Who travels has no better idle action than a turn by nothing.
+    # At travelling speed the vehicle turns by 0, because no action does nothing.
     can_speed_up = state.speed < _CRUISE
     discrete = torch.where(can_speed_up, ACCELERATE, TURN)
     parameter = torch.where(can_speed_up, ((_CRUISE - state.speed) / LARGEST_PUSH).clamp(0.0, 1.0), 0.0)

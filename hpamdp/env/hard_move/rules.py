@@ -1,6 +1,7 @@
 """The rules of Hard Move as pure functions on columns, in the dtype of the state.
 
-Source: Li et al. 2022 (HyAR), arXiv:2109.05490, after Chandak et al. 2019, arXiv:1902.00183; as in HyAR's code.
+Source: Li et al. 2022 (HyAR), arXiv:2109.05490, after Chandak et al. 2019, arXiv:1902.00183. The rules are those of
+HyAR's code.
 """
 
 from __future__ import annotations
@@ -21,7 +22,10 @@ _FORCE = 2.0
 
 
 class HardMoveState(NamedTuple):
-    """Columns `[N]`: places and speeds of the agent, place of the target; the rest is int32."""
+    """The state of N environments, columns `[N]`.
+
+    It holds the agent's position and velocity, the target's position, and int32 counters.
+    """
 
     x: Tensor
     y: Tensor
@@ -37,12 +41,12 @@ class HardMoveState(NamedTuple):
 def motions(n: int, *, rounded: bool) -> Tensor:
     """Return the motion of every set of actuators, float64 `[2^n, 2]`.
 
-    Set k holds actuator i if bit n - 1 - i of k is set. Its motion is the sum of its actuators' directions, which
-    divide the full turn, in units of the largest such sum.
+    Set k contains actuator i if bit n - 1 - i of k is set. The actuators' directions divide the full turn evenly. The
+    motion of a set is the sum of its actuators' directions, divided by the length of the longest such sum.
 
     Args:
         n: number of actuators.
-        rounded: whether the directions have three decimals, as published.
+        rounded: whether the directions are rounded to three decimals, as published.
     """
     directions = _directions(n, rounded)
     sets = torch.tensor(list(itertools.product((0.0, 1.0), repeat=n)), dtype=torch.float64)
@@ -51,7 +55,7 @@ def motions(n: int, *, rounded: bool) -> Tensor:
 
 
 def quadrants(n: int, *, rounded: bool) -> dict[str, list[int]]:
-    """Return the sets of actuators that push into each quadrant; sets that push nowhere are in the first one."""
+    """Return the sets of actuators that push into each quadrant. Sets whose pushes cancel are in `north_east`."""
     directions = _directions(n, rounded)
     numbers: dict[str, list[int]] = {name: [] for name in ("north_east", "north_west", "south_west", "south_east")}
     for number, members in enumerate(itertools.product((False, True), repeat=n)):
@@ -69,7 +73,7 @@ def _directions(n: int, rounded: bool) -> list[tuple[float, float]]:
 
 
 def start(episode: Tensor, rng: RngKey) -> HardMoveState:
-    """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
+    """Return the initial states of the episodes with these numbers, int32 `[N]`."""
     x, y, target_x, target_y = point_agent.start(rng)
     zeros = torch.zeros_like(x)
     none = torch.zeros_like(episode)
@@ -80,10 +84,10 @@ def act(state: HardMoveState, discrete: Tensor, parameter: Tensor, motions: Tens
     """Return the states after one action in every environment, and the rewards, `[N]`.
 
     Args:
-        state: before the action.
+        state: states before the action.
         discrete: sets of actuators, int64 `[N]`.
-        parameter: how strongly they push, backwards below 0, `[N]`.
-        motions: of the sets, `[2^n, 2]`.
+        parameter: strength of the push, `[N]`. Negative values push backwards.
+        motions: motions of the sets, `[2^n, 2]`.
     """
     force_x, force_y = (_FORCE * parameter.unsqueeze(-1) * motions[discrete]).unbind(-1)
     x, y, vx, vy = point_agent.move(state, force_x, force_y)
@@ -95,19 +99,19 @@ def act(state: HardMoveState, discrete: Tensor, parameter: Tensor, motions: Tens
 
 
 def observe(state: HardMoveState) -> Tensor:
-    """Return the observation `[N, 4]`: speed, and target - agent."""
+    """Return the observation `[N, 4]`: velocity, and target - agent."""
     return point_agent.observe(state)
 
 
 class Script:
-    """A hand-written player: the push after which the agent would come to rest nearest to the target.
+    """A scripted player. It chooses the push after which the agent would come to rest nearest to the target.
 
     Args:
-        motions: of the sets, `[2^n, 2]`.
+        motions: motions of the sets, `[2^n, 2]`.
     """
 
     def __init__(self, motions: Tensor) -> None:
-        # Many sets have the same motion, and some none at all.
+        # Many sets share a motion, and some have none. Keep the first set of each motion that is not 0.
         different, number = motions.round(decimals=6).unique(dim=0, return_inverse=True)
         first = torch.full((len(different),), len(motions), device=motions.device)
         sets = torch.arange(len(motions), device=motions.device)
@@ -116,11 +120,11 @@ class Script:
         self._reach = _FORCE * point_agent.REACH * motions[self._sets]
 
     def __call__(self, state: HardMoveState) -> tuple[Tensor, Tensor]:
-        """Return the set and its parameter, `[N]` each."""
+        """Return the discrete action and the parameter, `[N]` each."""
         offset = torch.stack(point_agent.rest_offset(state, point_agent.GLIDE), -1)
         length = self._reach.norm(dim=-1)
         strength = ((offset @ self._reach.T) / length.square()).clamp(-1.0, 1.0)
-        # The squared distance that is left, less that of the offset itself.
+        # The remaining squared distance, up to a constant: the squared length of the offset.
         left = strength * (strength * length.square() - 2.0 * (offset @ self._reach.T))
         best = left.argmin(-1)
         return self._sets[best], strength.gather(-1, best.unsqueeze(-1)).squeeze(-1)

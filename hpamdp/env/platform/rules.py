@@ -2,8 +2,10 @@
 
 Source: Masson, Ranchod & Konidaris 2016, arXiv:1509.01644, section on the Platform domain. Constants, bounds and rules
 as in gym-platform, the version of Bester, James & Konidaris 2019, arXiv:1905.04388.
-Differs from the source: observations are scaled to [-1, 1], as those authors do for their learners, and leave out how
-many ticks the last action took; the height and the length of a jump have closed forms, equal up to rounding.
+Differs from the source:
+- Observations are scaled to [-1, 1], as those authors do for their learners.
+- Observations leave out the number of ticks of the last action.
+- The height and the length of a jump have closed forms, which are equal up to rounding.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from torch import Tensor
 RUN, HOP, LEAP = range(3)
 ACTIONS = ("run", "hop", "leap")
 PARAMETER_HIGH = (30.0, 720.0, 430.0)
-# What learners conventionally start with (Masson et al. 2016, and the code of Bester et al. 2019).
+# The parameters that learners conventionally start with (Masson et al. 2016, and the code of Bester et al. 2019).
 INITIAL_PARAMETERS = (3.0, 10.0, 400.0)
 OUTCOMES = ("on the way", "arrived", "fell", "met an enemy", "time limit")
 ON_THE_WAY, ARRIVED, FELL, MET_ENEMY, TIME_LIMIT = range(5)
@@ -33,26 +35,26 @@ OBSERVATION_NAMES = (
     "next_height",
 )
 
-# Lengths in px, times in s. The three platforms have the same height. The position of an agent or an enemy is that of
-# its left foot.
+# Lengths in px, times in s. All three platforms have the same height. The position of an agent or an enemy is its left
+# edge.
 LEFT, RIGHT = (0.0, 475.0, 985.0), (250.0, 750.0, 1035.0)
 END = RIGHT[2]
 BODY_WIDTH, BODY_HEIGHT = 20.0, 30.0
 _TICK = 0.05
 _GRAVITY = 9.8
 _MAX_SPEED = 70.0  # px/s
-_MAX_PUSH = 30.0  # px/s, the most by which an action changes the speed in one tick
-_DECAY = 0.99  # of the speed, a tick
+_MAX_PUSH = 30.0  # px/s, largest change of the speed by an action in one tick
+_DECAY = 0.99  # factor on the speed after each tick
 _RUN_TICKS = 20.0
 _HOP_RISE, _LEAP_RISE = 35.0, 25.0  # vertical speed at the start of a jump, px/s
 _ENEMY_SPEED = 30.0
 _FIRST_START, _SECOND_START = RIGHT[0] - BODY_WIDTH, RIGHT[1] - BODY_WIDTH  # where the enemies start and turn
 _JUMP_NOISE = 1.0  # standard deviation of the speeds at the start of a jump, px/s
 _TICK_NOISE = 0.5 * _TICK  # standard deviation of the change of speed in a tick, px/s
-# Each action has this many normal random numbers of its episode: two for a jump, then two a tick. A hop has 144 ticks.
+# Normal random numbers that each action of an episode may use: two for a jump, then two per tick. A hop has 144 ticks.
 _NUMBERS_PER_ACTION = 512
-# Of each platform, as observed: its width, the next one's width, the gap and its left edge, all in [0, 1], and the next
-# one's height.
+# Observed features of each platform: its width, the next platform's width, the gap and its left edge, all in [0, 1],
+# and the next platform's height.
 _PLATFORM_FEATURES = (
     (250 / 275, 275 / 275, 225 / 235, LEFT[0] / END, 0.0),
     (275 / 275, 50 / 275, 235 / 235, LEFT[1] / END, 0.0),
@@ -61,9 +63,9 @@ _PLATFORM_FEATURES = (
 
 
 class PlatformState(NamedTuple):
-    """Columns `[N]`, px and px/s.
+    """The state of N environments, columns `[N]`, px and px/s.
 
-    Only the enemy of the platform that the agent reached last is kept: the other one is out of its reach.
+    It holds only the enemy of the platform that the agent reached last. The agent cannot meet the other enemy.
     """
 
     x: Tensor
@@ -76,7 +78,7 @@ class PlatformState(NamedTuple):
 
 
 def start(episode: Tensor) -> PlatformState:
-    """Return the states in which the episodes with these numbers, int32 `[N]`, begin."""
+    """Return the initial states of the episodes with these numbers, int32 `[N]`."""
     zeros = torch.zeros_like(episode, dtype=torch.float32)
     integer_zeros = torch.zeros_like(episode)
     return PlatformState(
@@ -95,25 +97,25 @@ def act(
 ) -> PlatformState:
     """Return the states after one action in every environment.
 
-    The action is simulated at full length, `[T, N]`, and then cut off where something ends it.
+    The action is simulated at full length, `[T, N]`, and then cut off at the first event that ends it.
 
     Args:
-        state: before the action.
+        state: states before the action.
         discrete: RUN, HOP or LEAP, `[N]`.
-        parameter: of the chosen action, within its bounds, `[N]`.
-        normal: returns the standard normal numbers with these indices, int32 `[N]` or `[T, N]`, of the episodes.
+        parameter: parameter of the chosen action, within its bounds, `[N]`.
+        normal: maps indices, int32 `[N]` or `[T, N]`, to standard normal numbers of the episodes.
         noise: factor on the published noise.
     """
     edge = torch.where(state.x < LEFT[2] - BODY_WIDTH, RIGHT[1], RIGHT[2])
     edge = torch.where(state.x < LEFT[1] - BODY_WIDTH, RIGHT[0], edge)
-    is_jump = (discrete != RUN) & (state.x <= edge)  # an agent beyond the edge falls, whatever it chooses
+    is_jump = (discrete != RUN) & (state.x <= edge)  # an agent beyond the edge falls, whatever the action
     first = first_number(state)
     rise = torch.where(discrete == HOP, _HOP_RISE, _LEAP_RISE).to(state.x.dtype)
     push = parameter / (2.0 * rise / _GRAVITY + 1.0) - state.speed
     push = push - noise * _JUMP_NOISE * normal(first).abs()
     rise = rise - noise * _JUMP_NOISE * normal(first + 1).abs()
     speed = state.speed + torch.where(is_jump, push.clamp(-_MAX_PUSH, _MAX_PUSH), 0.0)
-    # Tick k of a jump, counted from 0, ends at the height (k + 1) (rise - k fall) tick.
+    # Tick k of a jump, counted from 0, ends at the height (k + 1) (rise - k fall) _TICK.
     fall = 0.5 * _GRAVITY * _TICK
     length = torch.where(is_jump, (rise / fall).floor().clamp(min=-1.0) + 2.0, _RUN_TICKS)
     tick = torch.arange(int(length.max()), dtype=torch.int32, device=state.x.device).unsqueeze(-1)
@@ -144,18 +146,18 @@ def act(
 
 
 def first_number(state: PlatformState) -> Tensor:
-    """Return the index `[N]` of the first random number of the next action: two for a jump, then two for each tick."""
+    """Return the index `[N]` of the first random number of the next action."""
     return state.steps * _NUMBERS_PER_ACTION
 
 
 def _move(x: Tensor, speed: Tensor, edge: Tensor, power: Tensor, drag: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the agents' positions before and after each tick and their speeds after it, `[T, N]` each.
+    """Return the agents' positions before and after each tick, and their speeds after it, `[T, N]` each.
 
     Args:
-        x, speed: of the agents, `[N]`.
-        edge: right edge of their platforms, `[N]`; beyond it, `power` has no effect.
-        power: px/s that a run adds to the speed each tick, `[N]`.
-        drag: px/s that each tick takes off the speed, `[T, N]`.
+        x, speed: positions and speeds of the agents, `[N]`.
+        edge: right edges of their platforms, `[N]`. Beyond the edge, `power` has no effect.
+        power: px/s that a run adds to the speed in each tick, `[N]`.
+        drag: px/s subtracted from the speed in each tick, `[T, N]`.
     """
     xs = [x]
     speeds = []
@@ -177,15 +179,16 @@ def _patrol(before: Tensor, after: Tensor, x: Tensor, speed: Tensor, gust: Tenso
 
     Args:
         before, after: the agents' positions before and after each tick, `[T, N]`.
-        x, speed: of the enemies, `[N]`.
-        gust: px/s that each tick adds to their speeds, `[T, N]`.
+        x, speed: positions and speeds of the enemies, `[N]`.
+        gust: px/s added to the enemies' speeds in each tick, `[T, N]`.
     """
     is_second = before > LEFT[1]
     left = torch.where(is_second, LEFT[1], LEFT[0]).to(gust.dtype)
     right = torch.where(is_second, _SECOND_START, _FIRST_START).to(gust.dtype)
     slowest = torch.full_like(gust, -_ENEMY_SPEED)
     fastest = torch.full_like(gust, _ENEMY_SPEED)
-    # When the agent reaches the second platform, its enemy takes over: the bounds leave it nothing but its start.
+    # When the agent reaches the second platform, that platform's enemy replaces the first one. Equal bounds put the
+    # enemy at its start.
     is_reached = (after > LEFT[1]) & ~is_second
     left = left.masked_fill(is_reached, _SECOND_START)
     right = right.masked_fill(is_reached, _SECOND_START)
@@ -203,13 +206,13 @@ def _patrol(before: Tensor, after: Tensor, x: Tensor, speed: Tensor, gust: Tenso
 
 
 def _land(x: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return where agents end up that come down into a platform, and whether they stand on it, `[N]` each.
+    """Return the positions of agents after a platform has pushed them out, and whether they stand on it, `[N]` each.
 
-    A platform pushes an agent that overlaps it out on the shorter way: up, or over its edge.
+    A platform pushes an overlapping agent out by the shorter way: up, or over the platform's edge.
 
     Args:
         x: positions of the agents, `[N]`.
-        depth: px by which they are below the top of the platforms, `[N]`.
+        depth: px by which the agents are below the top of the platforms, `[N]`.
     """
     landed = x
     stands = torch.zeros_like(x, dtype=torch.bool)
@@ -224,7 +227,7 @@ def _land(x: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def observe(state: PlatformState) -> Tensor:
-    """Return the observation `[N, 9]`, whose entries are OBSERVATION_NAMES, scaled to [-1, 1]."""
+    """Return the observation `[N, 9]` with the entries OBSERVATION_NAMES, scaled to [-1, 1]."""
     basic = [
         (state.x + BODY_WIDTH) / (END + BODY_WIDTH),
         state.speed / 100.0,

@@ -1,8 +1,8 @@
 """The rules of Rooms as pure functions, and the best returns by dynamic programming.
 
 A problem of this project, after the four rooms of Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*, section
-2: four rooms with a doorway between each two neighbours. Here a floor of ice or sand makes the best option change from
-room to room, and a move has a length.
+2. A doorway connects each two neighbouring rooms. Two things are new here. The floor of a room is ice or sand, so the
+best option changes from room to room. And a move has a length.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ SKATES, BOOTS = range(2)
 
 SIZE = 11  # cells from wall to wall
 WALL = 5  # the row and the column of the inner walls
-DOORS = (2, 8)  # where they are open
+DOORS = (2, 8)  # places of the doorways along the inner walls
 GOAL = SIZE - 1  # both coordinates
-REACH = 3  # cells of a whole move with the option that suits the floor; 1 with the other one
+REACH = 3  # cells of a full move if the option suits the floor; otherwise 1
 STEP_COST = 0.02
 DIRECTIONS = ((0, -1), (1, 0), (0, 1), (-1, 0))  # up, right, down, left; y grows downwards
 
 
 class RoomsState(NamedTuple):
-    """Columns `[N]`, int32: the cell of the agent, and the counters of the episode."""
+    """The state of N environments, columns `[N]`, int32: the cell of the agent, and the counters of the episode."""
 
     x: Tensor
     y: Tensor
@@ -39,27 +39,27 @@ class RoomsState(NamedTuple):
 
 
 def is_free(x: Tensor, y: Tensor) -> Tensor:
-    """Return which cells are neither a wall nor outside."""
+    """Return which cells lie inside and are no wall."""
     is_inside = (x >= 0) & (x < SIZE) & (y >= 0) & (y < SIZE)
     is_wall = ((x == WALL) & (y != DOORS[0]) & (y != DOORS[1])) | ((y == WALL) & (x != DOORS[0]) & (x != DOORS[1]))
     return is_inside & ~is_wall
 
 
 def suits(option: Tensor, x: Tensor, y: Tensor) -> Tensor:
-    """Return where the option suits the floor: skates on ice, boots on sand, neither in a doorway."""
+    """Return whether the option suits the floor: skates on ice, boots on sand, neither in a doorway."""
     is_sand = (x > WALL) ^ (y > WALL)
     is_doorway = (x == WALL) | (y == WALL)
     return (option == is_sand) & ~is_doorway
 
 
 def move(x: Tensor, y: Tensor, option: Tensor, direction: Tensor, fraction: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the cells in which moves end; they stop at walls and at the goal.
+    """Return the cells in which moves end. A move stops at walls and at the goal.
 
     Args:
-        x, y: where they begin.
-        option: that is held.
-        direction: number in `DIRECTIONS`.
-        fraction: of the reach, in [0, 1]; the move is rounded to whole cells.
+        x, y: cells in which the moves begin.
+        option: current options.
+        direction: indices into `DIRECTIONS`.
+        fraction: length of the move as a fraction of the reach, in [0, 1]. The length is rounded to whole cells.
     """
     reach = torch.where(suits(option, x, y), float(REACH), 1.0)
     length = (fraction * reach).round()
@@ -75,7 +75,7 @@ def move(x: Tensor, y: Tensor, option: Tensor, direction: Tensor, fraction: Tens
 
 
 def start(episode: Tensor, rng: RngKey) -> RoomsState:
-    """Return the states in which the episodes with these numbers, int32 `[N]`, begin: anywhere in the first room."""
+    """Return the initial states of the episodes with these numbers, int32 `[N]`, anywhere in the first room."""
     x, y = ((counter_rng.uniform(rng, i) * WALL).floor().clamp(max=WALL - 1).int() for i in range(2))
     none = torch.zeros_like(episode)
     return RoomsState(x, y, none, none, episode)
@@ -91,20 +91,20 @@ def act(state: RoomsState, option: Tensor, direction: Tensor, fraction: Tensor) 
 
 
 def observe(state: RoomsState) -> Tensor:
-    """Return the observation `[N, 2 + 2 SIZE]`: both coordinates in [-1, 1], and each of them as a one-hot vector."""
+    """Return the observation `[N, 2 + 2 SIZE]`: both coordinates scaled to [-1, 1], then each as a one-hot vector."""
     place = torch.stack([state.x, state.y], -1)
     one_hot = (place.unsqueeze(-1) == torch.arange(SIZE, device=place.device)).flatten(-2)
     return torch.cat([2.0 * place.float() / (SIZE - 1) - 1.0, one_hot.float()], -1)
 
 
 def best_values(gamma: float, option_length: int) -> Tensor:
-    """Return the best discounted return from every cell in which an option is due, float64 `[x, y]`.
+    """Return the optimal discounted return from every cell when an option is due, float64 `[x, y]`.
 
-    By value iteration, without a time limit; walls and the goal have the value 0.
+    It is computed by value iteration, without a time limit. Walls and the goal have the value 0.
 
     Args:
-        gamma: discount of a step.
-        option_length: steps after which an option ends; 1: options can change at every step.
+        gamma: discount per step.
+        option_length: number of steps after which an option ends. If 1, options can change at every step.
     """
     cells = torch.arange(SIZE)
     x, y = (part.flatten() for part in torch.meshgrid(cells, cells, indexing="ij"))
@@ -114,18 +114,18 @@ def best_values(gamma: float, option_length: int) -> Tensor:
     )
     shape = (number, *option.shape)
     from_x, from_y = (part.reshape(-1, 1, 1, 1).expand(shape) for part in (x, y))
-    # With the option that does not suit, every fraction above a half is a whole move.
+    # If the option does not suit the floor, every fraction above a half gives a full move.
     to_x, to_y = move(from_x, from_y, option.expand(shape), direction.expand(shape), length.expand(shape) / REACH)
     successor = (to_x * SIZE + to_y).flatten(2)
     is_there = ((to_x == GOAL) & (to_y == GOAL)).flatten(2)
     is_nothing = ((x == GOAL) & (y == GOAL)) | ~is_free(x, y)
     value = torch.zeros(number, dtype=torch.float64)
     while True:
-        after = value.expand(2, number)  # where the option has ended
+        after = value.expand(2, number)  # the value once the option has ended
         for _ in range(option_length):
             following = torch.stack([after[o][successor[:, o]] for o in range(2)], 1)
-            worth = torch.where(is_there, 1.0, gamma * following) - STEP_COST
-            after = worth.amax(-1).T.masked_fill(is_nothing, 0.0)
+            backup = torch.where(is_there, 1.0, gamma * following) - STEP_COST
+            after = backup.amax(-1).T.masked_fill(is_nothing, 0.0)
         best = after.amax(0)
         if torch.allclose(best, value, rtol=0.0, atol=1e-9):
             return best.reshape(SIZE, SIZE)
