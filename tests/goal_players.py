@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from counter_players import Player, action
+from batched_players import Player, action
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F

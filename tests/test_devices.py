@@ -23,10 +23,10 @@ from toy_steps import SPECS, sample
 
 from hpamdp import keys
 from hpamdp.env import counter_rng
+from hpamdp.env.batched_env import Action
 from hpamdp.env.boatdock import episode
 from hpamdp.env.boatdock.environment import BoatDockEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
-from hpamdp.env.counter_env import Action
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.policies.low_level.hyar import LATENT

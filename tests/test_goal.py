@@ -9,8 +9,8 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from batched_players import action, agrees, is_unchanged, play, random_player, restart, snapshot
 from conftest import compose_config, global_generators_unmoved, make_config
-from counter_players import action, agrees, is_unchanged, play, random_player, restart, snapshot
 from goal_players import act, look_ahead_player, place, trained_player
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from counter_players import action, agrees, play, random_player
+from batched_players import action, agrees, play, random_player
 from tensordict import TensorDict
 from torch import Tensor
 
 from hpamdp import keys
+from hpamdp.env.batched_env import BatchedEnv
 from hpamdp.env.catch_point import rules as catch_point
 from hpamdp.env.catch_point.environment import CatchPointEnv
-from hpamdp.env.counter_env import CounterEnv
 from hpamdp.env.gym_hybrid import rules as gym_hybrid
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move import rules as hard_move
@@ -29,24 +29,24 @@ FOLDER = Path(os.environ.get("HPAMDP_TRACES", "nowhere")) / "domains"
 NAMES = ["platform", "catch_point", *(f"hard_move_{n}" for n in (4, 6, 8, 10)), "moving", "sliding"]
 
 
-def place(env: CounterEnv, **columns: float) -> None:
+def place(env: BatchedEnv, **columns: float) -> None:
     """Start episodes and change columns of the state."""
     env.reset()
     state = env.env_state()
     env.set_env_state(state | {name: torch.full_like(state[name], value) for name, value in columns.items()})
 
 
-def act(env: CounterEnv, discrete: int, parameter: float = 0.0) -> TensorDict:
+def act(env: BatchedEnv, discrete: int, parameter: float = 0.0) -> TensorDict:
     parameters = torch.full((env.num_envs, sum(env.parameter_dims)), parameter)
     return env.step(action(torch.full((env.num_envs,), discrete), parameters))["next"]
 
 
-def scripted(env: CounterEnv) -> TensorDict:
+def scripted(env: BatchedEnv) -> TensorDict:
     discrete, parameter = env.scripted_action(env.state)
     return action(discrete, parameter.unsqueeze(-1).expand(-1, sum(env.parameter_dims)))
 
 
-def success(env: CounterEnv, player) -> tuple[Tensor, Tensor]:
+def success(env: BatchedEnv, player) -> tuple[Tensor, Tensor]:
     """Return which episodes succeed, as 0 or 1, and their returns, `[N]` each."""
     last, total = play(env, player)
     return env.results(last)["success"].float(), total

@@ -1,4 +1,4 @@
-"""Random numbers that are pure functions of integer counters.
+"""Counter-based random numbers: pure functions of integers, such as the number of the episode.
 
 `torch.rand` reads one stream. The numbers of one environment would depend on how often the others were reset. Drawing
 a number for every row would also cost more than a step of the physics.

@@ -1,4 +1,4 @@
-"""The rows of a `CounterEnv` as NumPy arrays that a kernel moves; see `hpamdp.env.kernels`."""
+"""The rows of a `BatchedEnv` as NumPy arrays that a kernel moves; see `hpamdp.env.kernels`."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.env import point_pictures
-from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv, EpisodeColumns
+from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv, EpisodeColumns
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.point_agent import Located
 from hpamdp.settings import Settings
@@ -32,12 +32,12 @@ class PointColumns(EpisodeColumns, Located, Protocol):
 PointEpisode = TypeVar("PointEpisode", bound=PointColumns)
 
 
-class PointEnv(CounterEnv[PointEpisode], Generic[PointEpisode]):
+class PointEnv(BatchedEnv[PointEpisode], Generic[PointEpisode]):
     """A batch of environments in which a point must reach a target.
 
     If `oracle` is true, the environment writes the action of a scripted player under `oracle` (`discrete`,
     `parameters` `[N, 1]`).
-    For the other arguments and errors see `CounterEnv`.
+    For the other arguments and errors see `BatchedEnv`.
     """
 
     target_radius: ClassVar[float]  # the distance that counts as a hit

@@ -25,8 +25,8 @@ def register() -> None:
             importlib.import_module(name).register()
 
 
-def register_counter_env(env_id: str, problem: str, **settings: Any) -> None:
-    """Register an id of a `CounterEnv`, single and vectorised; calling it again changes nothing.
+def register_batched_env(env_id: str, problem: str, **settings: Any) -> None:
+    """Register an id of a `BatchedEnv`, single and vectorised; calling it again changes nothing.
 
     Args:
         env_id: such as `hpamdp/Platform-v0`.
@@ -38,7 +38,7 @@ def register_counter_env(env_id: str, problem: str, **settings: Any) -> None:
     # No max_episode_steps: the environment itself truncates after its last step.
     gymnasium.register(
         id=env_id,
-        entry_point="hpamdp.env.counter_adapter:CounterAdapter",
-        vector_entry_point="hpamdp.env.counter_adapter:CounterVectorAdapter",
+        entry_point="hpamdp.env.batched_adapter:BatchedEnvAdapter",
+        vector_entry_point="hpamdp.env.batched_adapter:BatchedEnvVectorAdapter",
         kwargs={"problem": problem, **settings},
     )

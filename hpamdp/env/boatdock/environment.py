@@ -19,6 +19,7 @@ from torchrl.data import Composite
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
+from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.boatdock import episode as episode_rules
 from hpamdp.env.boatdock import harbour, kernel, planner, task
 from hpamdp.env.boatdock.human_shares import human_shares, human_spec
@@ -28,7 +29,6 @@ from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
 from hpamdp.env.boatdock.reference import human_normalised, human_references
 from hpamdp.env.boatdock.scores import measure_boats
 from hpamdp.env.boatdock.task import BoatState
-from hpamdp.env.counter_env import Action, CounterEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.play_page import EpisodeError
@@ -47,7 +47,7 @@ _MOST_SWAPPED = 4  # boats; of more, symmetries swap none
 _CONTROLLER_ENTRY = task.OBSERVATION_NAMES.index("controller")
 
 
-class BoatDockEnv(CounterEnv[BoatState]):
+class BoatDockEnv(BatchedEnv[BoatState]):
     """Dock boats in `num_envs` harbours at once.
 
     Action leaves:

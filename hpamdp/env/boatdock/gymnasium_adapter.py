@@ -106,7 +106,7 @@ class BoatDockVector(GymnasiumVectorAdapter):
 
 def _tensor_rows(num_envs: int, options: BoatDockOptions, device: Any) -> Any:
     """Return boats that the tensor functions move."""
+    from hpamdp.env.batched_adapter import TensorRows
     from hpamdp.env.boatdock.environment import BoatDockEnv  # it brings torch along
-    from hpamdp.env.counter_adapter import TensorRows
 
     return TensorRows(BoatDockEnv(num_envs, options=options, device=device))

@@ -23,9 +23,9 @@ from torch import Tensor
 from hpamdp import keys
 from hpamdp.env import counter_rng
 from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.boatdock_released import rules as released
 from hpamdp.env.boatdock_released.rules import ReleasedState
-from hpamdp.env.counter_env import Action, CounterEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.state_columns import check_range, where
 from hpamdp.settings import SettingError, Settings
@@ -57,7 +57,7 @@ class ReleasedBoatDockOptions(Settings):
     """Number of steps after which an episode is truncated. The released code uses 999."""
 
 
-class ReleasedBoatDockEnv(CounterEnv[ReleasedState]):
+class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
     """A batch of boats under the rules of the released code.
 
     Action leaves:

@@ -14,9 +14,9 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env import point_agent
+from hpamdp.env.batched_env import Action
 from hpamdp.env.catch_point import kernel, rules
 from hpamdp.env.catch_point.rules import CatchPointState
-from hpamdp.env.counter_env import Action
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.point_env import PointEnv
 from hpamdp.geometry import PlaneGeometry, Symmetries, make_symmetries, on_observations, plane_maps
@@ -51,7 +51,7 @@ class CatchPointEnv(PointEnv[CatchPointState]):
     The reward is minus the squared distance after each step, plus 20 for a catch within 0.2 of the target, which ends
     the episode. A catch elsewhere is a miss.
 
-    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `CounterEnv`.
+    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `BatchedEnv`.
     """
 
     Options = CatchPointOptions

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.env.base import Metric
-from hpamdp.env.counter_env import Action, CounterEnv
+from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.goal import kernel, rendering, rules
@@ -60,7 +60,7 @@ class HardGoalOptions(GoalOptions):
     """
 
 
-class GoalEnv(CounterEnv[GoalState]):
+class GoalEnv(BatchedEnv[GoalState]):
     """Score against a keeper on `num_envs` half pitches at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 kick to, 1 shoot left, 2 shoot right;
@@ -73,7 +73,7 @@ class GoalEnv(CounterEnv[GoalState]):
     the pitch, or at the time limit, costs the distance of the ball from the goal.
 
     The rules are those behind all published numbers, with the slips of the published code; `options.repaired` takes
-    slips out. Starts are always random. For the constructor's arguments and errors see `CounterEnv`.
+    slips out. Starts are always random. For the constructor's arguments and errors see `BatchedEnv`.
     """
 
     Options: ClassVar[type[Settings]] = GoalOptions

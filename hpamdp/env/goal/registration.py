@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hpamdp.env.registration import register_counter_env
+from hpamdp.env.registration import register_batched_env
 
 GOAL_ID = "hpamdp/Goal-v0"
 HARD_GOAL_ID = "hpamdp/HardGoal-v0"
@@ -10,5 +10,5 @@ HARD_GOAL_ID = "hpamdp/HardGoal-v0"
 
 def register() -> None:
     """Register the ids with Gymnasium; calling it again changes nothing."""
-    register_counter_env(GOAL_ID, "hpamdp.env.goal.environment:GoalEnv")
-    register_counter_env(HARD_GOAL_ID, "hpamdp.env.goal.environment:HardGoalEnv")
+    register_batched_env(GOAL_ID, "hpamdp.env.goal.environment:GoalEnv")
+    register_batched_env(HARD_GOAL_ID, "hpamdp.env.goal.environment:HardGoalEnv")

@@ -12,7 +12,7 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor
 
-from hpamdp.env.counter_env import Action
+from hpamdp.env.batched_env import Action
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.gym_hybrid import kernel, rules
 from hpamdp.env.gym_hybrid.rules import VehicleState
@@ -127,7 +127,7 @@ class MovingEnv(_VehicleEnv):
     The reward is the way made towards the target, less 0.001 a step, plus 1 for stopping within 0.1 of it. Who leaves
     the field or runs out of time gets -1 instead. An episode terminates at rest in the target and outside the field.
 
-    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `CounterEnv`.
+    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `BatchedEnv`.
     """
 
     slides = False

@@ -13,7 +13,7 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from hpamdp.env import point_agent
-from hpamdp.env.counter_env import Action
+from hpamdp.env.batched_env import Action
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.hard_move import kernel, rules
@@ -52,7 +52,7 @@ class HardMoveEnv(PointEnv[HardMoveState]):
 
     The reward is minus the squared distance after each step, plus 20 within 0.2 of the target, which ends the episode.
 
-    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `CounterEnv`.
+    Only the start is random. For the constructor's arguments and errors see `PointEnv` and `BatchedEnv`.
     """
 
     Options = HardMoveOptions

@@ -15,7 +15,7 @@ from pydantic import Field, PositiveInt
 from torch import Tensor
 
 from hpamdp.env import counter_rng
-from hpamdp.env.counter_env import Action, CounterEnv
+from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.platform import kernel, rendering, rules
@@ -32,7 +32,7 @@ class PlatformOptions(Settings):
     """Factor on the published noise of jumps, of the agent's speed and of the enemies' speed; 0 means no noise."""
 
 
-class PlatformEnv(CounterEnv[PlatformState]):
+class PlatformEnv(BatchedEnv[PlatformState]):
     """Cross the platforms in `num_envs` courses at once.
 
     Action leaves: `("action", "discrete")` int64 `[N]`: 0 run, 1 hop, 2 leap; `("action", "parameters")` float32
@@ -43,7 +43,7 @@ class PlatformEnv(CounterEnv[PlatformState]):
     The reward is the distance covered as a share of the course, so an agent that arrives has the return 1. An episode
     terminates at the end of the course, in a gap or at an enemy.
 
-    Only the noise is random. For the constructor's arguments and errors see `CounterEnv`.
+    Only the noise is random. For the constructor's arguments and errors see `BatchedEnv`.
     """
 
     Options = PlatformOptions

@@ -10,7 +10,7 @@ import torch
 from pydantic import PositiveInt
 from torch import Tensor
 
-from hpamdp.env.counter_env import Action, CounterEnv
+from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.counter_rng import RngKey
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.rooms import rendering, rules
@@ -25,7 +25,7 @@ class RoomsOptions(Settings):
     """Steps after which an episode is truncated."""
 
 
-class RoomsEnv(CounterEnv[RoomsState]):
+class RoomsEnv(BatchedEnv[RoomsState]):
     """Find the goal in `num_envs` houses of four rooms at once.
 
     Action leaves: `option` int64 `[N]`: 0 skates, 1 boots; `("action", "discrete")` int64 `[N]`: up, right, down, left;
@@ -34,7 +34,7 @@ class RoomsEnv(CounterEnv[RoomsState]):
 
     The reward is -0.02 a step, and 1 at the goal, which ends the episode. It begins anywhere in the first room.
 
-    Only the start is random. For the constructor's arguments and errors see `CounterEnv`.
+    Only the start is random. For the constructor's arguments and errors see `BatchedEnv`.
     """
 
     Options = RoomsOptions

@@ -1,4 +1,4 @@
-"""Helpers to act in any environment over columns and counters: actions, episodes, restarts, figures."""
+"""Helpers to act in any `BatchedEnv`: actions, episodes, restarts, figures."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.env.counter_env import CounterEnv
+from hpamdp.env.batched_env import BatchedEnv
 from hpamdp.specs import PAMDPSpecs
 
-Player = Callable[[CounterEnv], TensorDictBase]
+Player = Callable[[BatchedEnv], TensorDictBase]
 
 
 def action(discrete: Tensor, parameters: Tensor) -> TensorDict:
@@ -26,7 +26,7 @@ def random_player(seed: int = 0) -> Player:
     """Return a player of uniformly random discrete actions with uniformly random parameters."""
     generator = torch.Generator().manual_seed(seed)
 
-    def act(env: CounterEnv) -> TensorDict:
+    def act(env: BatchedEnv) -> TensorDict:
         specs = PAMDPSpecs.from_env(env)
         discrete = torch.randint(specs.num_discrete, (env.num_envs,), generator=generator)
         unit = 2.0 * torch.rand(env.num_envs, specs.num_parameters, generator=generator) - 1.0
@@ -35,7 +35,7 @@ def random_player(seed: int = 0) -> Player:
     return act
 
 
-def play(env: CounterEnv, player: Player, num_steps: int | None = None) -> tuple[TensorDictBase, Tensor]:
+def play(env: BatchedEnv, player: Player, num_steps: int | None = None) -> tuple[TensorDictBase, Tensor]:
     """Reset and take steps; return what the last one returned and the sums of rewards `[N]`."""
     reading = env.reset()
     total = torch.zeros(env.num_envs)
@@ -47,17 +47,17 @@ def play(env: CounterEnv, player: Player, num_steps: int | None = None) -> tuple
     return reading, total
 
 
-def restart(env: CounterEnv, reading: TensorDictBase, mask: Tensor) -> TensorDictBase:
+def restart(env: BatchedEnv, reading: TensorDictBase, mask: Tensor) -> TensorDictBase:
     """Start new episodes in the rows of `mask` `[N]`."""
     return env.reset(reading.clone().set("_reset", mask.unsqueeze(-1)))
 
 
-def snapshot(env: CounterEnv) -> dict[str, Tensor]:
+def snapshot(env: BatchedEnv) -> dict[str, Tensor]:
     """Return copies of the columns of the state."""
     return {name: column.clone() for name, column in env.env_state().items()}
 
 
-def is_unchanged(env: CounterEnv, before: dict[str, Tensor], rows: Tensor | slice = slice(None)) -> bool:
+def is_unchanged(env: BatchedEnv, before: dict[str, Tensor], rows: Tensor | slice = slice(None)) -> bool:
     """Return whether the state is as `snapshot` found it, in these rows."""
     return all(torch.equal(now[rows], before[name][rows]) for name, now in env.env_state().items())
 

@@ -1,4 +1,7 @@
-"""A base for problems whose state is a tuple of columns and whose random numbers are functions of counters.
+"""A base for problems that are stepped as one batch of independent environments.
+
+The state is a tuple of columns, with one row for each environment. Random numbers are counter-based: each depends only
+on the seed, the number of the environment, the episode and the place of the draw in it (see `counter_rng`).
 
 A subclass hands over three pure functions: how an episode starts, what an action does, and what is observed. The rest
 is the same for all of them: specs, checks of actions, masked steps and resets, the time limit, seeds and checkpoints.
@@ -69,7 +72,7 @@ class Action(NamedTuple):
     option: Tensor | None
 
 
-class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
+class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     """`num_envs` copies of a problem in one batch dimension.
 
     A subclass sets the attributes below, in its class or in `_prepare`, and defines `start`, `act` and `observe`. This
@@ -280,7 +283,7 @@ class CounterEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
         """Yield the pictures of `draw`, each for a quarter of a second; none if there are none."""
-        if type(self).draw is CounterEnv.draw:
+        if type(self).draw is BatchedEnv.draw:
             return
         states = [type(self._state)(**columns) for columns in track]
         for i in range(1, len(states) + 1):

@@ -1,4 +1,4 @@
-"""Environments over columns and counters keep the framework's contract, and so do their Gymnasium adapters."""
+"""Batched environments keep the framework's contract, and so do their Gymnasium adapters."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from batched_players import action, is_unchanged, play, random_player, restart, snapshot
 from conftest import global_generators_unmoved
-from counter_players import action, is_unchanged, play, random_player, restart, snapshot
 from gymnasium.utils.env_checker import check_env
 from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from hpamdp import keys
 from hpamdp.env import counter_rng, point_pictures
+from hpamdp.env.batched_adapter import BatchedEnvAdapter
+from hpamdp.env.batched_env import GOING_ON, BatchedEnv
 from hpamdp.env.catch_point.environment import CatchPointEnv
-from hpamdp.env.counter_adapter import CounterAdapter
-from hpamdp.env.counter_env import GOING_ON, CounterEnv
 from hpamdp.env.gym_hybrid.environment import MovingEnv, SlidingEnv
 from hpamdp.env.hard_move.environment import HardMoveEnv
 from hpamdp.env.platform import rendering
@@ -252,7 +252,7 @@ def test_a_seed_fixes_the_starts(problem):
 @each_problem
 def test_evaluation_draws_starts_and_noise_from_streams_of_its_own_until_the_next_seed(problem):
     env = problem(4)
-    # The tensor functions; what the kernels draw is compared with them in test_counter_kernels.
+    # The tensor functions; what the kernels draw is compared with them in test_batched_kernels.
     env.leave_kernel()
     streams = []
 
@@ -379,7 +379,7 @@ def test_bad_actions_and_options_of_a_adapter_are_refused_in_one_line():
         with pytest.raises(ValueError, match=message):
             adapter.step(bad)
     with pytest.raises(ValueError, match="render_mode='human', but must be None or rgb_array"):
-        CounterAdapter("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
+        BatchedEnvAdapter("hpamdp.env.catch_point.environment:CatchPointEnv", render_mode="human")
 
 
 @pytest.mark.parametrize(
@@ -424,8 +424,8 @@ def test_a_picture_of_platform_shows_both_enemies_on_either_platform():
 
 def test_a_problem_without_pictures_or_player_says_so():
     class Bare(CatchPointEnv):
-        draw = CounterEnv.draw
-        scripted_action = CounterEnv.scripted_action
+        draw = BatchedEnv.draw
+        scripted_action = BatchedEnv.scripted_action
 
     env = Bare()
     with pytest.raises(NotImplementedError, match="Bare has no pictures"):

@@ -1,4 +1,4 @@
-"""Gymnasium environments of any `CounterEnv`, whose id a problem registers with the path of its class.
+"""Gymnasium environments of any `BatchedEnv`, whose id a problem registers with the path of its class.
 
 Their actions are the field's nested tuples, `(discrete action, (parameters of action 0, ..., of action K-1))`; batched
 spaces are Gymnasium's own: every leaf has a leading `[N]`. Only the parameters of the chosen action count.
@@ -20,7 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.env.base import PAMDPEnv
-from hpamdp.env.counter_env import GOING_ON, SUCCESS, CounterEnv
+from hpamdp.env.batched_env import GOING_ON, SUCCESS, BatchedEnv
 from hpamdp.env.gymnasium_adapter import (
     GymnasiumAdapter,
     GymnasiumVectorAdapter,
@@ -33,8 +33,8 @@ from hpamdp.env.kernel_rows import KernelRows, Results
 from hpamdp.env.kernels import OUTCOME_ROW, STEPS_ROW
 
 
-class CounterAdapter(GymnasiumAdapter):
-    """One environment of a `CounterEnv`.
+class BatchedEnvAdapter(GymnasiumAdapter):
+    """One environment of a `BatchedEnv`.
 
     Args:
         problem: the environment's class as text, `package.module:Class`.
@@ -44,15 +44,15 @@ class CounterAdapter(GymnasiumAdapter):
 
     def __init__(self, problem: str, *, render_mode: RenderMode = None, **settings: Any) -> None:
         env = _load(problem)(1, **settings)
-        super().__init__(NumpyCounterEnv(env, ()), render_mode)
+        super().__init__(NumpyBatchedEnv(env, ()), render_mode)
         self._env = env
 
     def _draw(self) -> np.ndarray:
         return self._env.draw(self._track)
 
 
-class CounterVectorAdapter(GymnasiumVectorAdapter):
-    """`num_envs` environments of a `CounterEnv`.
+class BatchedEnvVectorAdapter(GymnasiumVectorAdapter):
+    """`num_envs` environments of a `BatchedEnv`.
 
     Args:
         problem: the environment's class as text, `package.module:Class`.
@@ -69,13 +69,13 @@ class CounterVectorAdapter(GymnasiumVectorAdapter):
         **settings: Any,
     ) -> None:
         env = _load(problem)(num_envs, **settings)
-        super().__init__(NumpyCounterEnv(env, (num_envs,)), num_envs, autoreset_mode)
+        super().__init__(NumpyBatchedEnv(env, (num_envs,)), num_envs, autoreset_mode)
 
 
 class TensorRows:
-    """What `KernelRows` is, for a `CounterEnv` that its tensor functions move: on a GPU, or compiled."""
+    """What `KernelRows` is, for a `BatchedEnv` that its tensor functions move: on a GPU, or compiled."""
 
-    def __init__(self, env: CounterEnv) -> None:
+    def __init__(self, env: BatchedEnv) -> None:
         self._env = env
 
     @property
@@ -138,17 +138,17 @@ class TensorRows:
         )
 
 
-def rows_of(env: CounterEnv) -> KernelRows | TensorRows:
+def rows_of(env: BatchedEnv) -> KernelRows | TensorRows:
     """Return what moves the rows of an environment."""
     return TensorRows(env) if env.rows is None else env.rows
 
 
-class NumpyCounterEnv(NumpyRows):
-    """A `CounterEnv` with NumPy in and out: one environment (`batch=()`) or many (`batch=(N,)`)."""
+class NumpyBatchedEnv(NumpyRows):
+    """A `BatchedEnv` with NumPy in and out: one environment (`batch=()`) or many (`batch=(N,)`)."""
 
     final_infos = ("is_success",)
 
-    def __init__(self, env: CounterEnv, batch: tuple[int, ...]) -> None:
+    def __init__(self, env: BatchedEnv, batch: tuple[int, ...]) -> None:
         super().__init__(rows_of(env), batch)
         self.action_space = _action_space(env)
         low, high = (np.array(side, np.float32) for side in env.observation_bounds)
