@@ -88,10 +88,11 @@ class PAMDPSpecs:
         low, high = parameters.new_tensor(self.parameter_low), parameters.new_tensor(self.parameter_high)
         return 2.0 * (parameters - low) / (high - low) - 1.0
 
-    def from_unit(self, unit: Tensor) -> Tensor:
-        """Map `[*B, num_parameters]` in [-1, 1] to the parameters' bounds."""
-        low, high = unit.new_tensor(self.parameter_low), unit.new_tensor(self.parameter_high)
-        return low + (unit + 1.0) * 0.5 * (high - low)
+    def from_unit(self, unit_parameters: Tensor) -> Tensor:
+        """Map parameters `[*B, num_parameters]` from [-1, 1] to their bounds."""
+        low = unit_parameters.new_tensor(self.parameter_low)
+        high = unit_parameters.new_tensor(self.parameter_high)
+        return low + (unit_parameters + 1.0) * 0.5 * (high - low)
 
     def allowed(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor | None:
         """Return whether a learner may take each discrete action, bool `[*B, num_discrete]`; None if all are allowed.

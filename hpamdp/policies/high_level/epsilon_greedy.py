@@ -41,6 +41,6 @@ class EpsilonGreedy(Bandit):
         epsilon = (self.options.epsilon_scale / time.float()).clamp(self.options.epsilon_final, 1.0)
         is_random = torch.rand(num, device=device, dtype=torch.float32) < epsilon
         mask = None if allowed is None else allowed.expand(num, -1)
-        anything = random_choice(torch.Size([num]), self.specs.num_options, mask, device)
+        random_option = random_choice(torch.Size([num]), self.specs.num_options, mask, device)
         is_untried = self.statistics.is_untried if allowed is None else self.statistics.is_untried & allowed
-        return torch.where(is_random | is_untried.any(), anything, self.best(allowed))
+        return torch.where(is_random | is_untried.any(), random_option, self.best(allowed))

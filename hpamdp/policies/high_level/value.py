@@ -65,7 +65,7 @@ class Value(Selector):
             is_best = value == value.amax(-1, keepdim=True)
             best = torch.where(is_best, torch.rand_like(value), -1.0).argmax(-1)  # break ties at random
             is_random = torch.rand(best.shape, device=best.device, dtype=torch.float32) < self.options.epsilon
-            anything = random_choice(best.shape, self.specs.num_options, option_mask, best.device)
-            best = torch.where(is_random, anything, best)
+            random_option = random_choice(best.shape, self.specs.num_options, option_mask, best.device)
+            best = torch.where(is_random, random_option, best)
         option[is_decision] = best
         return option

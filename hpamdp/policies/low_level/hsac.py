@@ -41,7 +41,7 @@ from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
     InitialParameters,
-    before_tanh,
+    as_preactivations,
     mlp,
     polyak_update,
 )
@@ -102,7 +102,7 @@ class HSACActor(nn.Module):
             state: the observations.
             mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
         """
-        logits, mean, raw_scale = before_tanh(self.net(state)).split(self.sizes, -1)
+        logits, mean, raw_scale = as_preactivations(self.net(state)).split(self.sizes, -1)
         mean = mean + self.initial(state)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
         return HybridDistribution(masked_logits(logits, mask).log_softmax(-1), mean, log_scale, self.owner)
@@ -128,12 +128,14 @@ class HSACPolicy(TensorDictModuleBase):
         allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(observation, allowed)
         if self.is_random and not is_greedy():
-            unit = 2.0 * torch.rand_like(distribution.mean) - 1.0
-            discrete = random_choice(unit.shape[:-1], self.specs.num_discrete, allowed, unit.device)
+            unit_parameters = 2.0 * torch.rand_like(distribution.mean) - 1.0
+            discrete = random_choice(
+                unit_parameters.shape[:-1], self.specs.num_discrete, allowed, unit_parameters.device
+            )
         else:
             discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
-            unit = raw.tanh()
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}})
+            unit_parameters = raw.tanh()
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit_parameters)}})
 
 
 class HSAC(ReplayLearner):
@@ -227,12 +229,12 @@ class HSAC(ReplayLearner):
         """
         discrete_weight, parameter_weight = self.temperatures()
         distribution: HybridDistribution = self.actor(state, allowed)
-        unit, log_density = distribution.sample_squashed()
+        unit_parameters, log_density = distribution.sample_squashed()
         log_probs = distribution.discrete_log_probs
         # Of each discrete action's own parameters together, `[B, num_discrete]`.
         own_log_density = distribution.sum_of_own(log_density)
         own_target = self.options.parameter_target_entropy * self.parameter_dims
-        q = critics(state, unit).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
+        q = critics(state, unit_parameters).amin(0) - discrete_weight * log_probs - parameter_weight * own_log_density
         probs = log_probs.exp()
         most_entropy = self.most_discrete_entropy if allowed is None else allowed.sum(-1).log()
         discrete_excess = -(probs * log_probs).sum(-1) - self.options.discrete_target_entropy * most_entropy

@@ -65,7 +65,14 @@ from hpamdp.policies.shared.actor_search import (
     with_variations,
 )
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
-from hpamdp.policies.shared.networks import EnsembleMLP, before_tanh, mlp, polyak_update, unsquashed, with_clipped_noise
+from hpamdp.policies.shared.networks import (
+    EnsembleMLP,
+    as_preactivations,
+    mlp,
+    polyak_update,
+    unsquashed,
+    with_clipped_noise,
+)
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.policies.shared.scales import scale_of
 from hpamdp.settings import LearningRate, PositiveFraction
@@ -73,8 +80,8 @@ from hpamdp.specs import PAMDPSpecs
 
 LATENT = "latent"  # the latent action as the actor gave it; NaN where the action was random
 
-# Variations that are valued at once, if those of a state are no more: bounds the memory.
-_MAX_TRIED = 1 << 14
+# Latent actions that the critics evaluate at once, unless one state has more: bounds the memory.
+_MAX_CANDIDATES = 1 << 14
 
 
 class HyAROptions(TargetRateOptions, SearchingActorOptions):
@@ -197,7 +204,7 @@ class HybridCodec(nn.Module):
     def decode(self, state: Tensor, discrete: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Return the parameters `[B, num_parameters]` in [-1, 1] and the predicted change of the state, scaled."""
         hidden = self._hidden(state, discrete, z)
-        return before_tanh(self.parameter_head(hidden)).tanh(), self.dynamics_head(hidden)
+        return as_preactivations(self.parameter_head(hidden)).tanh(), self.dynamics_head(hidden)
 
     def change(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
         """Return the predicted change of the state alone, scaled, `[B, observation_dim]`."""
@@ -206,9 +213,9 @@ class HybridCodec(nn.Module):
     def _hidden(self, state: Tensor, discrete: Tensor, z: Tensor) -> Tensor:
         return self.decoder(torch.cat([z, state, self.embeddings[discrete]], -1))
 
-    def z_from_unit(self, unit: Tensor) -> Tensor:
+    def z_from_unit(self, unit_z: Tensor) -> Tensor:
         """Map the actor's [-1, 1] onto the central range of the encoded z."""
-        return self.z_low + (unit + 1.0) * 0.5 * (self.z_high - self.z_low)
+        return self.z_low + (unit_z + 1.0) * 0.5 * (self.z_high - self.z_low)
 
     def z_to_unit(self, z: Tensor) -> Tensor:
         """Map z back to the actor's [-1, 1], clipped."""
@@ -237,7 +244,7 @@ class LatentActor(nn.Module):
 
     def raw(self, state: Tensor) -> Tensor:
         """Return what the actor gives before tanh, `[B, num_proposals, num_given]`."""
-        return before_tanh(self.net(state)).unflatten(-1, (self.num_proposals, self.num_given))
+        return as_preactivations(self.net(state)).unflatten(-1, (self.num_proposals, self.num_given))
 
     def proposals(self, given: Tensor, embeddings: Tensor) -> Tensor:
         """Return the proposals of what the actor gave, `[B, num_proposals, num_given]` in [-1, 1]."""
@@ -270,19 +277,20 @@ class LatentCritics(nn.Module):
         return self.net(rows.flatten(0, 1), num_members).reshape(-1, batch_size, num_latents)
 
 
-def best_of_proposals(critics: LatentCritics, state: Tensor, tried: Tensor) -> tuple[Tensor, Tensor]:
+def best_of_proposals(critics: LatentCritics, state: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Return the best of T latent actions for each of P proposals, by the lowest of the critics' values, and its value.
 
     Args:
         critics: value the latent actions.
         state: `[B, observation_dim]`.
-        tried: in each state, `[B, P, T, embedding_dim + latent_dim]`.
+        candidates: T latent actions for each proposal in each state, `[B, P, T, embedding_dim + latent_dim]`.
 
     Returns:
         Latent actions `[B, P, embedding_dim + latent_dim]` and values `[B, P]`.
     """
-    value, place = critics(state, tried.flatten(1, 2)).amin(0).unflatten(1, tried.shape[1:3]).max(-1)
-    return tried.take_along_dim(place[..., None, None], 2).squeeze(2), value
+    q = critics(state, candidates.flatten(1, 2)).amin(0).unflatten(1, candidates.shape[1:3])
+    best_value, best_index = q.max(-1)
+    return candidates.take_along_dim(best_index[..., None, None], 2).squeeze(2), best_value
 
 
 class HyARPolicy(TensorDictModuleBase):
@@ -329,16 +337,16 @@ class HyARPolicy(TensorDictModuleBase):
             q = self.critics(state, proposals).amin(0) if q is None else q
             best = masked_values(q, allowed).argmax(-1)
             latent = proposals[torch.arange(len(best), device=best.device), best]
-        discrete, unit = self.decode(state, latent, allowed)
+        discrete, unit_parameters = self.decode(state, latent, allowed)
         if is_exploring and self.epsilon > 0.0:
-            is_random = torch.rand_like(unit[:, :1]) < self.epsilon
-            unit = torch.where(is_random, 2.0 * torch.rand_like(unit) - 1.0, unit)
+            is_random = torch.rand_like(unit_parameters[:, :1]) < self.epsilon
+            unit_parameters = torch.where(is_random, 2.0 * torch.rand_like(unit_parameters) - 1.0, unit_parameters)
             random_discrete = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
             discrete = torch.where(is_random.squeeze(-1), random_discrete, discrete)
             latent = torch.where(is_random, torch.nan, latent)
         td.set(LATENT, latent.reshape(*td.batch_size, -1))
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
-        return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters).reshape(*td.batch_size, -1))
 
     def _best_variations(self, state: Tensor, proposals: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best of each proposal `[B, P, embedding_dim + latent_dim]` and its variations, and its value."""
@@ -346,7 +354,7 @@ class HyARPolicy(TensorDictModuleBase):
         def best_of(some_states: Tensor, some_proposals: Tensor) -> tuple[Tensor, Tensor]:
             return best_of_proposals(self.critics, some_states, with_variations(some_proposals, self.variations))
 
-        num_rows = max(1, _MAX_TRIED // (proposals.shape[1] * (1 + len(self.variations))))
+        num_rows = max(1, _MAX_CANDIDATES // (proposals.shape[1] * (1 + len(self.variations))))
         best, values = in_pieces(best_of, num_rows, state, proposals)
         return best, values
 
@@ -360,8 +368,8 @@ class HyARPolicy(TensorDictModuleBase):
         """
         e, z = latent.split([self.codec.table.shape[-1], self.codec.latent_dim], -1)
         discrete = self.codec.nearest_discrete(e, allowed)
-        unit, _ = self.codec.decode(state, discrete, self.codec.z_from_unit(z))
-        return discrete, unit
+        unit_parameters, _ = self.codec.decode(state, discrete, self.codec.z_from_unit(z))
+        return discrete, unit_parameters
 
 
 class HyAR(ReplayLearner):
@@ -481,15 +489,16 @@ class HyAR(ReplayLearner):
             if self.actor.proposes_each:
                 e = proposals[..., : -self.codec.latent_dim].unsqueeze(2).expand(*shape, -1)
             else:
-                of_tried = None if allowed is None else allowed[:, None, None].expand(*shape, -1)
-                discrete = random_choice(torch.Size(shape), self.specs.num_discrete, of_tried, state.device)
+                mask = None if allowed is None else allowed[:, None, None].expand(*shape, -1)
+                discrete = random_choice(torch.Size(shape), self.specs.num_discrete, mask, state.device)
                 e = self.codec.embeddings[discrete]
             z = 2.0 * torch.rand(*shape, self.codec.latent_dim, device=state.device, dtype=torch.float32) - 1.0
-            num_rows = max(1, _MAX_TRIED // (shape[1] * shape[2]))
-            found, best = in_pieces(partial(best_of_proposals, self.critics), num_rows, state, torch.cat([e, z], -1))
-            gain = (best - self.critics(state, proposals).amin(0)).clamp(min=0.0)
+            num_rows = max(1, _MAX_CANDIDATES // (shape[1] * shape[2]))
+            best_of = partial(best_of_proposals, self.critics)
+            best, best_value = in_pieces(best_of, num_rows, state, torch.cat([e, z], -1))
+            gain = (best_value - self.critics(state, proposals).amin(0)).clamp(min=0.0)
             gain = gain * allowed if self.actor.proposes_each and allowed is not None else gain
-        return gain, (raw - unsquashed(self.actor.given(found))).square().sum(-1)
+        return gain, (raw - unsquashed(self.actor.given(best))).square().sum(-1)
 
     def corrected_latent(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return latents that the codec still decodes to the executed actions, and which of them were corrected, `[B]`.
@@ -532,8 +541,8 @@ class HyAR(ReplayLearner):
             target = (batch["next_state"] - state) / self.codec.change_scale
             error = (self.codec.change(state, discrete, z) - target).square().mean(-1)
             return error <= self.options.correction_factor * self.dynamics_error
-        unit, _ = self.codec.decode(state, discrete, z)
-        error = ((unit - batch["unit"]) * self.codec.mask[discrete]).abs().amax(-1)
+        unit_parameters, _ = self.codec.decode(state, discrete, z)
+        error = ((unit_parameters - batch["unit"]) * self.codec.mask[discrete]).abs().amax(-1)
         return error <= self.options.parameter_tolerance
 
     def codec_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -541,8 +550,8 @@ class HyAR(ReplayLearner):
         state, discrete, executed = sample["state"], sample["discrete"], sample["unit"]
         mean, log_variance = self.codec.encode(state, discrete, executed)
         z = mean + (0.5 * log_variance).exp() * torch.randn_like(mean)
-        unit, change = self.codec.decode(state, discrete, z)
-        reconstruction = ((unit - executed).square() * self.codec.mask[discrete]).sum(-1).mean()
+        unit_parameters, change = self.codec.decode(state, discrete, z)
+        reconstruction = ((unit_parameters - executed).square() * self.codec.mask[discrete]).sum(-1).mean()
         divergence = -0.5 * (1.0 + log_variance - mean.square() - log_variance.exp()).sum(-1).mean()
         dynamics = F.mse_loss(change, (sample["next_state"] - state) / self.codec.change_scale)
         loss = reconstruction + self.options.kl_weight * divergence + self.options.dynamics_weight * dynamics

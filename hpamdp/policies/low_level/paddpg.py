@@ -128,9 +128,9 @@ class PADDPGPolicy(TensorDictModuleBase):
             is_random = torch.rand_like(output[..., :1]) < self.epsilon
             noisy = with_exploring_noise(output, self.noise)
             output = torch.where(is_random, 2.0 * torch.rand_like(output) - 1.0, noisy)
-        scores, unit = with_lowest_scores(output, allowed).tensor_split([self.specs.num_discrete], -1)
+        scores, unit_parameters = with_lowest_scores(output, allowed).tensor_split([self.specs.num_discrete], -1)
         discrete = masked_values(scores, allowed).argmax(-1)
-        action = {"discrete": discrete, "parameters": self.specs.from_unit(unit)}
+        action = {"discrete": discrete, "parameters": self.specs.from_unit(unit_parameters)}
         return td.update({keys.ACTION: action, SCORES: scores})
 
 

@@ -62,7 +62,7 @@ from hpamdp.policies.shared.networks import (
     InitialLayer,
     InitialParameters,
     InvertingGradients,
-    before_tanh,
+    as_preactivations,
     mlp,
     polyak_update,
     unsquashed,
@@ -72,8 +72,8 @@ from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
 
-# Parameters, or values, of the variations that are tried at once: bounds the memory where discrete actions are many.
-_MAX_TRIED = 1 << 22
+# Numbers that the critics evaluate at once for the greedy policy: bounds the memory if there are many discrete actions.
+_MAX_NUMBERS = 1 << 22
 
 
 class PDQNOptions(SearchingActorOptions):
@@ -130,29 +130,29 @@ class ParameterActor(nn.Module):
 
     def raw(self, state: Tensor) -> Tensor:
         """Return the parameters before they are bounded: with tanh, the preactivations."""
-        return before_tanh(self.net(state)) + self.initial(state)
+        return as_preactivations(self.net(state)) + self.initial(state)
 
     def bounded(self, raw: Tensor) -> Tensor:
         """Return parameters in [-1, 1], given those before they are bounded."""
         return InvertingGradients.apply(raw) if self.is_inverting else raw.tanh()
 
-    def unbounded(self, unit: Tensor) -> Tensor:
+    def unbounded(self, unit_parameters: Tensor) -> Tensor:
         """Return the inverse of `bounded`, after clamping parameters at a bound to values close to it."""
-        return unit if self.is_inverting else unsquashed(unit)
+        return unit_parameters if self.is_inverting else unsquashed(unit_parameters)
 
 
-def best_of_tried(critics: HybridCritics, state: Tensor, tried: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the highest value of every discrete action and which of the tried parameters has it, `[B, num_discrete]`.
+def best_of_candidates(critics: HybridCritics, state: Tensor, candidates: Tensor) -> tuple[Tensor, Tensor]:
+    """Return every discrete action's highest value and the index of the candidate with it, `[B, num_discrete]` each.
 
     Args:
         critics: value the parameters; the lowest of their values counts.
         state: `[B, observation_dim]`.
-        tried: in each state, `[B, T, num_parameters]` in [-1, 1].
+        candidates: T parameter vectors in each state, `[B, T, num_parameters]` in [-1, 1].
     """
-    num_tried = tried.shape[1]
-    q = critics(state.repeat_interleave(num_tried, 0), tried.flatten(0, 1)).amin(0)
-    value, place = q.unflatten(0, (-1, num_tried)).max(1)
-    return value, place
+    num_candidates = candidates.shape[1]
+    q = critics(state.repeat_interleave(num_candidates, 0), candidates.flatten(0, 1)).amin(0)
+    best_value, best_index = q.unflatten(0, (-1, num_candidates)).max(1)
+    return best_value, best_index
 
 
 class PDQNPolicy(TensorDictModuleBase):
@@ -178,33 +178,34 @@ class PDQNPolicy(TensorDictModuleBase):
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
         allowed = allowed_rows(self.specs, td)
-        unit = self.actor(state)
+        unit_parameters = self.actor(state)
         if is_greedy() and len(self.variations) > 0:
-            discrete, unit = self._best_variation(state, unit, allowed)
+            discrete, unit_parameters = self._best_variation(state, unit_parameters, allowed)
         else:
-            discrete = masked_values(self.critics(state, unit).amin(0), allowed).argmax(-1)
+            discrete = masked_values(self.critics(state, unit_parameters).amin(0), allowed).argmax(-1)
         if not is_greedy():
             is_random = torch.rand(discrete.shape, device=discrete.device, dtype=torch.float32) < self.epsilon
-            noisy = with_exploring_noise(unit, self.noise)
-            unit = torch.where(is_random.unsqueeze(-1), 2.0 * torch.rand_like(unit) - 1.0, noisy)
-            anything = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
-            discrete = torch.where(is_random, anything, discrete)
+            noisy = with_exploring_noise(unit_parameters, self.noise)
+            random_parameters = 2.0 * torch.rand_like(unit_parameters) - 1.0
+            unit_parameters = torch.where(is_random.unsqueeze(-1), random_parameters, noisy)
+            random_discrete = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
+            discrete = torch.where(is_random, random_discrete, discrete)
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
-        return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters).reshape(*td.batch_size, -1))
 
-    def _best_variation(self, state: Tensor, unit: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _best_variation(self, state: Tensor, unit_parameters: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the discrete actions `[B]` and the parameters `[B, P]` that are best among x(s) and its variations."""
-        num_tried = 1 + len(self.variations)
-        num_rows = max(1, _MAX_TRIED // (num_tried * max(unit.shape[-1], self.specs.num_discrete)))
+        num_candidates = 1 + len(self.variations)
+        num_rows = max(1, _MAX_NUMBERS // (num_candidates * max(unit_parameters.shape[-1], self.specs.num_discrete)))
 
-        def best_of(some_states: Tensor, some_units: Tensor) -> tuple[Tensor, Tensor]:
-            return best_of_tried(self.critics, some_states, with_variations(some_units, self.variations))
+        def best_of(some_states: Tensor, some_parameters: Tensor) -> tuple[Tensor, Tensor]:
+            return best_of_candidates(self.critics, some_states, with_variations(some_parameters, self.variations))
 
-        values, places = in_pieces(best_of, num_rows, state, unit)
-        discrete = masked_values(values, allowed).argmax(-1)
-        place = places.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
-        none = unit.new_zeros(1, unit.shape[-1])
-        return discrete, (unit + torch.cat([none, self.variations])[place]).clamp(-1.0, 1.0)
+        best_values, best_indices = in_pieces(best_of, num_rows, state, unit_parameters)
+        discrete = masked_values(best_values, allowed).argmax(-1)
+        best_index = best_indices.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
+        no_variation = torch.zeros_like(self.variations[:1])
+        return discrete, (unit_parameters + torch.cat([no_variation, self.variations])[best_index]).clamp(-1.0, 1.0)
 
 
 class PDQN(ReplayLearner):
@@ -274,9 +275,9 @@ class PDQN(ReplayLearner):
         With `double_q`, the learned critics choose k instead of the target critics.
         """
         smoothing = self.options.target_smoothing, self.options.target_smoothing_clip
-        unit = with_clipped_noise(self.target_actor(observation), *smoothing)
-        q = self.target_critics(observation, unit).amin(0)
-        choosing_q = self.critics(observation, unit).amin(0) if self.options.double_q else q
+        unit_parameters = with_clipped_noise(self.target_actor(observation), *smoothing)
+        q = self.target_critics(observation, unit_parameters).amin(0)
+        choosing_q = self.critics(observation, unit_parameters).amin(0) if self.options.double_q else q
         choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
         return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
 
@@ -303,12 +304,12 @@ class PDQN(ReplayLearner):
         """
         shape = len(state), self.options.search_samples, self.specs.num_parameters
         with torch.no_grad():
-            tried = 2.0 * torch.rand(shape, device=state.device, dtype=torch.float32) - 1.0
-            best, place = best_of_tried(self.critics, state, tried)
-            found = tried.gather(1, place[:, self.owner].unsqueeze(1)).squeeze(1)
-            gain = (best - q).clamp(min=0.0)
+            candidates = 2.0 * torch.rand(shape, device=state.device, dtype=torch.float32) - 1.0
+            best_value, best_index = best_of_candidates(self.critics, state, candidates)
+            best_parameters = candidates.gather(1, best_index[:, self.owner].unsqueeze(1)).squeeze(1)
+            gain = (best_value - q).clamp(min=0.0)
             gain = gain if allowed is None else gain * allowed
-        return gain[:, self.owner], (raw - self.actor.unbounded(found)).square()
+        return gain[:, self.owner], (raw - self.actor.unbounded(best_parameters)).square()
 
     def learn(self, batch: TensorDictBase, mask: Tensor) -> dict[str, float]:
         """Store the batch's transitions, count its episodes; after the warm-up, make the updates that are due."""

@@ -103,5 +103,5 @@ class FourierBasis(SizedByData):
 
     def forward(self, observation: Tensor) -> Tensor:
         """Return the features `[*B, num_features]` of observations `[*B, observation_dim]`."""
-        unit = ((observation[..., self.inputs] - self.low) / self.width).clamp(0.0, 1.0)
-        return (math.pi * unit @ self.coefficients.T).cos()
+        scaled = ((observation[..., self.inputs] - self.low) / self.width).clamp(0.0, 1.0)
+        return (math.pi * scaled @ self.coefficients.T).cos()

@@ -24,10 +24,12 @@ class RandomPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         device = td.get(keys.OBSERVATION).device
-        unit = 2.0 * torch.rand(*td.batch_size, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
+        unit_parameters = (
+            2.0 * torch.rand(*td.batch_size, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
+        )
         allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
         discrete = random_choice(td.batch_size, self.specs.num_discrete, allowed, device)
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit)}})
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit_parameters)}})
 
 
 class Random(Learner):

@@ -114,13 +114,13 @@ class TD3BCPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
         state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
-        unit = self.actor(state)
-        q = self.critics(state, unit).amin(0)
+        unit_parameters = self.actor(state)
+        q = self.critics(state, unit_parameters).amin(0)
         discrete = q.masked_fill(self.is_refused(state, allowed_rows(self.specs, td)), -torch.inf).argmax(-1)
         if not is_greedy():
-            unit = with_exploring_noise(unit, self.parameter_noise)
+            unit_parameters = with_exploring_noise(unit_parameters, self.parameter_noise)
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
-        return td.set(keys.PARAMETERS, self.specs.from_unit(unit).reshape(*td.batch_size, -1))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters).reshape(*td.batch_size, -1))
 
 
 class TD3BC(ReplayLearner):
@@ -180,12 +180,12 @@ class TD3BC(ReplayLearner):
     def actor_loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss that falls towards higher values and towards the data."""
         state = sample["state"]
-        unit = self.actor(state)
+        unit_parameters = self.actor(state)
         with torch.no_grad():
             frequency = masked_logits(self.behaviour(state), allowed).softmax(-1)
-        q = (self.critics(state, unit).amin(0) * frequency).sum(-1)
+        q = (self.critics(state, unit_parameters).amin(0) * frequency).sum(-1)
         is_own = self.owner == sample["discrete"].unsqueeze(-1)
-        distance = ((unit - sample["unit"]).square() * is_own).sum(-1)
+        distance = ((unit_parameters - sample["unit"]).square() * is_own).sum(-1)
         # Values are divided by their mean size, so that the weight does not depend on the scale of the reward.
         loss = (self.options.behaviour_weight * distance).mean() - q.mean() / q.detach().abs().mean().clamp(min=1e-6)
         return loss, {"actor": loss}
@@ -193,8 +193,10 @@ class TD3BC(ReplayLearner):
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`."""
-        unit = self.target_actor(observation)
-        unit = with_clipped_noise(unit, self.options.target_smoothing, self.options.target_smoothing_clip)
-        q = self.target_critics(observation, unit).amin(0)
+        unit_parameters = self.target_actor(observation)
+        unit_parameters = with_clipped_noise(
+            unit_parameters, self.options.target_smoothing, self.options.target_smoothing_clip
+        )
+        q = self.target_critics(observation, unit_parameters).amin(0)
         is_refused = self.policy.is_refused(observation, self.specs.allowed(observation, action_mask))
         return q.masked_fill(is_refused, -torch.inf).amax(-1)

@@ -79,10 +79,10 @@ def even_normal(num: int, dim: int, deviation: float) -> Tensor:
     return deviation * torch.special.ndtri(uniform.clamp(1e-6, 1.0 - 1e-6))
 
 
-def with_variations(unit: Tensor, variations: Tensor) -> Tensor:
+def with_variations(unit_actions: Tensor, variations: Tensor) -> Tensor:
     """Return actions in [-1, 1], `[*B, D]`, and behind each its sums with the variations `[S, D]`: `[*B, 1 + S, D]`."""
-    unit = unit.unsqueeze(-2)
-    return torch.cat([unit, (unit + variations).clamp(-1.0, 1.0)], -2)
+    unit_actions = unit_actions.unsqueeze(-2)
+    return torch.cat([unit_actions, (unit_actions + variations).clamp(-1.0, 1.0)], -2)
 
 
 def in_pieces(function: Callable[..., tuple[Tensor, ...]], num_rows: int, *rows: Tensor) -> tuple[Tensor, ...]:

@@ -25,9 +25,9 @@ class EpsilonOptions(ParameterNoiseOptions):
     """Steps after the warm-up within which the probability of a random action falls."""
 
 
-def with_exploring_noise(unit: Tensor, deviation: float) -> Tensor:
+def with_exploring_noise(unit_actions: Tensor, deviation: float) -> Tensor:
     """Return parameters in [-1, 1], of any shape, with Gaussian noise of this standard deviation."""
-    return (unit + deviation * torch.randn_like(unit)).clamp(-1.0, 1.0)
+    return (unit_actions + deviation * torch.randn_like(unit_actions)).clamp(-1.0, 1.0)
 
 
 def linear_schedule(time: int, over: int, final: float) -> float:

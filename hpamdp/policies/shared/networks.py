@@ -93,30 +93,33 @@ def mlp(in_dim: int, hidden_dims: Sequence[int], out_dim: int) -> nn.Sequential:
     return nn.Sequential(*layers, nn.Linear(dims[-1], out_dim, dtype=torch.float32))
 
 
-def before_tanh(output: Tensor) -> Tensor:
-    """Return a network's output in float32: in bfloat16 tanh is 1 from 3.3 on, and has no gradient."""
+def as_preactivations(output: Tensor) -> Tensor:
+    """Return a network's output, to which tanh will be applied, in float32.
+
+    In bfloat16 tanh is 1 from 3.3 on, and has no gradient there.
+    """
     return output.float()
 
 
-def unsquashed(unit: Tensor, largest: float = _LARGEST_DRAWN_TO) -> Tensor:
+def unsquashed(squashed: Tensor, largest: float = _LARGEST_DRAWN_TO) -> Tensor:
     """Return the inverse tanh, after clamping to [-largest, largest]."""
-    return unit.clamp(-largest, largest).atanh()
+    return squashed.clamp(-largest, largest).atanh()
 
 
-def with_clipped_noise(unit: Tensor, scale: float, clip: float) -> Tensor:
+def with_clipped_noise(unit_actions: Tensor, scale: float, clip: float) -> Tensor:
     """Return actions in [-1, 1] with Gaussian noise, itself clipped: the target policy smoothing of TD3.
 
     Source: Fujimoto, van Hoof and Meger 2018, arXiv 1802.09477, section 5.3.
 
     Args:
-        unit: the actions, of any shape.
+        unit_actions: the actions, of any shape.
         scale: standard deviation of the noise; 0 is none, and draws no random numbers.
         clip: bound of the noise.
     """
     if scale == 0.0:
-        return unit
-    noise = (scale * torch.randn_like(unit)).clamp(-clip, clip)
-    return (unit + noise).clamp(-1.0, 1.0)
+        return unit_actions
+    noise = (scale * torch.randn_like(unit_actions)).clamp(-clip, clip)
+    return (unit_actions + noise).clamp(-1.0, 1.0)
 
 
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
@@ -220,8 +223,8 @@ class InitialLayer(nn.Module):
         """Return what to add for observations `[*B, observation_dim]`: `[*B, num_parameters]`, or 0."""
         if not self.exists:
             return 0.0
-        unit = nn.functional.linear(observation, self.weight, self.bias)
-        return unsquashed(unit, _LARGEST_INITIAL) if self.is_squashed else unit
+        unit_parameters = nn.functional.linear(observation, self.weight, self.bias)
+        return unsquashed(unit_parameters, _LARGEST_INITIAL) if self.is_squashed else unit_parameters
 
     def shrink(self, output: nn.Module, rows: slice = slice(None)) -> None:
         """Bring the parameters' rows of a network's linear output near 0 where this layer adds something."""
@@ -268,32 +271,32 @@ class HybridCritics(nn.Module):
             "is_own", (owner[slots] == torch.arange(self.num_discrete).unsqueeze(-1)).float(), persistent=False
         )
 
-    def forward(self, state: Tensor, unit: Tensor) -> Tensor:
+    def forward(self, state: Tensor, unit_parameters: Tensor) -> Tensor:
         """Return the values of all discrete actions, `[E, B, num_discrete]`."""
         if not self.is_multipass:
-            return self.net(torch.cat([state, unit], -1))
+            return self.net(torch.cat([state, unit_parameters], -1))
         num_rows = max(1, _MAX_PASSES // self.num_discrete)
         if len(state) <= num_rows:
-            return self._passes(state, unit)
-        pieces = zip(state.split(num_rows), unit.split(num_rows), strict=True)
+            return self._passes(state, unit_parameters)
+        pieces = zip(state.split(num_rows), unit_parameters.split(num_rows), strict=True)
         return torch.cat([self._passes(*piece) for piece in pieces], 1)
 
-    def of_discrete(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
+    def of_discrete(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
         """Return the values `[E, B]` of the given discrete actions `[B]`."""
-        own = unit * (self.owner == discrete.unsqueeze(-1)) if self.is_multipass else unit
+        own = unit_parameters * (self.owner == discrete.unsqueeze(-1)) if self.is_multipass else unit_parameters
         q = self.net(torch.cat([state, own], -1))
         return q.gather(-1, discrete.expand(q.shape[0], -1).unsqueeze(-1)).squeeze(-1)
 
-    def _passes(self, state: Tensor, unit: Tensor) -> Tensor:
+    def _passes(self, state: Tensor, unit_parameters: Tensor) -> Tensor:
         """Return output k of pass k for every discrete action k, `[E, B, num_discrete]`."""
         first, last = self.net.layers[0], self.net.layers[-1]
         assert isinstance(first, EnsembleLinear) and isinstance(last, EnsembleLinear)
-        of_state, of_unit = first.weight.split([self.observation_dim, unit.shape[-1]], 1)
+        of_state, of_parameters = first.weight.split([self.observation_dim, unit_parameters.shape[-1]], 1)
         common = torch.baddbmm(first.bias, state.expand(len(of_state), *state.shape), of_state)
         x = common.unsqueeze(2)
         for slot, is_own in zip(self.slots.unbind(-1), self.is_own.unbind(-1), strict=True):
             # Of every discrete action the next one of its parameters, `[B, K]`, in its own pass.
-            x = torch.addcmul(x, (unit[:, slot] * is_own).unsqueeze(-1), of_unit[:, slot].unsqueeze(1))
+            x = torch.addcmul(x, (unit_parameters[:, slot] * is_own).unsqueeze(-1), of_parameters[:, slot].unsqueeze(1))
         if first is last:
             return x.expand(-1, -1, self.num_discrete, -1).diagonal(dim1=-2, dim2=-1)
         x = self.net.activated(x.expand(-1, -1, self.num_discrete, -1).contiguous())

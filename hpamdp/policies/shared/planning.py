@@ -260,25 +260,27 @@ class SequenceSearch:
         parts = list(zip(steps, prefixes, strict=True))
         discrete = torch.stack([step.discrete.gather(1, prefix) for step, prefix in parts], -1)
         row = torch.arange(num_states, device=device)
-        unit = torch.stack([step.own[row.unsqueeze(-1), prefix] for step, prefix in parts], -2)
+        unit_parameters = torch.stack([step.own[row.unsqueeze(-1), prefix] for step, prefix in parts], -2)
         for refinement in range(self.options.num_iterations - 1):
             if refinement > 0:
                 kept = self._best_sequences(value, self.options.num_kept >> refinement)
                 value = value.take_along_dim(kept.unsqueeze(-1), 1)
                 is_allowed = None if is_allowed is None else is_allowed.gather(1, kept)
                 discrete = discrete.take_along_dim(kept.unsqueeze(-1), 1)
-                unit = unit.take_along_dim(kept[..., None, None, None], 1)
-            mean, deviation = self._gaussians(value, unit, self._lower_bound(refinement))
-            best = _best_samples(value, unit)
-            normal = torch.special.ndtri(_stratified(unit.shape, device))
-            unit = mean.unsqueeze(2) + deviation.unsqueeze(2) * normal
-            unit[:, :, -1] = mean
-            unit[:, :, 0] = best
-            unit = unit.clamp_(-1.0, 1.0) * has_slot[discrete].unsqueeze(2)
-            value = returns([SequenceStep(discrete[..., h], unit[..., h, :]) for h in range(self.options.horizon)])
+                unit_parameters = unit_parameters.take_along_dim(kept[..., None, None, None], 1)
+            mean, deviation = self._gaussians(value, unit_parameters, self._lower_bound(refinement))
+            best = _best_samples(value, unit_parameters)
+            normal = torch.special.ndtri(_stratified(unit_parameters.shape, device))
+            unit_parameters = mean.unsqueeze(2) + deviation.unsqueeze(2) * normal
+            unit_parameters[:, :, -1] = mean
+            unit_parameters[:, :, 0] = best
+            unit_parameters = unit_parameters.clamp_(-1.0, 1.0) * has_slot[discrete].unsqueeze(2)
+            value = returns(
+                [SequenceStep(discrete[..., h], unit_parameters[..., h, :]) for h in range(self.options.horizon)]
+            )
             value = _without_forbidden(value, is_allowed)
         best_value, place = value.amax(-1).max(-1)
-        return PlannedAction(discrete[row, place, 0], _best_samples(value, unit)[row, place, 0], best_value)
+        return PlannedAction(discrete[row, place, 0], _best_samples(value, unit_parameters)[row, place, 0], best_value)
 
     @staticmethod
     def _best_sequences(value: Tensor, num: int) -> Tensor:
@@ -290,19 +292,19 @@ class SequenceSearch:
         fraction = refinement / max(1, self.options.num_iterations - 2)
         return self.options.first_min_deviation ** (1.0 - fraction) * self.options.min_deviation**fraction
 
-    def _gaussians(self, value: Tensor, unit: Tensor, lower_bound: float) -> tuple[Tensor, Tensor]:
+    def _gaussians(self, value: Tensor, unit_parameters: Tensor, lower_bound: float) -> tuple[Tensor, Tensor]:
         """Return mean and deviation `[N, Q, H, D]` of the elites, of returns `[N, Q, S]` of `[N, Q, S, H, D]`."""
         place, weight = elite_weights(value, self.options.num_elites, self.options.temperature)
-        elites = unit.take_along_dim(place[..., None, None], 2)
+        elites = unit_parameters.take_along_dim(place[..., None, None], 2)
         weight = weight[..., None, None]
         mean = (weight * elites).sum(2)
         variance = (weight * (elites - mean.unsqueeze(2)).square()).sum(2)
         return mean, variance.sqrt().clamp(min=lower_bound)
 
 
-def _best_samples(value: Tensor, unit: Tensor) -> Tensor:
+def _best_samples(value: Tensor, unit_parameters: Tensor) -> Tensor:
     """Return each sequence's best sample `[N, Q, H, D]`, of returns `[N, Q, S]` of `[N, Q, S, H, D]`."""
-    return unit.take_along_dim(value.argmax(-1)[..., None, None, None], 2).squeeze(2)
+    return unit_parameters.take_along_dim(value.argmax(-1)[..., None, None, None], 2).squeeze(2)
 
 
 def _without_forbidden(value: Tensor, is_allowed: Tensor | None) -> Tensor:

@@ -66,7 +66,7 @@ class PlanningPolicy(TensorDictModuleBase):
         mask = None if mask is None else mask.flatten(0, -2)
         allowed = self.specs.allowed(observation, mask)
         discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed, device)
-        unit = 2.0 * torch.rand(num, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
+        unit_parameters = 2.0 * torch.rand(num, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
         is_planned = self.is_trained.expand(num)
         done = td.get(keys.DONE, None)
         if done is not None:
@@ -75,9 +75,9 @@ class PlanningPolicy(TensorDictModuleBase):
             is_planned = is_planned & (torch.rand(num, device=device, dtype=torch.float32) >= self.epsilon)
         if is_planned.any():
             mask = None if mask is None else mask[is_planned]
-            discrete[is_planned], unit[is_planned] = self.first_action(td, observation, is_planned, mask)
+            discrete[is_planned], unit_parameters[is_planned] = self.first_action(td, observation, is_planned, mask)
         shape = td.batch_size
-        parameters = self.specs.from_unit(unit).reshape(*shape, self.specs.num_parameters)
+        parameters = self.specs.from_unit(unit_parameters).reshape(*shape, self.specs.num_parameters)
         return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": parameters}})
 
     def first_action(

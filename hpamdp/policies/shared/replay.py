@@ -231,7 +231,8 @@ class ReplayLearner(Learner):
     def transitions(self, batch: TensorDictBase) -> TensorDict:
         """Return what is stored of a batch `[*B, T]`, with scaled rewards.
 
-        `discount` is 0 where the step terminated, else gamma.
+        `unit` holds the parameters, mapped from their bounds to [-1, 1]. `discount` is 0 if the step terminated, else
+        gamma.
         """
         rows = TensorDict(
             {

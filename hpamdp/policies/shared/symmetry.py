@@ -37,11 +37,11 @@ class RandomSymmetry:
     def mapped(self, number: Tensor, rows: TensorDictBase) -> TensorDictBase:
         """Return rows `[*B]` under the maps int64 `[*B]`."""
         context = self.maps.context(rows["state"])
-        discrete, unit = self.maps.map_action(number, context, rows["discrete"], rows["unit"])
+        discrete, unit_parameters = self.maps.map_action(number, context, rows["discrete"], rows["unit"])
         rows = rows.copy()
         for name in ("state", "next_state"):
             rows.set(name, self.maps.map_observation(number, rows[name]))
         for name in ("option", "next_option"):
             if name in rows.keys():
                 rows.set(name, self.maps.map_option(number, rows[name]))
-        return rows.set("discrete", discrete).set("unit", unit)
+        return rows.set("discrete", discrete).set("unit", unit_parameters)

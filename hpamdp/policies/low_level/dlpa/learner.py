@@ -94,8 +94,8 @@ class DLPAPolicy(PlanningPolicy):
         probability, mean, deviation = (part[:, 0] for part in plan)
         if is_greedy():
             return probability.argmax(-1), mean
-        unit = mean + deviation * torch.randn_like(mean)
-        return probability.multinomial(1).squeeze(-1), unit.clamp(-1.0, 1.0)
+        unit_parameters = mean + deviation * torch.randn_like(mean)
+        return probability.multinomial(1).squeeze(-1), unit_parameters.clamp(-1.0, 1.0)
 
 
 class DLPA(ReplayLearner):

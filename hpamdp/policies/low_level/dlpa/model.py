@@ -47,9 +47,9 @@ class Predictor(nn.Module):
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("slots", specs.parameter_slots)
 
-    def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
+    def forward(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
         """Apply all members."""
-        own = unit * self.mask[discrete]
+        own = unit_parameters * self.mask[discrete]
         if self.form != "masking":
             own = own.gather(-1, self.slots[discrete])
         x = torch.cat([state, F.one_hot(discrete, self.num_discrete).to(state.dtype)], -1)
@@ -79,9 +79,9 @@ class PAMDPModel(nn.Module):
         self.state_scale.copy_(scale_of(state))
         self.change_scale.copy_(scale_of(next_state - state))
 
-    def forward(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Prediction:
+    def forward(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Prediction:
         """Predict one step from states `[B, observation_dim]`, discrete actions `[B]`, parameters in [-1, 1]."""
         scaled = (state - self.state_mean) / self.state_scale
-        change = self.transition(scaled, discrete, unit)[0] * self.change_scale
-        continuing, terminating, logit = self.outcome(scaled, discrete, unit).unbind(-1)
+        change = self.transition(scaled, discrete, unit_parameters)[0] * self.change_scale
+        continuing, terminating, logit = self.outcome(scaled, discrete, unit_parameters).unbind(-1)
         return Prediction(state + change, continuing, terminating, logit)

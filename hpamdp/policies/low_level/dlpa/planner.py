@@ -99,8 +99,8 @@ class Planner:
         mean = state.new_zeros(*shape, self.specs.num_parameters)
         plan = Plan(probability, mean, torch.ones_like(mean))
         for _ in range(self.options.num_iterations):
-            discrete, unit = self.sample(plan)
-            plan = self.re_estimate(plan, discrete, unit, self.returns(state, discrete, unit))
+            discrete, unit_parameters = self.sample(plan)
+            plan = self.re_estimate(plan, discrete, unit_parameters, self.returns(state, discrete, unit_parameters))
         return plan
 
     def sample(self, plan: Plan) -> tuple[Tensor, Tensor]:
@@ -108,10 +108,10 @@ class Planner:
         discrete = plan.probability.flatten(0, 1).multinomial(self.options.num_samples, replacement=True)
         discrete = discrete.unflatten(0, plan.probability.shape[:2]).transpose(1, 2)
         noise = torch.randn(*discrete.shape, self.specs.num_parameters, device=discrete.device, dtype=torch.float32)
-        unit = plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise
-        return discrete, unit.clamp(-1.0, 1.0)
+        unit_parameters = plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise
+        return discrete, unit_parameters.clamp(-1.0, 1.0)
 
-    def returns(self, state: Tensor, discrete: Tensor, unit: Tensor) -> Tensor:
+    def returns(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
         """Return the predicted returns `[N, S]` of action sequences from states `[N, observation_dim]`."""
         rows = state.repeat_interleave(discrete.shape[1], 0)
 
@@ -119,7 +119,7 @@ class Planner:
             nonlocal rows
             for h in range(discrete.shape[2]):
                 with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
-                    predicted = self.model(rows, discrete[:, :, h].flatten(), unit[:, :, h].flatten(0, 1))
+                    predicted = self.model(rows, discrete[:, :, h].flatten(), unit_parameters[:, :, h].flatten(0, 1))
                 rows = predicted.next_state
                 yield predicted
 
@@ -129,7 +129,7 @@ class Planner:
             value = value - self.options.pessimism * total.std(0, correction=0)
         return value.unflatten(0, discrete.shape[:2])
 
-    def re_estimate(self, plan: Plan, discrete: Tensor, unit: Tensor, returns: Tensor) -> Plan:
+    def re_estimate(self, plan: Plan, discrete: Tensor, unit_parameters: Tensor, returns: Tensor) -> Plan:
         """Return the distribution of the elites.
 
         The parameters of a discrete action are estimated from the elites that choose it; they stay as they were if
@@ -138,13 +138,13 @@ class Planner:
         options = self.options
         elite, elite_weight = elite_weights(returns, options.num_elites, options.temperature)
         discrete = discrete.take_along_dim(elite[..., None], 1)
-        unit = unit.take_along_dim(elite[..., None, None], 1)
+        unit_parameters = unit_parameters.take_along_dim(elite[..., None, None], 1)
         discrete_weight = elite_weight[..., None, None] * F.one_hot(discrete, self.specs.num_discrete)
         parameter_weight = discrete_weight @ self.specs.parameter_mask.to(discrete_weight)
         total = parameter_weight.sum(1)
         parameter_weight = parameter_weight / total.clamp(min=1e-8).unsqueeze(1)
-        mean = (parameter_weight * unit).sum(1)
-        variance = (parameter_weight * (unit - mean.unsqueeze(1)).square()).sum(1)
+        mean = (parameter_weight * unit_parameters).sum(1)
+        variance = (parameter_weight * (unit_parameters - mean.unsqueeze(1)).square()).sum(1)
         deviation = variance.sqrt().clamp(min=options.min_deviation)
         step = 1.0 - options.momentum
         return Plan(

@@ -107,8 +107,8 @@ class PETSPolicy(PlanningPolicy):
         member = td.get(MEMBER).flatten()[is_planned] if self._follows_member else None
         planned = self.plan(observation[:, self.entries], member, self._allowed(observation, mask))
         own = planned.own if is_greedy() else with_exploring_noise(planned.own, self.options.parameter_noise)
-        unit = own.new_zeros(len(own), self.specs.num_parameters)
-        return planned.discrete, unit.scatter(-1, self.slots[planned.discrete], own)
+        unit_parameters = own.new_zeros(len(own), self.specs.num_parameters)
+        return planned.discrete, unit_parameters.scatter(-1, self.slots[planned.discrete], own)
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
