@@ -1,4 +1,4 @@
-"""Read and write a run's metrics on disk, `metrics.csv`."""
+"""Keep a run's metrics, on disk in `metrics.csv` or in memory."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from hpamdp.files import replacing
 from hpamdp.messages import warn
@@ -42,6 +42,43 @@ def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:
             continue
 
 
+class Metrics(Protocol):
+    """The rows of a run's metrics, one for each log. Later rows may add columns."""
+
+    def append(self, row: Mapping[str, float]) -> None:
+        """Add one row."""
+
+    def rows(self) -> list[dict[str, float]]:
+        """Return all rows so far, each with the columns that have a number."""
+
+
+def rows_up_to(frames: float, path: Path) -> list[dict[str, float]]:
+    """Return the rows of a `metrics.csv` for a run that resumes from this many frames.
+
+    Later rows are left out, and so is the last row of a stopped run.
+    """
+    return list(takewhile(lambda row: STOPPED not in row and row.get(FRAMES, 0.0) <= frames, read_rows(path)))
+
+
+class MetricsInMemory:
+    """The metrics of a run that writes no files.
+
+    Args:
+        resumed: the rows of the resumed run, which come first.
+    """
+
+    def __init__(self, resumed: Iterable[Mapping[str, float]] = ()) -> None:
+        self._rows = [dict(row) for row in resumed]
+
+    def append(self, row: Mapping[str, float]) -> None:
+        """Add one row."""
+        self._rows.append({column: float(value) for column, value in row.items()})
+
+    def rows(self) -> list[dict[str, float]]:
+        """Return a copy of all rows so far."""
+        return [dict(row) for row in self._rows]
+
+
 class MetricsFile:
     """A csv file with one row for each log, complete on disk after every row. Later rows may add columns.
 
@@ -55,10 +92,9 @@ class MetricsFile:
     def __init__(self, path: Path, resume_from: Path | None = None, up_to_frames: float = math.inf) -> None:
         self.path = path
         self._columns: list[str] = []
-        resumed = read_rows(resume_from) if resume_from is not None else []
         # Rows that wait for the first one of this run; None once they are in the file.
-        self._resumed: list[dict[str, float]] | None = list(
-            takewhile(lambda row: STOPPED not in row and row.get(FRAMES, 0.0) <= up_to_frames, resumed)
+        self._resumed: list[dict[str, float]] | None = (
+            [] if resume_from is None else rows_up_to(up_to_frames, resume_from)
         )
 
     def append(self, row: Mapping[str, float]) -> None:

@@ -25,7 +25,7 @@ QUICK_CRITIC = ["high=meta_critic", "high.warmup_decisions=0", "high.updates_per
 
 def make(config: Config, folder: Path) -> AssembledRun:
     torch.manual_seed(0)
-    return assemble(config, folder)
+    return assemble(config)
 
 
 def train(config: Config, folder: Path) -> AssembledRun:
@@ -41,8 +41,8 @@ def crossing(*words: str) -> Config:
     return make_config([*SMALL, "env=crossing", "low=stepper", *words])
 
 
-def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(tmp_path, capsys):
-    assemble(make_config(["env.switch_cost=0.2", "high=ucb", "low=random", "eval.layouts=4"]), tmp_path)
+def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(capsys):
+    assemble(make_config(["env.switch_cost=0.2", "high=ucb", "low=random", "eval.layouts=4"]))
     assert capsys.readouterr().err == (
         "env=boatdock: its plans, and so the ceiling, change options, but agent.termination=episode keeps them; use "
         "agent.termination=steps agent.option_length=1 to change them\n"

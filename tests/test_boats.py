@@ -273,12 +273,12 @@ def test_the_fuel_of_a_change_is_not_drawn_as_a_press():
 
 
 @pytest.mark.parametrize("high", ["meta_critic", "actor", "option_critic", "oracle"])
-def test_selectors_that_end_options_train_with_changes_of_boats(high, tmp_path):
+def test_selectors_that_end_options_train_with_changes_of_boats(high):
     learned = high == "option_critic"
     ends = ["agent.termination=learned"] if learned else ["agent.termination=steps", "agent.option_length=1"]
     words = [f"high={high}", "low=hppo", "env.switch_cost=0.2", "num_envs=4", "steps_per_batch=4", *ends]
     config = read(compose_config([*words, "eval.layouts=4", "low.minibatch_size=16"]))
-    parts = assemble(config, tmp_path)
+    parts = assemble(config)
     means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
     assert (
         means["option_changes"] <= means["steps"] - 1.0
@@ -330,9 +330,9 @@ def test_the_maps_of_other_boats_are_those_that_their_directions_share():
     assert len(BoatDockEnv(1, boats=["congruent", "sideways"], controllers=SIDEWAYS).symmetries) == 2
 
 
-def test_the_changes_of_boats_in_an_evaluation_are_counted(tmp_path):
+def test_the_changes_of_boats_in_an_evaluation_are_counted():
     words = ["high=uniform", "low=random", "env.switch_cost=0.2", "agent.termination=steps", "agent.option_length=1"]
-    parts = assemble(read(compose_config([*words, "num_envs=4", "eval.layouts=200"])), tmp_path)
+    parts = assemble(read(compose_config([*words, "num_envs=4", "eval.layouts=200"])))
     played = parts.evaluation.run(parts.agent.policy)
     assert (played["option_changes"][played["steps"] == 1] == 0).all()
     share = played["option_changes"].sum() / (played["steps"] - 1).sum()

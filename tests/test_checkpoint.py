@@ -31,8 +31,8 @@ def trained(tmp_path_factory):
 
 
 @pytest.fixture
-def parts(tmp_path):
-    return assemble(make_config(PDQN), tmp_path)
+def parts():
+    return assemble(make_config(PDQN))
 
 
 def rewritten(file, target, change):
@@ -74,7 +74,7 @@ def test_checkpoints_that_name_the_optimizer_as_earlier_versions_did_are_resumed
             copy.writestr(name.replace("optimizer", "optimiser"), archive.read(name))
     moments = []
     for file in (today, tmp_path / "earlier.zip"):
-        parts = assemble(make_config(words), tmp_path / file.stem)
+        parts = assemble(make_config(words))
         load(file, parts)
         moments.append(parts.agent.learners[0].optimizer.state_dict()["state"])
     assert moments[0].keys() == moments[1].keys() and moments[0]
@@ -182,7 +182,7 @@ def test_missing_members_foreign_files_and_other_agents_are_refused(trained, par
     with zipfile.ZipFile(tmp_path / "foreign.zip", "w") as archive:
         archive.writestr("word/document.xml", "<a/>")
     refusal(tmp_path / "foreign.zip", parts)
-    hppo = assemble(make_config([*SMALL, "low=hppo", *SHORT["hppo"]]), tmp_path)
+    hppo = assemble(make_config([*SMALL, "low=hppo", *SHORT["hppo"]]))
     assert "does not fit this agent" in refusal(file, hppo)
 
 
@@ -191,7 +191,7 @@ def test_weights_that_are_nan_are_refused(trained, parts, tmp_path):
         next(parts.agent.parameters()).fill_(torch.nan)
     states = {"collection": {}, "recorder": {}}
     checkpoint.save(tmp_path / "nan.zip", parts.agent, states, PROGRESS)
-    other = assemble(make_config(PDQN), tmp_path)
+    other = assemble(make_config(PDQN))
     assert "holds NaN" in refusal(tmp_path / "nan.zip", other)
 
 

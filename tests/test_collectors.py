@@ -56,13 +56,13 @@ WORKERS = [
 
 def make(folder, *overrides):
     config = make_config([*SMALL, *overrides])
-    parts = assemble(config, folder)
+    parts = assemble(config)
     return parts, config.collector.build(config=config, parts=parts, frames=0)
 
 
 def share(folder, *overrides, first_env=0, num_envs=8, low=None):
     config = make_config([*SMALL, *overrides])
-    specs = assemble(config, folder).agent.specs
+    specs = assemble(config).agent.specs
     return EnvShard(config, specs, first_env, num_envs, env_seed=0, exploration_seed=0, low=low)
 
 
@@ -146,11 +146,11 @@ def test_workers_have_the_priority_of_the_learner_that_waits_for_them(workers):
     "low",
     [pytest.param(low, marks=[] if low in OF_EACH_KIND else [pytest.mark.slow]) for low in TRAINED],
 )
-def test_a_copy_takes_all_that_a_policy_acts_by(low, tmp_path):
+def test_a_copy_takes_all_that_a_policy_acts_by(low):
     warmup = ["low.warmup_steps=8"] if low in ("hyar", "hsac", "iql", "pdqn", "qpamdp", "td3_bc") else []
     warmup += ["low.codec_pretrain_updates=2"] if low == "hyar" else []
     config = make_config(["num_envs=8", "steps_per_batch=8", "eval.layouts=4", "high=ucb", f"low={low}", *warmup])
-    parts = assemble(config, tmp_path)
+    parts = assemble(config)
     collection = config.collector.build(config=config, parts=parts, frames=0)
     torch.manual_seed(1)
     copy = EnvShard(config, parts.agent.specs, 0, 8, env_seed=0, exploration_seed=1, low=None).make_policy()
@@ -232,7 +232,7 @@ def test_the_state_of_another_number_of_environments_is_refused(workers, tmp_pat
 
 
 def test_a_frozen_presser_goes_with_the_share(tmp_path):
-    parts = assemble(make_config([*SMALL, "high=ucb", "low.freeze=true"]), tmp_path)
+    parts = assemble(make_config([*SMALL, "high=ucb", "low.freeze=true"]))
     torch.manual_seed(5)
     work = share(tmp_path, "high=ucb", "low.freeze=true", low=packed(parts.agent.router))
     env, policy = work.make_env(), work.make_policy()
@@ -296,7 +296,7 @@ class Mortal(WorkerCollection):
 
     def __init__(self, folder, max_restarts, *overrides):
         config = make_config([*SMALL, "high=ucb", *overrides])
-        self.parts = assemble(config, folder)
+        self.parts = assemble(config)
         self.shards = []
         super().__init__(config, self.parts, 0, num_workers=2, max_restarts=max_restarts)
 

@@ -33,7 +33,7 @@ TINY = ["num_envs=16", "steps_per_batch=4", "eval.layouts=4", "eval.every=0"]
 )
 def test_a_run_that_ends_before_a_first_update_is_refused(total, words, setting, needed, most, tmp_path):
     with pytest.raises(ConfigError) as refusal:
-        assemble(make_config([*TINY, f"total_frames={total}", *words.split()]), tmp_path)
+        assemble(make_config([*TINY, f"total_frames={total}", *words.split()]))
     assert str(refusal.value) == (
         f"{setting}: the first update comes after {needed} steps or decisions, but total_frames={total} gives at most "
         f"{most}; set a larger total_frames or another {setting.partition('=')[0]}"
@@ -41,8 +41,8 @@ def test_a_run_that_ends_before_a_first_update_is_refused(total, words, setting,
     assert not [*tmp_path.iterdir()]
 
 
-def test_the_last_batch_counts_as_a_whole(tmp_path):
-    assemble(make_config([*TINY, "high=ucb", "low=hppo", "total_frames=1985"]), tmp_path)
+def test_the_last_batch_counts_as_a_whole():
+    assemble(make_config([*TINY, "high=ucb", "low=hppo", "total_frames=1985"]))
 
 
 @pytest.mark.parametrize(

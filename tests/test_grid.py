@@ -70,7 +70,7 @@ def words(high: str, low: str) -> list[str]:
 
 def make(high: str, low: str, tmp_path):
     torch.manual_seed(0)
-    return assemble(make_config(words(high, low)), tmp_path)
+    return assemble(make_config(words(high, low)))
 
 
 def weights(agent: HierarchicalAgent) -> dict[str, torch.Tensor]:
@@ -83,7 +83,7 @@ def weights(agent: HierarchicalAgent) -> dict[str, torch.Tensor]:
 def assert_it_updated(given: list[str], folder: Path) -> None:
     """Assert that the learners of a run in a folder are no longer those that the run began with."""
     torch.manual_seed(0)
-    parts = assemble(make_config(given), folder)
+    parts = assemble(make_config(given))
     before = weights(parts.agent)
     checkpoint.load(folder / checkpoint.FILE_NAME, parts.agent, parts.device, with_training=False)
     after = weights(parts.agent)
@@ -177,7 +177,7 @@ AUGMENTED = [low for low in choices("low") if "augment:" in (CONF / "low" / f"{l
 
 
 @pytest.mark.parametrize("low", AUGMENTED)
-def test_a_learner_with_augment_learns_from_steps_under_the_problems_symmetries(low, tmp_path, monkeypatch):
+def test_a_learner_with_augment_learns_from_steps_under_the_problems_symmetries(low, monkeypatch):
     given = [*words("uniform", low), "low.augment=true"]
     if low != "pets":  # which learns from all maps of a step at once
         calls = []
@@ -186,7 +186,7 @@ def test_a_learner_with_augment_learns_from_steps_under_the_problems_symmetries(
             RandomSymmetry, "mapped", lambda self, *rows: calls.append(len(self.maps)) or mapped(self, *rows)
         )
     torch.manual_seed(0)
-    parts = assemble(make_config(given), tmp_path)
+    parts = assemble(make_config(given))
     before = weights(parts.agent)
     collected = parts.env.rollout(20, parts.agent.policy, break_when_any_done=False).contiguous()
     parts.agent.learn(collected)
@@ -204,6 +204,6 @@ def test_every_learner_makes_updates_in_bfloat16(low, tmp_path):
 
 
 @pytest.mark.parametrize("low", ["pdqn", "pets"])
-def test_augment_is_refused_where_the_problem_declares_no_symmetries(low, tmp_path):
+def test_augment_is_refused_where_the_problem_declares_no_symmetries(low):
     with pytest.raises(ConfigError, match="low: augment=true: the problem declares no symmetries; use augment=false"):
-        assemble(make_config(["env=platform", "high=none", f"low={low}", "low.augment=true", *SMALL]), tmp_path)
+        assemble(make_config(["env=platform", "high=none", f"low={low}", "low.augment=true", *SMALL]))

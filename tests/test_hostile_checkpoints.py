@@ -46,7 +46,7 @@ class Opener:
         self.manifest = json.loads(self.members.pop("manifest.json"))
         self.states = {name: torch.load(io.BytesIO(data), weights_only=True) for name, data in self.members.items()}
         self.config = make_config(words)
-        self.parts = assemble(self.config, folder)
+        self.parts = assemble(self.config)
         self.collection = SingleCollection(self.config, self.parts)
         self.trainer = Trainer(self.config, self.parts, folder)
 

@@ -55,9 +55,9 @@ def test_a_learner_trains_on_a_data_set_without_stepping_an_environment(low, pat
 
 
 @pytest.mark.parametrize("high", ["ucb", "linucb", "meta_critic"])
-def test_a_selector_learns_from_the_decisions_in_the_data(high, path, tmp_path):
+def test_a_selector_learns_from_the_decisions_in_the_data(high, path):
     words = [*overrides(path, "iql", high), *(["high.memory=all"] if high != "meta_critic" else [])]
-    parts = assemble(make_config(words), tmp_path)
+    parts = assemble(make_config(words))
     parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
     num_episodes = len(read(path, checksum=None).episodes)
     selector = parts.agent.selector
@@ -113,7 +113,7 @@ def test_where_the_boat_is_given_there_are_no_decisions(path):
 
 def test_the_meta_critic_makes_as_many_updates_offline_as_the_learners_and_keeps_its_exploration(path, tmp_path):
     words = [*overrides(path, "iql", "meta_critic"), "offline.updates=7", "offline.eval_every=0", "high.batch_size=16"]
-    parts = assemble(make_config(words), tmp_path)
+    parts = assemble(make_config(words))
     made = []
     update = parts.agent.selector.update_critics
     parts.agent.selector.update_critics = lambda rows: made.append(len(rows)) or update(rows)
@@ -122,18 +122,18 @@ def test_the_meta_critic_makes_as_many_updates_offline_as_the_learners_and_keeps
     assert parts.agent.selector.num_decisions == 0 and parts.agent.selector.epsilon == 1.0
 
 
-def test_decisions_of_a_data_set_use_up_no_exploration_of_a_run_that_goes_on_with_its_own(path, tmp_path):
+def test_decisions_of_a_data_set_use_up_no_exploration_of_a_run_that_goes_on_with_its_own(path):
     words = [f"data.path={path}", "data=human", "data.checksum=null", "low=iql", "eval.layouts=4", "num_envs=4"]
     for high in ("meta_critic", "epsilon_greedy", "ucb"):
-        parts = assemble(make_config([*words, f"high={high}"]), tmp_path)
+        parts = assemble(make_config([*words, f"high={high}"]))
         parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
         assert parts.agent.selector.num_decisions == 0 and parts.agent.selector.pending.tolist() == [0, 0]
 
 
 @pytest.mark.parametrize("high", ["exp3", "actor"])
-def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(high, path, tmp_path):
+def test_selectors_of_their_own_choices_alone_are_refused_offline_in_one_line(high, path):
     with pytest.raises(ConfigError) as refusal:
-        assemble(make_config(overrides(path, "iql", high)), tmp_path)
+        assemble(make_config(overrides(path, "iql", high)))
     assert str(refusal.value) == f"high={high}: learns from its own choices only; use mode=train, or another high"
 
 
@@ -222,10 +222,10 @@ REFUSED = [
 @pytest.mark.parametrize(
     ("given", "line"), REFUSED, ids=lambda value: " ".join(value) if isinstance(value, list) else ""
 )
-def test_impossible_configs_are_refused_in_one_line(given, line, tmp_path):
+def test_impossible_configs_are_refused_in_one_line(given, line):
     config = make_config([*given, "eval.layouts=4", "num_envs=4"])
     with pytest.raises(ConfigError, match=line) as refusal:
-        assemble(config, tmp_path)
+        assemble(config)
     assert "\n" not in str(refusal.value)
 
 
@@ -242,9 +242,9 @@ def test_an_offline_run_can_be_resumed_and_fine_tuned_online(path, tmp_path):
     assert run(compose_config(tuned), tmp_path / "d", tuned) == 0
 
 
-def test_demonstrations_are_stored_in_the_replay_buffers(path, tmp_path):
+def test_demonstrations_are_stored_in_the_replay_buffers(path):
     given = ["low=pdqn", "data=human", "data.checksum=null", f"data.path={path}", "eval.layouts=4", "num_envs=4"]
-    parts = assemble(make_config(given), tmp_path)
+    parts = assemble(make_config(given))
     parts.agent.add_demonstrations(parts.data.batch, parts.data.decisions)
     assert sum(len(learner.buffer) for learner in parts.agent.learners) == parts.data.batch.numel()
 

@@ -154,9 +154,9 @@ def config_of(words: str) -> DictConfig:
 
 
 @pytest.mark.parametrize(("words", "line"), REFUSED, ids=[words for words, _ in REFUSED])
-def test_what_no_run_can_have_is_refused_in_one_line(words, line, tmp_path):
+def test_what_no_run_can_have_is_refused_in_one_line(words, line):
     with pytest.raises(ConfigError) as raised:
-        assemble(choose_selector(read(config_of(words))), tmp_path)
+        assemble(choose_selector(read(config_of(words))))
     assert line in str(raised.value) and "\n" not in str(raised.value)
 
 
@@ -168,13 +168,13 @@ def test_a_project_name_that_wandb_refuses_is_reported_in_one_line(tmp_path):
     assert "\n" not in str(raised.value)
 
 
-def test_the_estimate_of_memory_counts_all_parts_together(monkeypatch, tmp_path):
+def test_the_estimate_of_memory_counts_all_parts_together(monkeypatch):
     config = read(config_of("low.buffer_size=1000000 low.warmup_steps=32"))
-    assemble(config, tmp_path)
+    assemble(config)
     monkeypatch.setattr(capacity, "total_memory", lambda device: 100_000_000)
     line = r"^low.buffer_size=1000000: the run takes at least 0\.3 GB of memory, and there are 0\.1 GB$"
     with pytest.raises(ConfigError, match=line):
-        assemble(config, tmp_path)
+        assemble(config)
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_an_unknown_option_is_refused_in_one_line():
         env.step(TensorDict({"option": torch.tensor([0, 2]), "action": action}, [2]))
 
 
-def test_an_evaluation_knows_the_ceiling(tmp_path):
+def test_an_evaluation_knows_the_ceiling():
     words = [
         "env=rooms",
         "high=uniform",
@@ -105,7 +105,7 @@ def test_an_evaluation_knows_the_ceiling(tmp_path):
         "num_envs=4",
         "eval.layouts=50",
     ]
-    parts = assemble(make_config(words), tmp_path)
+    parts = assemble(make_config(words))
     means = parts.evaluation.measure(parts.evaluation.run(parts.agent.policy))
     assert 0.8 < means["ceiling"] < 0.9 and means["score"] < means["ceiling"]
 

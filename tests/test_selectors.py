@@ -150,10 +150,10 @@ def test_a_selector_that_learns_from_its_own_choices_alone_leaves_a_data_set_to_
 
 
 @pytest.mark.parametrize("freeze", [False, True])
-def test_pending_decisions_are_those_whose_end_the_selector_has_not_seen(freeze, tmp_path):
+def test_pending_decisions_are_those_whose_end_the_selector_has_not_seen(freeze):
     words = ["high=ucb", "low=random", "num_envs=6", "steps_per_batch=7", "eval.layouts=4", f"low.freeze={freeze}"]
     config = make_config(words)
-    parts = assemble(config, tmp_path)
+    parts = assemble(config)
     selector = parts.agent.selector
     collection = SingleCollection(config, parts)
     num_made = 0
@@ -242,11 +242,11 @@ def test_the_random_agent_has_no_selector_where_there_are_no_options():
 @pytest.mark.parametrize(
     "high", [high for high in choices("high") if high not in ("none", "oracle", "human", "uniform")]
 )
-def test_exploring_choices_are_uniform_for_uniform_option_steps_and_greedy_ones_never(high, tmp_path):
+def test_exploring_choices_are_uniform_for_uniform_option_steps_and_greedy_ones_never(high):
     low = "hppo" if high == "value" else "random"
     words = [f"high={high}", f"low={low}", "num_envs=400", "eval.layouts=4", "agent.uniform_option_steps=800"]
     words += ["high.warmup_decisions=0"] if high == "meta_critic" else []
-    parts = assemble(make_config(words), tmp_path)
+    parts = assemble(make_config(words))
     torch.manual_seed(0)
     agent = parts.agent
     for _ in range(2):

@@ -86,7 +86,7 @@ def test_evaluations_move_no_random_generator_of_the_training(tmp_path):
     states = []
     for name in ("often", "seldom"):
         file = checkpoint.find(tmp_path / name, "resume")
-        parts = assemble(make_config([*SMALL, "low=random"]), tmp_path)
+        parts = assemble(make_config([*SMALL, "low=random"]))
         saved = checkpoint.load(file, parts.agent, torch.device("cpu"), with_training=True)
         states.append(saved.states["collection"]["env"])
     assert all(torch.equal(states[0][column], states[1][column]) for column in states[0])

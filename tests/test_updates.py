@@ -228,13 +228,13 @@ SMALL = ["num_envs=4", "steps_per_batch=4", "total_frames=20000", "eval.layouts=
         ),
     ],
 )  # fmt: skip
-def test_what_updates_cannot_do_is_refused_in_one_line(tmp_path, words, message):
+def test_what_updates_cannot_do_is_refused_in_one_line(words, message):
     with pytest.raises(ConfigError) as error:
-        assemble(make_config([*SMALL, *words]), tmp_path)
+        assemble(make_config([*SMALL, *words]))
     assert str(error.value) == message
 
 
-def test_a_missing_compiler_is_told_in_one_line(tmp_path, monkeypatch):
+def test_a_missing_compiler_is_told_in_one_line(monkeypatch):
     from torch._inductor import cpp_builder
     from torch._inductor.exc import InvalidCxxCompiler
 
@@ -243,4 +243,4 @@ def test_a_missing_compiler_is_told_in_one_line(tmp_path, monkeypatch):
 
     monkeypatch.setattr(cpp_builder, "get_cpp_compiler", missing)
     with pytest.raises(ConfigError, match=r"^compile_updates=true: low=pdqn: there is no C\+\+ compiler; install"):
-        assemble(make_config([*SMALL, "env=platform", "high=none", "low=pdqn", "compile_updates=true"]), tmp_path)
+        assemble(make_config([*SMALL, "env=platform", "high=none", "low=pdqn", "compile_updates=true"]))

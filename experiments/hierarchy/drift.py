@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -55,7 +54,7 @@ def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, floa
             noise = f"env.motor_noise=[{incongruent},{congruent}]"
             phases.append(read(compose("config", [*overrides, noise], return_hydra_config=True)))
     torch.manual_seed(seed)
-    agent = assemble(phases[0], Path(tempfile.gettempdir())).agent
+    agent = assemble(phases[0]).agent
     for phase, config in enumerate(phases):
         env, policy = acting(make_env(config, NUM_ENVS, torch.device("cpu"), seed), agent, config)
         options: list[torch.Tensor] = []

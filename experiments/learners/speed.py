@@ -91,7 +91,7 @@ def build(overrides: list[str], folder: Path) -> tuple[AssembledRun, int]:
         words = ["high=none", "env.controller=congruent", "eval.layouts=10", *overrides]
         config = read(compose("config", words, return_hydra_config=True))
     torch.manual_seed(0)
-    return assemble(config, folder), config.run.num_envs * config.run.steps_per_batch
+    return assemble(config), config.run.num_envs * config.run.steps_per_batch
 
 
 def _updates(parts: AssembledRun) -> int:

@@ -190,7 +190,7 @@ def trained(config: Config) -> tuple[AssembledRun, int, float]:
     cpu = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         torch.manual_seed(config.run.seed)
-        parts = assemble(config, Path(folder))
+        parts = assemble(config)
         trainer = Trainer(config, parts, Path(folder))
         trainer.train()
     return parts, trainer.frames, time.process_time() - cpu

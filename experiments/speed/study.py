@@ -71,7 +71,7 @@ def make(name: str, folder: Path) -> tuple[AssembledRun, Learner, int]:
         words = ["high=none", f"low={name}", "env.controller=congruent", "eval.layouts=10"]
         config = read(compose("config", [*words, *_of(name)], return_hydra_config=True))
     torch.manual_seed(0)
-    parts = assemble(config, folder)
+    parts = assemble(config)
     return parts, parts.agent.learners[0], config.run.num_envs * config.run.steps_per_batch
 
 

@@ -316,8 +316,12 @@ class PAMDPEnv(EnvBase):
             ValueError: the state is of another number of environments.
         """
 
+    def statistics(self) -> dict[str, Tensor]:
+        """Return the part of `env_state` that scales the observations, if their scale is learned; else empty."""
+        return {}
+
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
-        """Set only the scale of the observations from an `env_state`, to score a saved agent."""
+        """Set only the scale of the observations, from `statistics` or a whole `env_state`, to use a saved agent."""
 
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations as the other environment does, now and later, if their scale is learned."""

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -56,7 +55,7 @@ class AssembledRun:
     device: torch.device
 
 
-def assemble(config: Config, output_dir: Path) -> AssembledRun:
+def assemble(config: Config) -> AssembledRun:
     """Build the parts of a run.
 
     Raises:

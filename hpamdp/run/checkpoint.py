@@ -10,6 +10,7 @@ full capacity. It also moves the old file away before the new one is in place.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
 import json
@@ -171,14 +172,23 @@ def save(
         archive.writestr(_MANIFEST, json.dumps(manifest))
 
 
-def save_policy(path: Path, agent: HierarchicalAgent, progress: Mapping[str, Any]) -> None:
-    """Write only the networks, without the parts for training. `mode=eval` can load the file.
+def save_policy(path: Path, agent: HierarchicalAgent, env: PAMDPEnv, progress: Mapping[str, Any]) -> None:
+    """Write the networks and the scale of the observations, without the parts for training.
+
+    `mode=eval` can load the file.
+
+    Args:
+        path: the file.
+        agent: the agent.
+        env: the environment that the agent acts in.
+        progress: see `save`.
 
     Raises:
         OSError: see `save`.
     """
+    parts = {"agent": agent.state_dict(), "collection": {"env": env.statistics()}}
     with replacing(path) as partial:
-        torch.save({"format": _FORMAT, "progress": json.dumps(dict(progress)), "agent": agent.state_dict()}, partial)
+        torch.save({"format": _FORMAT, "progress": json.dumps(dict(progress)), **parts}, partial)
 
 
 def progress_of(file: Path) -> dict[str, Any]:
@@ -365,8 +375,11 @@ class _Opened:
             saved = TensorArchive(file, num_bytes)
             _check_format(saved.state["format"])
             progress = _json(saved.state["progress"])
-            saved.state = saved.state["agent"]
-            self.names, self._parts = {"agent"}, {"agent": saved}
+            for name in ("agent", "collection"):
+                if name == "agent" or name in saved.state:  # files of earlier versions hold the networks only
+                    self._parts[name] = copy.copy(saved)
+                    self._parts[name].state = saved.state[name]
+            self.names = {*self._parts}
         self.progress = checked(Progress, progress).model_dump(exclude_unset=True)
 
     def part(self, name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Write a run's metrics, evaluations, summary and figures, during training and at its end."""
+"""Keep a run's metrics and evaluations, and write them with its summary and figures if the run has a folder."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from hpamdp import keys
 from hpamdp.analysis import figures, film
 from hpamdp.config.schema import Config
 from hpamdp.files import replacing
-from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, MetricsFile
+from hpamdp.metrics_file import FRAMES, STOPPED, WALL_SECONDS, Metrics, MetricsFile, MetricsInMemory, rows_up_to
 from hpamdp.policies.random_agent import random_agent
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.closing_table import SHORT_SIGHT, WITHOUT_UPDATE, closing_table, short_sight
-from hpamdp.run.loggers import CSVLogger, EarlierRun, Guarded, Logger
+from hpamdp.run.loggers import EarlierRun, Guarded, Logger
 from hpamdp.run.state_checks import SavedPart, check_columns, check_values, checked
 from hpamdp.run.summary import summarise
 from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
@@ -42,15 +42,21 @@ class Recorder:
     Args:
         config: config of the run.
         parts: the run's environment, agent and evaluation.
-        output_dir: folder of `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures.
+        output_dir: folder of `metrics.csv`, `summary.json`, `evaluation.npz` and the pictures. If None, nothing is
+            written.
+
+    Attributes:
+        metrics: the rows so far.
+        summary: see `summarise`; empty before `finish`.
     """
 
-    def __init__(self, config: Config, parts: AssembledRun, output_dir: Path) -> None:
+    def __init__(self, config: Config, parts: AssembledRun, output_dir: Path | None) -> None:
         self.config = config
         self.parts = parts
         self.output_dir = output_dir
-        self.metrics = MetricsFile(output_dir / METRICS_NAME)
-        self._logger: Logger = CSVLogger(output_dir)
+        self.metrics: Metrics = MetricsInMemory() if output_dir is None else MetricsFile(output_dir / METRICS_NAME)
+        self.summary: dict[str, Any] = {}
+        self._logger: Logger | None = None
         self._resumed_from: Path | None = None  # the folder of the run that is continued
         self._ended: list[TensorDictBase] = []
         self._scalars: dict[str, float] = {}
@@ -62,15 +68,21 @@ class Recorder:
 
     def resume_from(self, folder: Path, frames: int) -> None:
         """Start the metrics with the rows of the run in `folder`, up to `frames`."""
-        self.metrics = MetricsFile(self.metrics.path, folder / METRICS_NAME, frames)
+        source = folder / METRICS_NAME
+        if self.output_dir is None:
+            self.metrics = MetricsInMemory(rows_up_to(frames, source))
+        else:
+            self.metrics = MetricsFile(self.output_dir / METRICS_NAME, source, frames)
         self._resumed_from = folder
 
     def start(self) -> None:
-        """Start the logger, which takes over the rows of a resumed run.
+        """Start the logger, if the run has a folder. It takes over the rows of a resumed run.
 
         Raises:
             ConfigError: the logger refuses its settings.
         """
+        if self.output_dir is None:
+            return
         earlier = None
         if self._resumed_from is not None:
             earlier = EarlierRun(self._resumed_from, [row for row in self.metrics.rows() if FRAMES in row])
@@ -137,13 +149,14 @@ class Recorder:
             measured = self.parts.evaluation.measure(self._play())
             row |= {f"eval/{name}": value for name, value in (measured | self._drift(measured)).items()}
         self.metrics.append(row)
-        self._logger.log(row, frames)
+        if self._logger is not None:
+            self._logger.log(row, frames)
         self._ended = []
         self._scalars = {}
         return row
 
     def finish(self, frames: int, wall_s: float, cpu_s: float, *, is_finished: bool) -> str:
-        """Evaluate, write the summary and the figures, close the logger, and return the closing table.
+        """Evaluate, write the summary and the figures, close the logger, and return the closing table as text.
 
         Args:
             frames: frames of training.
@@ -158,9 +171,6 @@ class Recorder:
         if not is_finished and self._played is None:
             self.log(frames, wall_s, is_evaluated=True, is_stopped=True)
         played = self._play()
-        arrays: dict[str, Any] = dict(played)
-        with replacing(self.output_dir / EVALUATION_NAME) as partial:
-            np.savez_compressed(partial, **arrays)
         measured = self.parts.evaluation.measure(played)
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
@@ -168,25 +178,36 @@ class Recorder:
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
             summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])
-        with replacing(self.output_dir / SUMMARY_NAME) as partial:
-            partial.write_text(json.dumps(summary, indent=2) + "\n")
-        logger = self._logger
-        logger.images(figures.draw_all(self.output_dir, type(env)))
-        filmed = self._film()
-        if filmed is not None:
-            logger.film(filmed)
-        logger.summary(summary)
-        logger.close()
+        self.summary = summary
+        if self.output_dir is not None:
+            self._write(self.output_dir, played)
         return closing_table(summary, env.table_metrics)
 
-    def _film(self) -> Path | None:
+    def _write(self, folder: Path, played: Mapping[str, np.ndarray]) -> None:
+        """Write the last evaluation, the summary, the figures and the film, and close the logger."""
+        arrays: dict[str, Any] = dict(played)
+        with replacing(folder / EVALUATION_NAME) as partial:
+            np.savez_compressed(partial, **arrays)
+        with replacing(folder / SUMMARY_NAME) as partial:
+            partial.write_text(json.dumps(self.summary, indent=2) + "\n")
+        images = figures.draw_all(folder, type(self.parts.evaluation.problem))
+        filmed = self._film(folder)
+        if self._logger is None:
+            return
+        self._logger.images(images)
+        if filmed is not None:
+            self._logger.film(filmed)
+        self._logger.summary(self.summary)
+        self._logger.close()
+
+    def _film(self, folder: Path) -> Path | None:
         """Film the first episodes of the last evaluation, if the problem has pictures, and return the file."""
         evaluation = self.parts.evaluation
         tracks = film.tracks_of(evaluation.states, _FILMED_STEPS)
         pictures = film.film(evaluation.problem, tracks, _FPS, _FILM_SIZE)
         if not pictures:
             return None
-        path = self.output_dir / FILM_NAME
+        path = folder / FILM_NAME
         film.write(path, pictures, _FPS)
         return path
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import torch
 from omegaconf import DictConfig
@@ -26,6 +26,7 @@ from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun, assemble
+from hpamdp.run.callbacks import Callback
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import Collection, CollectionError
 from hpamdp.run.folder import check_no_link, check_no_training, check_unused, mark_unfinished, moved_aside
@@ -72,47 +73,83 @@ def run(
         ConfigError: a value or a path is wrong, or values do not go together.
     """
     try:
-        with exits_explained():
+        with exits_explained(), problems_explained():
             config, source = resolve(cfg, overrides)
-            source = stopped_at or source
             with memory_errors_explained(config):
-                return _run(config, source, output_dir, overrides, may_overwrite=may_overwrite, tell=tell)
-    except ProblemError as error:
-        raise ConfigError(f"env: {first_line(error)}") from error
+                source = stopped_at or source
+                trainer = begin(config, source, output_dir, overrides, may_overwrite=may_overwrite)
+                return _run_to_the_end(trainer, output_dir, tell)
     except ProgramExitError as error:
         tell(str(error))
         return FAILED
 
 
-def _run(
+@contextmanager
+def problems_explained() -> Iterator[None]:
+    """Turn an error about the problem into the user's mistake that it is.
+
+    Raises:
+        ConfigError: the block raised a `ProblemError`.
+    """
+    try:
+        yield
+    except ProblemError as error:
+        raise ConfigError(f"env: {first_line(error)}") from error
+
+
+def begin(
     config: Config,
-    source: Path | None,
-    output_dir: Path,
-    overrides: Sequence[str],
+    source: Path | None = None,
+    output_dir: Path | None = None,
+    overrides: Sequence[str] = (),
     *,
-    may_overwrite: bool,
-    tell: Callable[[str], None],
-) -> int:
-    for name in (TENSORBOARD_NAME, WANDB_NAME):
-        check_no_link(output_dir / name)
+    may_overwrite: bool = False,
+    callbacks: Sequence[Callback] = (),
+) -> Trainer:
+    """Build a run and write its first files.
+
+    Args:
+        config: config of the run.
+        source: the checkpoint to continue from or to score; None for a new run.
+        output_dir: folder of the run, created if it is missing. If None, the run writes nothing.
+        overrides: the command line's words, which change a resumed run's config.
+        may_overwrite: whether the results of a run in the folder may be overwritten, as with `overwrite=true`.
+        callbacks: called during training.
+
+    Raises:
+        ConfigError: a value or a path is wrong, or values do not go together.
+    """
     is_training = config.run.mode != "eval"
-    if not is_training:
-        check_no_training(output_dir)
-    is_own = is_training and source is not None and source.parent.resolve() == output_dir.resolve()
-    if not is_own:
-        check_unused(output_dir, may_overwrite=may_overwrite or config.run.overwrite)
+    is_own = is_training and _is_in(source, output_dir)
+    if output_dir is not None:
+        for name in (TENSORBOARD_NAME, WANDB_NAME):
+            check_no_link(output_dir / name)
+        if not is_training:
+            check_no_training(output_dir)
+        if not is_own:
+            check_unused(output_dir, may_overwrite=may_overwrite or config.run.overwrite)
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
-    parts = assemble(config, output_dir)
+    parts = assemble(config)
     check_saved_options(config, parts.env.base_env)
-    trainer = Trainer(config, parts, output_dir)
+    trainer = Trainer(config, parts, output_dir, callbacks)
     if source is not None:
         trainer.restore(source)
         if is_training:
             check_more(overrides, trainer.frames, config.run.num_frames)
     trainer.start(is_own=is_own)
+    return trainer
+
+
+def _is_in(source: Path | None, folder: Path | None) -> bool:
+    return source is not None and folder is not None and source.parent.resolve() == folder.resolve()
+
+
+def _run_to_the_end(trainer: Trainer, output_dir: Path, tell: Callable[[str], None]) -> int:
+    """Train, report in lines, and return the exit code of `run`."""
+    config = trainer.config
     is_interrupted = False
-    if is_training:
+    if config.run.mode != "eval":
         try:
             is_interrupted = trainer.train()
         except DivergedError as error:
@@ -123,7 +160,7 @@ def _run(
             saved = f"to go on: {_resuming(config, output_dir)}" if has_learned else "nothing was learned"
             tell(f"{error} at frame {trainer.frames:,}; {saved}")
             return FAILED
-    say(trainer.recorder.finish(trainer.frames, trainer.wall_s, trainer.cpu_s, is_finished=not is_interrupted))
+    say(trainer.finish(is_finished=not is_interrupted))
     say(f"Everything is in {output_dir}")
     if is_interrupted:
         say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: {_resuming(config, output_dir)}")
@@ -145,18 +182,35 @@ class Trainer:
     Args:
         config: config of the run.
         parts: parts of the run.
-        output_dir: folder of the run.
+        output_dir: folder of the run. If None, the run writes nothing.
+        callbacks: called during training.
+
+    Attributes:
+        frames: frames so far.
+        wall_s, cpu_s: wall time and CPU time of training so far.
+        last_score: score of the last evaluation; None before the first one.
+        shows_progress: whether a bar on stderr shows the progress.
     """
 
-    def __init__(self, config: Config, parts: AssembledRun, output_dir: Path) -> None:
+    shows_progress = True
+
+    def __init__(
+        self,
+        config: Config,
+        parts: AssembledRun,
+        output_dir: Path | None = None,
+        callbacks: Sequence[Callback] = (),
+    ) -> None:
         self.config = config
         self.parts = parts
         self.output_dir = output_dir
+        self.callbacks = list(callbacks)
         self.recorder = Recorder(config, parts, output_dir)
+        self._is_stopped = False
         self.frames = 0
         self.wall_s = 0.0
         self.cpu_s = 0.0
-        self.last_score: float | None = None  # at the last evaluation
+        self.last_score: float | None = None
         self._saved: checkpoint.Saved | None = None  # what a resumed run continues from
         self.unit = " steps"
         if config.run.mode == "offline":
@@ -186,7 +240,9 @@ class Trainer:
         self._saved = saved
 
     def start(self, *, is_own: bool) -> None:
-        """Write the config and start the logger. These are the first writes, so everything must be checked and built.
+        """Write the config and start the logger, if the run has a folder.
+
+        These are the first writes, so everything must be checked and built.
 
         Args:
             is_own: whether the folder holds the continued run. Otherwise an earlier run there is deleted.
@@ -194,22 +250,38 @@ class Trainer:
         Raises:
             ConfigError: the logger refuses its settings; the folder stays as it was.
         """
+        if self.output_dir is None:
+            return
         if is_own:
             self.recorder.start()
-            self._write_config()
+            self._write_config(self.output_dir)
             mark_unfinished(self.output_dir)
             return
         self.output_dir.mkdir(parents=True, exist_ok=True)
         with moved_aside(self.output_dir):
-            self._write_config()
+            self._write_config(self.output_dir)
             self.recorder.start()
 
-    def _write_config(self) -> None:
-        with replacing(self.output_dir / CONFIG_NAME) as partial:
+    def _write_config(self, folder: Path) -> None:
+        with replacing(folder / CONFIG_NAME) as partial:
             partial.write_text(self.config.to_yaml())
 
+    def stop(self) -> None:
+        """End training after the current batch. The run counts as finished."""
+        self._is_stopped = True
+
+    def finish(self, *, is_finished: bool = True) -> str:
+        """Evaluate the agent, write what the run has found, and return the closing table as text.
+
+        Args:
+            is_finished: whether training reached its end.
+        """
+        return self.recorder.finish(self.frames, self.wall_s, self.cpu_s, is_finished=is_finished)
+
     def train(self) -> bool:
-        """Train until `num_frames` or `eval.stop_score` and save the agent; return whether a signal stopped it before.
+        """Train until `num_frames`, `eval.stop_score` or a callback ends it, and save the agent.
+
+        Returns whether a signal stopped it before.
 
         A signal takes effect between two batches, so that the saved state equals that of an uninterrupted run.
 
@@ -231,6 +303,8 @@ class Trainer:
             except BaseException:  # such as a dead worker; the agent is saved before the run fails
                 self._save_and_close(collection)
                 raise
+            for callback in self.callbacks:
+                callback.on_end(self)
             self._save_and_close(collection)
             return not self._is_over()
 
@@ -272,6 +346,7 @@ class Trainer:
             unit_scale=True,
             mininterval=1.0,
             file=LenientStream(sys.stderr),
+            disable=not self.shows_progress,
         )
         for learner in self.parts.agent.learners:
             assert isinstance(learner, Learner)
@@ -290,6 +365,8 @@ class Trainer:
                 self.frames += num
                 take_time()
                 bar.update(num)
+                for callback in self.callbacks:
+                    callback.on_batch(self)
                 if self.frames >= run.num_frames or _is_due(last, self.frames, run.eval_every):
                     self._evaluate(bar)
                 elif _is_due(last, self.frames, run.log_every):
@@ -324,16 +401,18 @@ class Trainer:
     def _is_over(self) -> bool:
         stop_score, last_score = self.config.run.eval.stop_score, self.last_score
         is_reached = stop_score is not None and last_score is not None and last_score >= stop_score
-        return is_reached or self.frames >= self.config.run.num_frames
+        return self._is_stopped or is_reached or self.frames >= self.config.run.num_frames
 
     def _evaluate(self, bar: tqdm) -> None:
         row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True)
         success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
         self.last_score = row["eval/score"]
         bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
+        for callback in self.callbacks:
+            callback.on_evaluation(self, row)
 
     def save(self, collection: Collection) -> None:
-        """Write the checkpoint and the file with only the networks.
+        """Write the checkpoint and the file with only the networks, if the run has a folder.
 
         Raises:
             DivergedError: a weight is not finite, or another number is NaN.
@@ -344,22 +423,31 @@ class Trainer:
         for name, value in self.parts.agent.state_dict().items():
             if isinstance(value, torch.Tensor) and value.is_floating_point() and value.isnan().any():
                 raise DivergedError(f"{name} is NaN")
-        progress = self._progress()
+        if self.output_dir is None:
+            return
+        progress = self.progress()
         file = self.output_dir / checkpoint.FILE_NAME
         with_replay = self.config.run.checkpoint_replay
         states = {"collection": collection.state(), "recorder": self.recorder.state()}
         checkpoint.save(file, self.parts.agent, states, progress, with_replay=with_replay)
-        checkpoint.save_policy(self.output_dir / POLICY_NAME, self.parts.agent, progress)
+        self.save_policy(self.output_dir / POLICY_NAME)
+
+    def save_policy(self, file: Path) -> None:
+        """Write the networks, and the scale of the observations, to a file that `hpamdp.load` reads."""
+        checkpoint.save_policy(file, self.parts.agent, self.parts.env.base_env, self.progress())
 
     def keep_for_inspection(self) -> str:
         """Save the current agent beside the last good checkpoint, and return a message about both files."""
+        if self.output_dir is None:
+            return "the run has no folder, so nothing is kept"
         file = self.output_dir / DIVERGED_NAME
-        checkpoint.save(file, self.parts.agent, {}, self._progress(), with_replay=False)
+        checkpoint.save(file, self.parts.agent, {}, self.progress(), with_replay=False)
         good = self.output_dir / checkpoint.FILE_NAME
         kept = f"the last good checkpoint is {good}" if good.is_file() else "there is no checkpoint from before"
         return f"{kept}; the agent as it is now is in {file}"
 
-    def _progress(self) -> dict[str, object]:
+    def progress(self) -> dict[str, Any]:
+        """Return what a saved agent tells of its run, as JSON values."""
         return {
             "config": self.config.to_dict(),
             "option_names": list(self.parts.agent.specs.option_names),

@@ -207,6 +207,10 @@ class GymnasiumEnv(PAMDPEnv):
         if self.observations.statistics is not None and columns:
             self.observations.statistics.set_columns(columns)
 
+    def statistics(self) -> dict[str, Tensor]:
+        """Return the running statistics: they are the whole `env_state`."""
+        return self.env_state()
+
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
         """Continue with saved running statistics: they are the whole `env_state`."""
         self.set_env_state(columns)
