@@ -137,7 +137,7 @@ def test_the_option_is_read_at_the_first_press_and_held():
         reading = press(env, [2, 1], [0.1, 0.1], option)
         assert env.state.controller.tolist() == [0, 1]
         assert reading["observation"][:, SCALED_NAMES.index("controller")].tolist() == [0.0, 1.0]
-    # The incongruent boat's third key goes down, the congruent boat's second key up.
+    # The incongruent controller's third key goes down, the congruent controller's second key up.
     assert env.state.y[0] > 0.0 > env.state.y[1]
     assert torch.allclose(env.state.y[0], -env.state.y[1])
     env.reset()

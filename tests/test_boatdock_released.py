@@ -141,7 +141,7 @@ def test_an_invalid_action_is_refused_and_changes_nothing(bad, complaint):
         ({"start": (640.0, 512.0)}, "goal has shape None"),
         ({"start": (640.0, 512.0), "goal": (717.0, 512.0)}, "a goal lies outside"),
         ({"start": (640.0, 512.0), "goal": (640.0, 512.0)}, "within 1 px"),
-        ({"start": (640.0, 512.0), "goal": (600.0, 512.0), "keymap": 1}, "the congruent boat has none"),
+        ({"start": (640.0, 512.0), "goal": (600.0, 512.0), "keymap": 1}, "the congruent controller has none"),
     ],
 )
 def test_an_invalid_layout_is_refused(given, complaint):

@@ -172,7 +172,7 @@ def test_platform_declares_nothing():
     assert specs.symmetries is None and specs.geometry is None
 
 
-@pytest.mark.parametrize("name", ["congruent boat, key map 1, scaled", "choose 1", "hard move 6"])
+@pytest.mark.parametrize("name", ["congruent controller, key map 1, scaled", "choose 1", "hard move 6"])
 def test_in_the_canonical_frame_actions_of_one_kind_make_the_same_transition(name):
     make, columns_of, _ = PROBLEMS.get(name, (lambda: BoatDockEnv(NUM, controller="choose"), boat_columns, 12))
     env = make()

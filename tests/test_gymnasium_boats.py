@@ -23,7 +23,7 @@ from hpamdp.env.boatdock.gymnasium_adapter import BoatDock, BoatDockVector
 from hpamdp.env.boatdock.rendering import Leg, Scene, draw
 
 ID = "hpamdp/BoatDock-v0"
-START, GOAL = np.array([640.0, 512.0]), np.array([640.0, 452.0])  # 60 px straight up, the congruent boat's key 1
+START, GOAL = np.array([640.0, 512.0]), np.array([640.0, 452.0])  # 60 px straight up, the congruent controller's key 1
 NOISE = {"motor_noise": 0.2, "sensor_noise": 4.0, "slip": 0.2}
 # Gymnasium recommends actions scaled to [-1, 1]; ours are seconds on purpose.
 RECOMMENDATION = "we recommend using a symmetric and normalized space"

@@ -189,7 +189,7 @@ def test_the_distance_is_the_integral_of_the_measured_speed():
 def test_turning_the_world_by_180_degrees_and_swapping_the_controller_turns_the_result(batch):
     x, y, goal_x, goal_y, _, duration, fuel = torch.tensor(batch).unbind(-1)
     key = torch.arange(len(batch)) % 3
-    # For each key of the incongruent boat, with key map 1 and 2, the opposite key of the congruent boat.
+    # For each key of the incongruent controller, with key map 1 and 2, the opposite key of the congruent controller.
     opposite = torch.tensor([[0, 2, 1], [1, 0, 2]])
     for keymap in (1, 2):
         maps = torch.full_like(key, keymap)

@@ -30,7 +30,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="needs playwright")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 
 KEYS = "jkl"
-DOWN_THE_MIDDLE = {"start": [0, 60], "goal": [0, -60]}  # key 2 of the congruent boat (K) goes there
+DOWN_THE_MIDDLE = {"start": [0, 60], "goal": [0, -60]}  # key 2 of the congruent controller (K) goes there
 
 
 @pytest.fixture(scope="module")

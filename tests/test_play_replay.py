@@ -19,7 +19,7 @@ from hpamdp.env.play_page import EpisodeError
 from hpamdp.run.players import load_player
 
 NODE = shutil.which("node")
-START, GOAL = (0.0, 60.0), (0.0, -60.0)  # key 1 of the congruent boat goes from one to the other
+START, GOAL = (0.0, 60.0), (0.0, -60.0)  # key 1 of the congruent controller goes from one to the other
 
 
 def test_a_press_lasts_from_key_down_to_key_up():

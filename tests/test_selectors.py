@@ -208,7 +208,7 @@ def test_human_chooses_the_congruent_boat_as_often_as_humans_do_at_each_bearing(
         chosen = human(with_decisions(env).reset())[keys.OPTION].float()
     way = env.state.goal_x - env.state.start_x, env.state.goal_y - env.state.start_y
     bearing = torch.rad2deg(torch.atan2(way[1], way[0]))
-    # The congruent boat's keys point to 30, 150 and 270 degrees, y down.
+    # The congruent controller's keys point to 30, 150 and 270 degrees, y down.
     offset = torch.stack([((bearing - d + 180.0) % 360.0 - 180.0).abs() for d in (30.0, 150.0, 270.0)]).amin(0)
     for share, low, high in zip(HUMAN_CONGRUENT_BY_OFFSET, OFFSET_EDGES[:-1], OFFSET_EDGES[1:], strict=True):
         inside = (offset >= low) & (offset < high)

@@ -1,4 +1,4 @@
-"""Train H-PPO on one boat with each collector, one run after another.
+"""Train H-PPO with one controller with each collector, one run after another.
 
 python experiments/collectors/study.py run   makes eighteen runs, writes results.csv, then tabulates
 python experiments/collectors/study.py       tabulates the stored results.csv

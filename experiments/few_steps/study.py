@@ -32,7 +32,7 @@ DECLARED = ("auto", "shaped")  # augment and reward by default
 SETTINGS = {
     DECLARED: "symmetry declared",
     ("auto", "sparse"): "symmetry declared, sparse reward",
-    ("False", "shaped"): "told nothing of symmetry",
+    ("False", "shaped"): "symmetry not declared",
 }
 # Settings that ablations change, their default values, and labels.
 ABLATED = {"num_members": (5,), "posterior_sampling": ("auto", True), "updates_per_step": (10.0,), "horizon": (2,)}
@@ -102,7 +102,7 @@ def runs_of(curves: Rows, augment: str, reward: str, boat: str) -> Rows:
 
 def table(curves: Rows) -> str:
     """Return a line for each setting and boat."""
-    lines = _head("| | boat |")
+    lines = _head("| | controller |")
     for (augment, reward), label in SETTINGS.items():
         for boat, task in TASKS.items():
             rows = runs_of(curves, augment, reward, boat)
@@ -112,7 +112,7 @@ def table(curves: Rows) -> str:
 
 
 def ablation_table(curves: Rows) -> str:
-    """Return a line for each variant on the congruent boat, with the seeds that all variants have."""
+    """Return a line for each variant with the congruent controller, with the seeds that all variants have."""
     rows = [row for row in runs_of(curves, *DECLARED, "congruent") if row["seed"] in ABLATION_SEEDS]
     cells = {name: of_name for (name,), of_name in groups(rows, "variant").items()}
     return "\n".join(
@@ -142,7 +142,7 @@ def long_table(long: Rows) -> str:
     """Return a line for each boat: the scores of long runs."""
     presses = sorted({row["presses"] for row in long if row["presses"] > 0})
     columns = ("seeds", *(f"{number:,.0f} presses" for number in presses), "CPU of a run")
-    lines = [f"| boat | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
+    lines = [f"| controller | {' | '.join(columns)} |", "|---" * (1 + len(columns)) + "|"]
     for boat, task in TASKS.items():
         rows = [row for row in long if row["boat"] == boat]
         if rows:

@@ -1,4 +1,4 @@
-"""Test context-free selectors over frozen learners, with motor noise first on one boat, then on the other.
+"""Test context-free selectors over frozen learners, with motor noise first on one controller, then on the other.
 
 python experiments/hierarchy/drift.py RUN     plays with the learners of a run's output folder, writes drift.csv, draws
 python experiments/hierarchy/drift.py         draws and tabulates the stored drift.csv
@@ -29,7 +29,7 @@ SEEDS = range(3)
 NUM_ENVS = 20
 DECISIONS = 10_000  # in each phase
 EVERY = 200  # decisions between two rows
-# Motor noise of the incongruent and the congruent boat in each phase. First the congruent boat is the better one.
+# Motor noise of the incongruent and the congruent controller in each phase. The congruent one is better in the first.
 NOISE = ((0.15, 0.0), (0.0, 0.15))
 BETTER = (1, 0)  # option, in each phase
 RECOVERED = 0.8  # share of the better boat among the last EVERY decisions

@@ -80,7 +80,7 @@ def gather(runs: Sequence[Run]) -> tuple[Rows, Rows, Rows]:
         played = run.played()
         bins = np.digitize(played["bearing_offset"], OFFSET_EDGES[1:-1])
         for number, offset in enumerate(OFFSET_EDGES[:-1]):
-            share = float(played["option"][bins == number].mean())  # option 1 is the congruent boat
+            share = float(played["option"][bins == number].mean())  # option 1 is the congruent controller
             choices.append({**name, "offset": offset, "congruent": round(share, 4)})
     return results, curves, choices
 
@@ -167,7 +167,7 @@ def draw_curves(curves: Rows, column: str, label: str, path: Path) -> None:
 
 
 def draw_choices(choices: Rows, path: Path) -> None:
-    """Draw the frequency of the congruent boat by the bearing's offset, with people's, a panel for each learner."""
+    """Draw how often the congruent controller is chosen, by the bearing's offset, in a panel for each learner."""
     lows = list(dict.fromkeys(row["low"] for row in choices))
     middle = np.add(OFFSET_EDGES[:-1], OFFSET_EDGES[1:]) / 2
     figure = Figure(figsize=(6.2 * len(lows), 4.0), layout="constrained")
@@ -180,7 +180,9 @@ def draw_choices(choices: Rows, path: Path) -> None:
             shares = [np.mean([row["congruent"] for row in of_bin]) for of_bin in bins]
             axes.plot(middle, shares, color=colour, linewidth=1.5, label=high)
         axes.plot(middle, HUMAN_CONGRUENT_BY_OFFSET, "--", color=SELECTORS["human"], linewidth=2.2, label="people")
-        _label(axes, low, "degrees from the congruent boat's nearest direction", "share of the congruent boat")
+        _label(
+            axes, low, "degrees from the congruent controller's nearest direction", "share of the congruent controller"
+        )
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.legend(fontsize=7, frameon=False, ncols=2)
     figure.savefig(path, dpi=130)

@@ -118,7 +118,7 @@ def _mean_score_of_each_person(data: HumanData, mask: torch.Tensor) -> torch.Ten
 
 
 def choices(data: HumanData, best: torch.Tensor) -> Rows:
-    """Return a row for each block (or all) and bin of bearings: how often the congruent boat was chosen or better."""
+    """Return a row for each block (or all) and bin of bearings: frequencies of choosing the congruent controller."""
     rows = []
     bins = statistics.offset_bins(data)
     is_congruent_better = (best.argmax(1) == harbour.CONGRUENT).double()
@@ -213,7 +213,7 @@ def draw_gaps(axes: Axes) -> None:
 
 
 def draw_choices(axes: Axes) -> None:
-    """Draw how often the congruent boat was chosen and how often it was better, by the bearing."""
+    """Draw how often the congruent controller was chosen and how often it was better, by the bearing."""
     rows = load("choices")
     for block, colour, label in ((ALL_BLOCKS, HUMAN, "people"), (0, FAINT, "first 60"), (5, INK, "last 60")):
         own = rows["block"] == block
@@ -232,7 +232,7 @@ def draw_choices(axes: Axes) -> None:
         label="better boat",
     )
     axes.set(xlim=(0, 60), ylim=(0, 1), title="Congruent boat chosen")
-    axes.set_xlabel("degrees between bearing and congruent boat's nearest key")
+    axes.set_xlabel("degrees between bearing and congruent controller's nearest key")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     axes.legend(frameon=False, loc="lower left")
 
@@ -339,7 +339,8 @@ def table_cells(rows: Columns, mask: np.ndarray) -> str:
 def tabulate() -> None:
     """Print the table of the page, then the other figures in it."""
     rows = load("blocks")
-    print("| episodes | score | congruent | incongruent | success | too fast | out | no fuel | presses | keys | boat |")
+    outcomes = "success | too fast | out | no fuel"
+    print(f"| episodes | score | congruent | incongruent | {outcomes} | presses | keys | controller |")
     print("|---|---|---|---|---|---|---|---|---|---|---|")
     for block in np.unique(rows["block"]):
         first = BLOCK_EPISODES * block + 1

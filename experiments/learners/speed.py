@@ -86,7 +86,7 @@ def run_case(case: Case) -> tuple[float, float | None]:
 
 
 def build(overrides: list[str], folder: Path) -> tuple[AssembledRun, int]:
-    """Return the parts of a run on the congruent boat, and the presses of a batch."""
+    """Return the parts of a run with the congruent controller, and the presses of a batch."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         words = ["high=none", "env.controller=congruent", "eval.layouts=10", *overrides]
         config = read(compose("config", words, return_hydra_config=True))

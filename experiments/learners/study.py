@@ -108,7 +108,7 @@ def table(results: Rows) -> str:
 
 
 def boats_table(results: Rows) -> str:
-    """Return a line with the difference of scores for each learner that was trained on both boats."""
+    """Return a line with the difference of scores for each learner that was trained with both controllers."""
     lines = ["| learner | congruent less incongruent (95 %) | probability of improvement |", "|---|---|---|"]
     for (low,), runs in groups(results, "low").items():
         scores = [

@@ -56,7 +56,7 @@ def _order(row: dict[str, Any]) -> tuple[int, str]:
 def table(rows: Rows) -> str:
     """Return a line for each learner and boat, with single seeds, which differ too much for a mean."""
     lines = [
-        "| learner | boat | trained | return, by seed | docks in | idles to the limit in | presses an episode |",
+        "| learner | controller | trained | return, by seed | docks in | idles to the limit in | presses an episode |",
         "|---|---|---|---|---|---|---|",
     ]
     for (low, boat), runs in groups(rows, "low", "boat").items():

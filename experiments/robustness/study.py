@@ -98,7 +98,7 @@ def _agent(row: dict[str, Any]) -> list[Any]:
 
 def table(rows: Rows) -> str:
     """Return a line for each agent and noise: mean and standard deviation of the score over seeds at each level."""
-    lines = ["| agent | boat | trained with | noise | level: score |", "|---|---|---|---|---|"]
+    lines = ["| agent | controller | trained with | noise | level: score |", "|---|---|---|---|---|"]
     cases = groups(rows, "agent", "boat", "trained_with", "noise").items()
     for (agent, boat, trained_with, noise), of_case in cases:
         scores = []
@@ -133,7 +133,7 @@ def _scores(rows: Rows, noise: str, level: float) -> list[float]:
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """Draw scores on the congruent boat against the level of each noise.
+    """Draw scores with the congruent controller against the level of each noise.
 
     The upper row shows all agents trained without noise. The lower row shows H-PPO trained without noise, with this
     noise, and with all three.

@@ -66,7 +66,7 @@ class Products(TorchDispatchMode):
 
 
 def make(name: str, folder: Path) -> tuple[AssembledRun, Learner, int]:
-    """Return the parts of a run on the congruent boat with its defaults, the learner, and the steps of a batch."""
+    """Return the parts of a run with the congruent controller and defaults, the learner, and the steps of a batch."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         words = ["high=none", f"low={name}", "env.controller=congruent", "eval.layouts=10"]
         config = read(compose("config", [*words, *_of(name)], return_hydra_config=True))

@@ -178,7 +178,7 @@ def ceilings(results: Rows) -> dict[str, float]:
 def brief_table(rows: Rows, results: Rows) -> str:
     """Return one line for each learner, for the project's front page."""
     lines = [
-        "| | score, congruent boat | score, incongruent boat | presses | CPU |",
+        "| | score, congruent controller | score, incongruent controller | presses | CPU |",
         "|---|---|---|---|---|",
     ]
     for (low,), boats in groups(rows, "learner").items():
@@ -201,7 +201,8 @@ def table(rows: Rows, results: Rows) -> str:
     From five seeds on, the interquartile mean and its interval follow the score.
     """
     lines = [
-        "| | boat | score | above the next best (95 %) | random 0, people 1 | success | presses | CPU | the paper's |",
+        "| | controller | score | above the next best (95 %) | human-normalised score | success | presses | CPU "
+        "| the paper's |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
@@ -242,10 +243,10 @@ def reward_table(results: Rows) -> str:
 
 
 def efficiency_table(efficiency: Rows, results: Rows) -> str:
-    """Return a line for each learner: presses to the human score, and the full-length scores on both boats together."""
+    """Return a line for each learner: presses to the human score, and full-length scores over both controllers."""
     lines = [
         "| learner | presses to 1.97, congruent | incongruent | wall seconds, both "
-        "| random 0, people 1: full-length runs, both boats |",
+        "| human-normalised score: full-length runs, both controllers |",
         "|---|---|---|---|---|",
     ]
     for low in LEARNERS:

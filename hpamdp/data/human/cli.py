@@ -223,7 +223,7 @@ def _summary(options: argparse.Namespace) -> None:
         _print_row(f"episodes {60 * block + 1} to {60 * block + 60}", figures)
     best = int(scores_by_person(data).nan_to_num(nan=-torch.inf).argmax())
     _print_row(f"best person ({best})", by_person[best])
-    say("congruent boat chosen, by degrees between the bearing and its nearest direction:")
+    say("congruent controller chosen, by degrees between the bearing and its nearest direction:")
     bins = zip(OFFSET_EDGES[:-1], OFFSET_EDGES[1:], curve, strict=True)
     say(", ".join(f"{low}-{high}: {share:.3f}" for low, high, share in bins))
 

@@ -94,19 +94,19 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     no_choice_setting: ClassVar[str] = "env.controller=congruent (or incongruent, random)"
     table_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "score"),
-        Metric("human_normalised", "random 0, people 1"),
+        Metric("human_normalised", "human-normalised score"),
         *(Metric(name, name.replace("_", " "), "share") for name in task.OUTCOMES[1:]),
         Metric("steps", "presses an episode", "count"),
-        Metric("option_congruent", "congruent boat", "share"),
-        Metric("option_changes", "changes of boats an episode", "count"),
+        Metric("option_congruent", "congruent controller", "share"),
+        Metric("option_changes", "controller changes an episode", "count"),
         Metric("oracle_agreement", "oracle's choice", "share"),
         Metric("optimality_gap", "gap to the ceiling"),
     )
     curve_metrics: ClassVar[tuple[Metric, ...]] = (
         Metric("score", "Score"),
         Metric("success", "Episodes that succeed", "share"),
-        Metric("oracle_agreement", "Better boat chosen", "share"),
-        Metric("option_congruent", "Congruent boat chosen", "share"),
+        Metric("oracle_agreement", "Better controller chosen", "share"),
+        Metric("option_congruent", "Congruent controller chosen", "share"),
     )
 
     def __init__(

@@ -134,7 +134,7 @@ def fixed_layouts(num: int, seed: int) -> Layout:
 
 
 def bearing_offset(layout: Layout) -> Tensor:
-    """Return the degrees, in [0, 60], between the goal's bearing and the congruent boat's nearest direction, `[*B]`."""
+    """Return the degrees, in [0, 60], between the goal's bearing and the nearest congruent direction, `[*B]`."""
     bearing = torch.rad2deg(torch.atan2(layout.goal_y - layout.start_y, layout.goal_x - layout.start_x))
     # The congruent directions lie at 30, 150 and 270 degrees (y down), 120 apart.
     return ((bearing - 30.0 + 60.0) % 120.0 - 60.0).abs()

@@ -18,7 +18,7 @@ def human_spec(num_envs: int, device: torch.device) -> Composite:
 
 
 def human_shares(state: BoatState) -> Tensor:
-    """Return the shares of people who choose the incongruent and the congruent boat `[N, 2]`, by the bearing offset."""
+    """Return how often people choose the incongruent and the congruent controller at these bearings, `[N, 2]`."""
     layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
     offset = harbour.bearing_offset(layout)
     bins = torch.bucketize(offset, offset.new_tensor(OFFSET_EDGES[1:-1]))

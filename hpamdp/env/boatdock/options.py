@@ -35,7 +35,7 @@ class BoatDockOptions(Settings):
     All but `choose` need high=none.
     """
     keymap: Literal[1, 2, "random"] = 1
-    """Key map of the incongruent boat, which says where its keys push it; `random` draws one for each episode."""
+    """Key map of the incongruent controller, which says where its keys push it; `random` draws one for each episode."""
     reward: RewardForm = "paper"
     """`paper`: progress at each press, 5 x the fuel left on success, -1 on failure. `sparse`: only the success term."""
     observation: ObservationForm = "scaled"

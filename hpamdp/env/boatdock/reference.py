@@ -25,7 +25,7 @@ HUMAN: dict[str, Figures] = {
         "time_limit": 0.0,
         "steps": 3.25,  # as logged; the log drops presses that overlapped another
         "option_congruent": 0.582,
-        "oracle_agreement": 0.648,  # by the bearing: the congruent boat is the better one under 30 degrees
+        "oracle_agreement": 0.648,  # by the bearing: the congruent controller is the better one under 30 degrees
     },
     "congruent": {"score": 2.012, "success": 0.864},
     "incongruent": {"score": 1.912, "success": 0.854},
@@ -36,13 +36,13 @@ HUMAN_LAST_60: Figures = {"score": 2.241, "success": 0.900}  # of each person's 
 BEST_PERSON: Figures = {"score": 3.021, "success": 0.989}
 HUMAN_SUCCESS_BY_BLOCK = (0.764, 0.843, 0.873, 0.886, 0.894, 0.900)  # six blocks of 60 episodes
 
-# Share choosing the congruent boat, by the degrees between the goal's bearing and that boat's nearest direction.
+# Share choosing the congruent controller, by the degrees between the goal's bearing and its nearest direction.
 OFFSET_EDGES = (0, 10, 20, 30, 40, 50, 60)
 HUMAN_CONGRUENT_BY_OFFSET = (0.788, 0.741, 0.654, 0.502, 0.427, 0.370)
 
 
 def human_normalised(score: float, controller: str = "chosen") -> float:
-    """Return a score on the scale on which random presses score 0 and people with the same boat 1.
+    """Return the human-normalised score: 0 for random presses, 1 for the mean of people with the same controller.
 
     Args:
         score: mean score of an evaluation.

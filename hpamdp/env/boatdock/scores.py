@@ -18,7 +18,8 @@ def measure_boats(played: Mapping[str, np.ndarray], controller: str, rules: Rule
     - `ceiling`: the best possible mean score on the same layouts, with the better controller of each where the agent
       chose (`option`), else with the one that was given (`controller`);
     - `ceiling_success`: with other boats than people's, the share of these layouts in which a plan docks;
-    - `human_normalised`: the score, where random presses score 0 and people 1; with people's two boats alone;
+    - `human_normalised`: the human-normalised score, 0 for random presses and 1 for the mean of people; only with the
+      two controllers of the recording;
     - where the agent chose: `option_NAME`, the share of episodes with that controller, and with a `switch_cost` that
       began with it; `oracle_agreement`, the share with the best one; `oracle_agreement_weighted`, the share of what the
       choice is worth, from the worst to the best one, that the agent's was worth; 1 where all are equally good.

@@ -37,14 +37,14 @@ class ReleasedBoatDockOptions(Settings):
     controller: Literal["congruent", "incongruent"] = "congruent"
     """The boat. The agent cannot choose it, so use high=none."""
     keymap: Literal[0, 1] = 0
-    """Key map of the incongruent boat. If 0, it is sampled from {0, 1} at every reset until it is 1.
+    """Key map of the incongruent controller. If 0, it is sampled from {0, 1} at every reset until it is 1.
 
-    Key map 0 has the keys of key map 2 in env=boatdock. The congruent boat observes -1.
+    Key map 0 has the keys of key map 2 in env=boatdock. The congruent controller observes -1.
     """
     test_mode: Literal[0, 1, None] = None
-    """If 1, only layouts with a bearing within 30 degrees of the incongruent boat's directions. If 0, only the others.
+    """If 1, only layouts with a bearing within 30 degrees of the incongruent controller's directions.
 
-    If None, all layouts.
+    If 0, only the other layouts. If None, all layouts.
     """
     frozen_layouts: bool = True
     """Keep the layout of the first reset for all episodes, as released. If false, every episode has a new layout."""
@@ -87,7 +87,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
         settings: single settings by name, which replace those in `options`.
 
     `reset` also takes layouts, which the environments keep: a tensordict with `start` and `goal` `[N, 2]` in screen px
-    and, for the incongruent boat, optionally `keymap` int `[N]`.
+    and, for the incongruent controller, optionally `keymap` int `[N]`.
 
     Raises:
         ValueError: an argument, action or layout is invalid; the state is unchanged.
@@ -242,7 +242,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
         if keymap is None:
             return columns
         if self._is_congruent:
-            raise ValueError("reset: keymap is given, but the congruent boat has none")
+            raise ValueError("reset: keymap is given, but the congruent controller has none")
         if keymap.shape != (num,) or not ((keymap == 0) | (keymap == 1)).all():
             raise ValueError(f"reset: keymap must be 0 or 1 in shape [{num}]")
         return {**columns, "keymap": keymap.astype(np.int32)}
