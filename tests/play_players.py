@@ -1,4 +1,4 @@
-"""Episodes of `hpamdp play` without a browser: events of given presses, and what they come to."""
+"""Episodes of `hpamdp play` without a browser: events of given presses, and their results."""
 
 import math
 

@@ -214,7 +214,7 @@ def forged(rng, number):
     episode["index"] = 10_000 + number
     names = list(episode)
     kind = number % 8
-    if kind == 0:  # a figure that the presses do not come to
+    if kind == 0:  # a figure that does not follow from the presses
         name = rng.choice(["score", "fuel"])
         episode[name] = episode[name] * rng.uniform(0.1, 0.9)
     elif kind == 1:  # a press of another time

@@ -1,4 +1,4 @@
-"""The game's rules: which presses key events come to, what they do, and that the page's script does the same."""
+"""The game's rules: the presses that follow from key events, their effects, and that the page's script does the same."""
 
 import json
 import random
@@ -122,7 +122,7 @@ GOOD = docked(1)[0]
         ({"end": [0.0, 0.0]}, "end"),
         ({"presses": [{"key": 0, "start": 0.3, "duration": 0.2}]}, "presses"),
         ({"events": GOOD["events"][:1]}, "presses"),
-        ({"events": GOOD["events"][::-1]}, "times go back"),
+        ({"events": GOOD["events"][::-1]}, "times must not decrease"),
         ({"goal": GOOD["start"]}, "goal"),
         ({"start": [150.0, 0.0]}, "start"),
         ({"controller": "steamer"}, "controller"),

@@ -135,7 +135,7 @@ def test_the_commands_of_the_recording_work_on_the_file(file, tmp_path, capsys):
         ("no json\n[]\n", "line 1: no JSON; no line is an episode"),
         (
             json.dumps({**EPISODES[0], "outcome": "too_fast", "score": -1.0}) + "\n",
-            "line 1: outcome: too_fast, but the presses come to success",
+            "line 1: outcome: too_fast, but the presses lead to success",
         ),
         (json.dumps(EPISODES[-1]) + "\n", "but those of practice"),
         ("\x00\xff" * 10 + "\n", "line 1"),
@@ -158,7 +158,7 @@ def test_lines_that_are_no_episodes_are_named_and_the_others_read(tmp_path, caps
         "UTF-16, but must be UTF-8": [good[0].encode("utf-16").replace(b"\n", b"")],
         "longer than 1048576 bytes": [b"[" + b"1," * 600_000 + b"1]"],
         "the same episode as line 1": [good[0].encode(), json.dumps({**first, "software": "9"}).encode()],
-        "fuel: not what the presses come to": [json.dumps({**first, "fuel": 0.123}).encode()],
+        "fuel: does not follow from the presses": [json.dumps({**first, "fuel": 0.123}).encode()],
         "presses.0.duration: Input should be greater than 0": [changed(first, duration=-1.0)],
         "presses.0.duration: Input should be a valid number": [changed(first, duration="0.5")],
         "presses.0.key: Field required": [changed(first, key=None)],
@@ -167,7 +167,7 @@ def test_lines_that_are_no_episodes_are_named_and_the_others_read(tmp_path, caps
     }
     for constant in ("NaN", "Infinity", "-Infinity"):
         bad["no JSON"].append(good[0].replace('"end": [', f'"end": [{constant}, ').encode())
-    bad["episode: no JSON object"] = [re.sub('"end": .[^,]*', '"end": [1e999', good[0]).encode()]
+    bad["episode: is not a JSON object"] = [re.sub('"end": .[^,]*', '"end": [1e999', good[0]).encode()]
     for problem, lines in bad.items():
         for line in lines:
             path = tmp_path / "a.jsonl"
@@ -221,7 +221,7 @@ def test_a_forged_episode_is_found_by_the_check(tmp_path, capsys):
     forged = {**EPISODES[0], "events": [{**events[0], "t": events[0]["t"] + 0.001}, *events[1:]]}
     (tmp_path / "a.jsonl").write_text(json.dumps(forged) + "\n")
     assert main(["check", str(tmp_path / "a.jsonl")]) == 2
-    assert "line 1: presses.0: not what the events come to" in capsys.readouterr().err
+    assert "line 1: presses.0: does not follow from the events" in capsys.readouterr().err
 
 
 def test_a_missing_recording_is_told_in_one_line(tmp_path):

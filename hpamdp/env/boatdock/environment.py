@@ -22,7 +22,7 @@ from hpamdp.env.base import Metric
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.boatdock import episode as episode_rules
 from hpamdp.env.boatdock import harbour, kernel, planner, task
-from hpamdp.env.boatdock.human_shares import human_shares, human_spec
+from hpamdp.env.boatdock.human_choices import choice_probabilities, human_spec
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.options import BoatDockOptions
 from hpamdp.env.boatdock.oracle import BoatDockOracle, oracle_spec
@@ -383,7 +383,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         """Return how often people choose each boat, and what the planner knows."""
         known: dict[str, Any] = {}
         if self._has_human:
-            known["human"] = {"option": human_shares(self._state)}
+            known["human"] = {"option": choice_probabilities(self._state)}
         if self._oracle is not None:
             known["oracle"] = self._oracle.read(self._state)
         return known

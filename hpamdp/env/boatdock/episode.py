@@ -1,7 +1,7 @@
 """One episode of the task as pure functions on columns: a press, a new episode, the observation.
 
-The functions know nothing of TorchRL and compile without graph breaks; BoatDockEnv wraps them. The observation is
-compiled apart from the press, because its strided writes would keep a physics fused with them from being vectorised.
+The functions do not use TorchRL and compile without graph breaks. BoatDockEnv wraps them. The observation is compiled
+apart from the press: if both were fused, the observation's strided writes would keep the physics from being vectorised.
 Positions are px from the harbour's centre.
 """
 
@@ -37,15 +37,16 @@ def start(episode: Tensor, rng: counter_rng.RngKey, rules: Rules) -> BoatState:
 
     Args:
         episode: numbers of the episodes, int32 `[N]`.
-        rng: `[N]`, for the layouts, and for what the rules leave to chance.
-        rules: of the environment.
+        rng: random-number keys `[N]`, for the layouts, and for a random controller and key map.
+        rules: rules of the environment.
     """
     layout = harbour.sample_layout(rng)
     zeros = torch.zeros_like(layout.start_x)
     integer_zeros = torch.zeros_like(episode)
     if rules.controller == "random":
         num = len(rules.names)
-        # The last boat for the smallest numbers, as there were two at first and the second for those under a half.
+        # The smallest numbers give the last boat. This keeps the draws of earlier versions, which had two boats and
+        # gave the second one for numbers under a half.
         drawn = (counter_rng.uniform(rng, harbour.INDEX_CONTROLLER) * num).to(torch.int32)
         controller = (num - 1 - drawn).clamp(min=0)
     elif rules.controller == "choose":
@@ -77,13 +78,13 @@ def act(
     """Return the boats after a press, as if no episode were over, and the rewards `[N]`.
 
     Args:
-        state: before the press.
-        option: integers `[N]`: the controller of boats that have none yet; with a `switch_cost`, of all. None if nobody
-            chooses.
+        state: states before the press.
+        option: chosen controllers, integers `[N]`. They count for boats without a controller or, with a `switch_cost`,
+            for all boats. None if the agent does not choose.
         key: 0, 1 or 2, integers `[N]`.
         duration: seconds in [0, MAX_DURATION], `[N]`.
-        rng: of the noise, `[N]`.
-        rules: of the environment.
+        rng: random-number keys of the noise, `[N]`.
+        rules: rules of the environment.
     """
     key = key.to(torch.int32)
     first = state.presses * NUMBERS_PER_PRESS
@@ -143,9 +144,9 @@ def observe(state: BoatState, rng: counter_rng.RngKey | None, rules: Rules) -> T
     """Return the observations: `[N, 16]` with the entries SCALED_NAMES, or `[N, 14]` with OBSERVATION_NAMES.
 
     Args:
-        state: of the boats.
-        rng: of the noise, `[N]`; None if the sensors have none.
-        rules: of the environment; with `pixels` the observation is the shorter one.
+        state: states of the boats.
+        rng: random-number keys of the noise, `[N]`. None if the sensors have no noise.
+        rules: rules of the environment. With `pixels` the observation has OBSERVATION_NAMES.
     """
     points = [state.start_x, state.start_y, state.goal_x, state.goal_y, state.x, state.y]
     if rng is not None:
@@ -153,7 +154,7 @@ def observe(state: BoatState, rng: counter_rng.RngKey | None, rules: Rules) -> T
         points = [p + rules.sensor_noise * counter_rng.normal(rng, first + i) for i, p in enumerate(points)]
     start_x, start_y, goal_x, goal_y, x, y = points
     distance = ((goal_x - x).square() + (goal_y - y).square()).sqrt()
-    # Clamped, because sensor noise can bring start and goal together.
+    # The clamp is needed because sensor noise can bring start and goal together.
     at_start = harbour.separation(harbour.Layout(start_x, start_y, goal_x, goal_y)).clamp(min=physics.DOCK_RADIUS)
     is_pixels = rules.observation == "pixels"
     centre_x, centre_y = harbour.CENTRE if is_pixels else (0.0, 0.0)

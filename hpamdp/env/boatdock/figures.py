@@ -1,4 +1,4 @@
-"""Figures of an evaluation on boats: the courses they took, and the choice of the boat."""
+"""Figures of an evaluation on boats: the trajectories, and the choice of the boat."""
 
 from __future__ import annotations
 
@@ -32,11 +32,12 @@ _SHEET = (4, 6)  # rows and columns of the sheet of trajectories
 
 
 def draw(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
-    """Return `trajectories.png` and, where the agent chose its boat, `choices.png`.
+    """Return `trajectories.png` and, if the agent chose its boat, `choices.png`.
 
     Args:
-        evaluation: the arrays that `BoatDockEnv.describe` and an evaluation give; figures that lack one are left out.
-        summary: of the run; `references` has the figures of people, `boats` the names of other boats than theirs.
+        evaluation: arrays from `BoatDockEnv.describe` and an evaluation. A figure is left out if one of its arrays is
+            missing.
+        summary: summary of the run. `references` has people's figures, `boats` the names of other boats than theirs.
     """
     evaluation = dict(evaluation)
     if "option" in evaluation:
@@ -50,7 +51,8 @@ def _trajectories(evaluation: Mapping[str, np.ndarray], names: tuple[str, ...]) 
     if not {"path", "goal", "outcome", "score"} <= evaluation.keys() or not len(evaluation["score"]):
         return None
     scores, outcomes = evaluation["score"], evaluation["outcome"].astype(int)
-    # Best first; failures, which all score the same, by their outcome. Evenly spaced ranks show the typical ones too.
+    # Rank the best first. Failures all score the same, so rank them by outcome. Evenly spaced ranks also show typical
+    # episodes.
     ranking = np.lexsort((outcomes, -scores))
     num = min(len(ranking), _SHEET[0] * _SHEET[1])
     chosen = ranking[np.linspace(0, len(ranking) - 1, num).round().astype(int)]
@@ -64,8 +66,8 @@ def _trajectories(evaluation: Mapping[str, np.ndarray], names: tuple[str, ...]) 
         _draw_episode(axes, evaluation, int(episode), names)
     present = [(name, (outcomes == code).mean()) for code, name in enumerate(OUTCOMES) if (outcomes == code).any()]
     handles = [
-        Line2D([], [], color=_colour(name), marker=_end_marker(name), label=f"{_words(name)} {share:.1%}")
-        for name, share in present
+        Line2D([], [], color=_colour(name), marker=_end_marker(name), label=f"{_words(name)} {fraction:.1%}")
+        for name, fraction in present
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False, fontsize=9)
     figure.supxlabel(
@@ -109,13 +111,13 @@ def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int
 
 
 def episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...] = ()) -> str:
-    """Return the score, the highest possible score if it is known, and the initial of the boat or option."""
+    """Return a title: the score, the highest possible score if it is known, and the initial of the boat."""
     title = f"{evaluation['score'][episode]:.2f}"
     boat = int(evaluation["controller"][episode]) if "controller" in evaluation else NOT_CHOSEN
     if "optimum" in evaluation:
         best = evaluation["optimum"][episode]
         is_chosen = "option" in evaluation and evaluation["option"][episode] != NOT_CHOSEN
-        # The best of both boats is the ceiling of those who choose only.
+        # If the agent does not choose, its ceiling is the best score with its own boat.
         best = best if is_chosen or boat == NOT_CHOSEN else best[boat : boat + 1]
         if np.isfinite(best).any():
             title += f" / {np.nanmax(best):.2f}"
@@ -142,16 +144,16 @@ def _choices(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -
 
 
 class _Bins:
-    """Episodes sorted by a value into bins, of which those without an episode are left out.
+    """Episodes sorted by a value into bins. Bins without an episode are left out.
 
     Args:
-        values: of the episodes, `[N]`.
-        edges: of the bins.
+        values: values of the episodes, `[N]`.
+        edges: edges of the bins.
 
     Attributes:
-        all_centres: of all bins.
-        centres: of the bins with episodes.
-        num: how many episodes each of them has.
+        all_centres: centres of all bins.
+        centres: centres of the bins with episodes.
+        num: number of episodes in each of these bins.
     """
 
     def __init__(self, values: np.ndarray, edges: np.ndarray) -> None:
@@ -164,7 +166,7 @@ class _Bins:
         self.num = num[self._filled]
 
     def sums(self, weights: np.ndarray) -> np.ndarray:
-        """Return the sum of the episodes' weights `[N]` in each bin with episodes."""
+        """Return the sum of the episodes' weights `[N]` in each bin that has episodes."""
         return np.bincount(self._bin, weights=weights, minlength=len(self.all_centres))[self._filled]
 
 
@@ -185,14 +187,14 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: 
         axes.plot(bins.all_centres, HUMAN_CONGRUENT_BY_OFFSET, color=colour, linestyle=dashes, marker="D", markersize=4)
         labels.append((HUMAN_CONGRUENT_BY_OFFSET[-1], label, colour))
     chosen = bins.sums(congruent)
-    share = chosen / bins.num
+    fraction = chosen / bins.num
     intervals = [
         binomtest(int(k), int(n)).proportion_ci(0.95, method="wilson")
         for k, n in zip(chosen.round(), bins.num, strict=True)
     ]
-    errors = np.maximum([share - [i.low for i in intervals], [i.high for i in intervals] - share], 0.0)
-    axes.errorbar(bins.centres, share, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
-    labels.append((share[-1], "this agent", AGENT))
+    errors = np.maximum([fraction - [i.low for i in intervals], [i.high for i in intervals] - fraction], 0.0)
+    axes.errorbar(bins.centres, fraction, errors, color=AGENT, linewidth=2.0, marker="o", markersize=5, capsize=3)
+    labels.append((fraction[-1], "this agent", AGENT))
     axes.set(xlim=(0, 60), ylim=(-0.03, 1.03), xticks=bins.edges)
     axes.set_xlabel("degrees between the goal's bearing and the congruent boat's nearest key")
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -201,7 +203,10 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: 
 
 
 def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
-    """Draw the share of each boat by the goal's bearing; equally good boats share what the planner would choose."""
+    """Draw the fraction of choices of each boat by the goal's bearing, for the agent and the planner.
+
+    If several boats are equally good, the planner's choice is split evenly between them.
+    """
     to_goal = evaluation["goal"] - evaluation["start"]
     bearing = np.degrees(np.arctan2(to_goal[:, 1], to_goal[:, 0])) % 360.0
     bins = _Bins(bearing, np.arange(0.0, 361.0, 30.0))
@@ -226,11 +231,11 @@ def _draw_outcomes(axes: Axes, outcomes: np.ndarray, people: Mapping[str, float]
     names = [name for code, name in enumerate(OUTCOMES) if (outcomes == code).any() or people.get(name)]
     colour = REFERENCES["human"][1]
     for row, name in enumerate(names):
-        share = (outcomes == OUTCOMES.index(name)).mean()
-        axes.barh(row, share, color=_colour(name), height=0.62)
-        axes.annotate(f"{share:.1%}", (1.19, row), ha="right", va="center", fontsize=8.5, annotation_clip=False)
+        fraction = (outcomes == OUTCOMES.index(name)).mean()
+        axes.barh(row, fraction, color=_colour(name), height=0.62)
+        axes.annotate(f"{fraction:.1%}", (1.19, row), ha="right", va="center", fontsize=8.5, annotation_clip=False)
         if people.get(name) is not None:
-            for edge, width in (("white", 4.5), (colour, 2.0)):  # the white edge keeps it apart from the bar
+            for edge, width in (("white", 4.5), (colour, 2.0)):  # the white edge sets the mark apart from the bar
                 axes.plot([people[name]] * 2, [row - 0.38, row + 0.38], color=edge, linewidth=width)
     if people.get("success") is not None:
         axes.annotate("people", (people["success"], -0.45), color=colour, ha="center", va="bottom", fontsize=8.5)

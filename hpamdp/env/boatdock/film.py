@@ -1,4 +1,4 @@
-"""Films of an episode: the boat moves as it does in the task, in closed form, between the states before and after."""
+"""Films of an episode. The boat moves between the states before and after a press by the task's own closed forms."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ def film(
     """Yield the pictures of one episode, uint8 `[size, size, 3]` each, from its start to its end.
 
     Args:
-        track: the states at the start and after every press, columns `[1]`; columns that are no boat's are ignored.
-        fps: pictures a second.
-        size: px from edge to edge.
-        rules: of the environment; None: the default ones.
+        track: the states at the start and after every press, columns `[1]`. Columns outside `BoatState` are ignored.
+        fps: pictures per second.
+        size: width and height of a picture, px.
+        rules: rules of the environment. If None, the default ones.
     """
     rules = Rules() if rules is None else rules
     states = [BoatState(*(columns[name].double() for name in BoatState._fields)) for columns in track]
     scene = _scene(states[0], states[min(1, len(states) - 1)], rules.boats)
     yield rendering.draw(scene, size)
-    late = 0.0  # from the last press's end to the next picture, s
+    late = 0.0  # seconds from the end of the last press to the next picture
     for before, after in itertools.pairwise(states):
         if before.outcome.item() != physics.SAILING:
             break
@@ -63,12 +63,12 @@ def _scene(first: BoatState, second: BoatState, boats: Boats | None) -> Scene:
 def _underway(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float, seconds: float) -> Scene:
     """Return the scene `seconds` after the beginning of a press."""
     elapsed = burnt.new_tensor([seconds])
-    share = min(physics.distance_at(burnt, elapsed).item() / length, 1.0) if length > 0.0 else 0.0
+    fraction = min(physics.distance_at(burnt, elapsed).item() / length, 1.0) if length > 0.0 else 0.0
     start = (before.x.item(), before.y.item())
     end = (after.x.item(), after.y.item())
-    boat = (start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1]))
+    boat = (start[0] + fraction * (end[0] - start[0]), start[1] + fraction * (end[1] - start[1]))
     pressed = physics.pressed_distance(torch.minimum(burnt, elapsed)).item()
-    made = share * length
+    made = fraction * length
     leg = Leg(start, boat, min(pressed / made, 1.0) if made > 0.0 else 1.0)
     return replace(
         scene,
@@ -82,16 +82,16 @@ def _underway(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, 
 
 
 def _rested(scene: Scene, before: BoatState, after: BoatState, burnt: Tensor, length: float) -> Scene:
-    """Return the scene when a press has come to its end."""
+    """Return the scene at the end of a press."""
     start, end = (before.x.item(), before.y.item()), (after.x.item(), after.y.item())
-    share = min(physics.pressed_distance(burnt).item() / length, 1.0) if length > 0.0 else 1.0
+    pressed = min(physics.pressed_distance(burnt).item() / length, 1.0) if length > 0.0 else 1.0
     outcome = int(after.outcome)
     is_over = outcome != physics.SAILING
     return replace(
         scene,
         boat=end,
         heading=(after.velocity_x.item(), after.velocity_y.item()) if length > 0.0 else scene.heading,
-        legs=(*scene.legs, Leg(start, end, share)),
+        legs=(*scene.legs, Leg(start, end, pressed)),
         fuel=after.fuel.item() / physics.TANK,
         presses=min(scene.presses + 1, MAX_PRESSES),
         controller=int(after.controller),

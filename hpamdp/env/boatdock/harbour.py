@@ -1,4 +1,4 @@
-"""The harbour: its position on the screen, the two controllers and their key maps, and where boats start and dock."""
+"""The harbour: its position on the screen, the directions of keys, the layouts and the score."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, 
 
     Args:
         controller: INCONGRUENT or CONGRUENT, `[*B]`.
-        keymap: 1 or 2, `[*B]`; only the incongruent controller depends on it.
+        keymap: 1 or 2, `[*B]`. Only the incongruent controller depends on it.
         key: 0, 1 or 2, `[*B]`.
     """
-    # Arithmetic instead of the table, because a gather keeps the compiled step from being vectorised. The incongruent
-    # boat's directions are the opposite of the congruent ones, in another order of keys.
+    # Use arithmetic instead of the table, because a gather keeps the compiled step from being vectorised. The
+    # incongruent boat's directions are opposite to the congruent ones, in another order of keys.
     reordered = torch.where(keymap == 1, torch.where(key == 0, 0, 3 - key), torch.where(key == 2, 2, 1 - key))
     congruent = controller == CONGRUENT
     column = torch.where(congruent, key, reordered)
@@ -54,20 +54,23 @@ def direction(controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, 
 
 
 def direction_of(rules: Rules, controller: Tensor, keymap: Tensor, key: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the unit direction (x, y) of a key, each `[*B]` float32; arguments as for `direction`."""
+    """Return the unit direction (x, y) of a key with the boats of these rules, each `[*B]` float32.
+
+    The other arguments are those of `direction`.
+    """
     if rules.boats is None:
         return direction(controller, keymap, key)
     row = controller * NUM_KEYS + key
     every = [each for keys in rules.boats.directions for each in keys]
     x, y = (torch.full(row.shape, each, device=row.device, dtype=torch.float32) for each in every[0])
-    # No gather, as above.
+    # As in `direction`, there is no gather.
     for number, (key_x, key_y) in enumerate(every[1:], start=1):
         x, y = torch.where(row == number, key_x, x), torch.where(row == number, key_y, y)
     return x, y
 
 
 class Layout(NamedTuple):
-    """Where an episode starts and docks, px from the harbour's centre, every field `[*B]`."""
+    """Start and goal of an episode, px from the harbour's centre, every field `[*B]`."""
 
     start_x: Tensor
     start_y: Tensor
@@ -76,14 +79,15 @@ class Layout(NamedTuple):
 
 
 def sample_layout(rng: counter_rng.RngKey) -> Layout:
-    """Sample start and goal uniformly in the disc, again while they are less than MIN_SEPARATION apart.
+    """Sample start and goal uniformly in the disc, at least MIN_SEPARATION apart.
 
-    A try samples the two squared radii and the angle between the points: the distance depends on nothing else. The
-    angle of the pair as a whole is sampled last. After four tries 2 in 100,000 layouts are still too close; these get
-    their goal on the far side of the centre, which avoids a loop that depends on the data.
+    Points that are too close are sampled again. A try samples the two squared radii and the angle between the points,
+    because the distance depends on nothing else. The angle of the pair as a whole is sampled last. After four tries, 2
+    in 100,000 layouts are still too close. Their goal is put on the far side of the centre, which avoids a loop that
+    depends on the data.
 
     Args:
-        rng: `[*B]` from `counter_rng.rng_key`.
+        rng: random-number keys `[*B]` from `counter_rng.rng_key`.
     """
 
     def attempt(first_index: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -97,8 +101,8 @@ def sample_layout(rng: counter_rng.RngKey) -> Layout:
         squared = start + goal - 2.0 * (start * goal).sqrt() * turn.cos()
         return squared < (MIN_SEPARATION / LAYOUT_RADIUS) ** 2
 
-    # Each try is judged on its own. From the last to the first, each replaces what came after it unless it is too near,
-    # so that the first good try remains.
+    # Go from the last try to the first. Each try replaces the later ones unless it is too near, so the first good try
+    # remains.
     tries = [attempt(3 * i) for i in range(LAYOUT_TRIES)]
     near = [is_near(*each) for each in tries]
     start, goal, turn = tries[-1]
@@ -127,14 +131,14 @@ def separation(layout: Layout) -> Tensor:
 
 
 def fixed_layouts(num: int, seed: int) -> Layout:
-    """Return `num` layouts for evaluation; training meets none of them, since they come from a stream of their own."""
+    """Return `num` layouts for evaluation. They have their own random stream, so training never uses them."""
     rows = torch.arange(num, dtype=torch.int32)
     episode = torch.zeros(num, dtype=torch.int32)
     return sample_layout(counter_rng.rng_key(counter_rng.seed_tensor(seed), counter_rng.EVALUATION, rows, episode))
 
 
 def bearing_offset(layout: Layout) -> Tensor:
-    """Return the degrees, in [0, 60], between the goal's bearing and the nearest congruent direction, `[*B]`."""
+    """Return the degrees (0 to 60) between the goal's bearing and the nearest congruent direction, `[*B]`."""
     bearing = torch.rad2deg(torch.atan2(layout.goal_y - layout.start_y, layout.goal_x - layout.start_x))
     # The congruent directions lie at 30, 150 and 270 degrees (y down), 120 apart.
     return ((bearing - 30.0 + 60.0) % 120.0 - 60.0).abs()
@@ -146,7 +150,7 @@ def score(outcome: Tensor, fuel: Tensor) -> Tensor:
 
 
 def score_of(is_success: Tensor, fuel: Tensor) -> Tensor:
-    """Return the score `[*B]` of episodes that succeed or fail with this fraction of fuel left."""
+    """Return the score `[*B]` of episodes that succeeded or failed with this fraction of fuel left."""
     return torch.where(is_success, SUCCESS_REWARD * fuel, FAILURE_REWARD)
 
 

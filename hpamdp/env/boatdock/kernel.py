@@ -1,9 +1,11 @@
 """The boats' rules for one row, and the loops over all rows that Numba compiles: a step, a reset, a reading.
 
-They state what `physics`, `harbour` and `episode` say of columns, for the CPU alone and without gradients; the tests
-compare the two. Rows are taken through a step in blocks that stay in the processor's cache. What is the same for all
-rows of a block stands in loops without branches, which become vector instructions: hence conditions as values, and one
-flat scratch array, in which the compiler sees that two columns never overlap.
+These are the rules of `physics`, `harbour` and `episode`, for the CPU alone and without gradients. The tests compare
+the two.
+
+Rows pass through a step in blocks that stay in the processor's cache. The loops over a block have no branches, so the
+compiler turns them into vector instructions. That is why conditions are values, and why the columns lie in one flat
+scratch array, where the compiler sees that two columns never overlap.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ from hpamdp.env.kernels import (
 START_X, START_Y, GOAL_X, GOAL_Y, X, Y, VELOCITY_X, VELOCITY_Y, FUEL = range(9)
 CONTROLLER, KEYMAP, PRESSES, OUTCOME, EPISODE = range(5)
 
-# Places of the boats' own settings, float64.
+# Places of the boats' own settings in the float64 array of settings.
 (
     SET_CONTROLLER,
     SET_KEYMAP,
@@ -59,9 +61,10 @@ CONTROLLER, KEYMAP, PRESSES, OUTCOME, EPISODE = range(5)
     SWITCH_COST,
 ) = range(OWN, OWN + 9)
 FIRST_BOAT = OWN + 9
-# From there on each boat has its motor noise and, unless the directions follow from the key map, x and y of each key.
+# From FIRST_BOAT on, each boat has its motor noise and then x and y of each key. If HAS_KEYMAPS is set, the directions
+# follow from the key map instead.
 NUM_BOAT_SETTINGS = 7
-RANDOM = -2  # of SET_CONTROLLER and SET_KEYMAP
+RANDOM = -2  # value of SET_CONTROLLER and SET_KEYMAP
 
 _BLOCK = 128
 
@@ -69,8 +72,8 @@ _BLOCK = 128
 _DURATION, _REWARD, _SEEN = 9, 10, 11
 _DIR_X, _DIR_Y = _SEEN, _SEEN + 1
 _NUM_FLOATS = 27
-# Columns of the int32 scratch: the state's five, the key, the option, whether the row moves, whether it starts anew,
-# the bits of its episode's key, and whether a try at a layout was too near.
+# Columns of the int32 scratch: the state's five, the key, the option, whether the row moves, whether it restarts, the
+# bits of its episode's random-number key, and whether the last try at a layout was too near.
 _KEY, _OPTION, _MOVES, _IS_NEW, _BITS, _IS_NEAR = 5, 6, 7, 8, 9, 10
 _NUM_INTEGERS = 11
 
@@ -89,7 +92,7 @@ _SUCCESS, _FAILURE = _F(task.SUCCESS_REWARD), _F(task.FAILURE_REWARD)
 _LENGTH, _SPEED = _F(1.0 / task.HARBOUR_RADIUS), _F(1.0 / task.SPEED_SCALE)
 _CENTRE_X, _CENTRE_Y = _F(task.CENTRE[0]), _F(task.CENTRE[1])
 _PI, _QUARTER, _THREE = _F(math.pi), _F(0.25), _F(3.0)
-# A third of the bits of a float, plus this, are about those of its cube root.
+# A third of a float's bits plus this constant are approximately the bits of its cube root.
 _ROOT_BITS = np.int32(709921077)
 
 
@@ -105,7 +108,7 @@ def _pressed_distance(duration: Any) -> Any:
 
 @inlined
 def _duration_for(distance: Any) -> Any:
-    """Invert the distance by Newton's method, from a rough root that Halley's method refines."""
+    """Invert the distance by Newton's method. It starts from a rough cube root, refined by Halley's method."""
     cubed = np.float32(_F(0.03) * distance + _F(1e-12))
     root = np.int32(cubed.view(np.int32) // np.int32(3) + _ROOT_BITS).view(np.float32)
     power = root * root * root
@@ -124,7 +127,7 @@ def _length(x: Any, y: Any) -> Any:
 
 @inlined
 def _press(x: Any, y: Any, fuel: Any, goal_x: Any, goal_y: Any, dir_x: Any, dir_y: Any, duration: Any) -> Any:
-    """Return x, y, fuel, speed and outcome after a press: `physics.press` for one boat."""
+    """Return x, y, fuel, speed and outcome after a press, as `physics.press` does for columns."""
     duration = min(duration, fuel)
     pressed = _pressed_distance(duration)
     total = _TOTAL * pressed
@@ -152,7 +155,7 @@ def _press(x: Any, y: Any, fuel: Any, goal_x: Any, goal_y: Any, dir_x: Any, dir_
 
 @inlined
 def _direction(controller: Any, keymap: Any, key: Any) -> Any:
-    """Return the unit direction of a key: `harbour.direction` for one boat."""
+    """Return the unit direction of a key, as `harbour.direction` does for columns."""
     first = int32(0) if key == 0 else int32(3 - key)
     second = int32(2) if key == 2 else int32(1 - key)
     reordered = first if keymap == 1 else second
@@ -164,7 +167,7 @@ def _direction(controller: Any, keymap: Any, key: Any) -> Any:
 
 @inlined
 def _attempt(bits: Any, step: Any, first: Any) -> Any:
-    """Return both squared radii, the angle between start and goal, and whether they are too near."""
+    """Return the squared radii of start and goal, the angle between them, and whether they are too near."""
     start, goal = uniform(bits, step, first), uniform(bits, step, first + 1)
     turn = TURN * uniform(bits, step, first + 2)
     return start, goal, turn, start + goal - TWO * math.sqrt(start * goal) * sin_cos(turn)[1] < _NEAR
@@ -185,7 +188,7 @@ def _load(floats: Any, integers: Any, mask: Any, first: Any, count: Any, scratch
 
 @part
 def _mark_over(count: Any, numbers: Any) -> None:
-    """Mark the rows whose episode is over to start anew."""
+    """Mark the rows whose episode is over for a restart."""
     for j in range(count):
         numbers[_IS_NEW * _BLOCK + j] = int32(numbers[OUTCOME * _BLOCK + j] != task.SAILING)
 
@@ -196,7 +199,7 @@ def _load_actions(
 ) -> None:
     last_boat = int32(settings[NUM_BOATS] - 1.0)
     for j in range(count):
-        # An action that is ignored may have any key and option.
+        # Clip keys and options, because ignored actions may have any value.
         row = unsigned(first + j)
         pressed = int32(min(max(key[row], 0), task.NUM_KEYS - 1))
         numbers[_KEY * _BLOCK + j] = pressed
@@ -225,7 +228,7 @@ def _has_motor_noise(settings: Any) -> Any:
 
 @part
 def _switch(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Change boats where the option is another one, for the fuel that it costs."""
+    """Change to the option's boat if another one is held, and take the fuel that the change costs."""
     cost = _F(settings[SWITCH_COST])
     for j in range(count):
         held, option = numbers[CONTROLLER * _BLOCK + j], numbers[_OPTION * _BLOCK + j]
@@ -237,14 +240,14 @@ def _switch(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
 
 @inlined
 def _controller(numbers: Any, j: Any) -> Any:
-    """Return the held controller of a row, or the chosen one where it holds none."""
+    """Return the held controller of a row, or the chosen one if the row holds none."""
     held = numbers[CONTROLLER * _BLOCK + j]
     return numbers[_OPTION * _BLOCK + j] if held == task.NOT_CHOSEN else held
 
 
 @part
 def _aim(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Write the directions of the keys to two columns that are free at this moment."""
+    """Write the directions of the keys to two columns of the scratch that are free at this point."""
     if settings[HAS_KEYMAPS] != 0.0:
         for j in range(count):
             dir_x, dir_y = _direction(_controller(numbers, j), numbers[KEYMAP * _BLOCK + j], numbers[_KEY * _BLOCK + j])
@@ -257,7 +260,7 @@ def _aim(count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
 
 @part
 def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Let keys slip and durations vary, as `episode` does."""
+    """Apply slips of keys and motor noise, as `episode.act` does."""
     base = stream_hash(settings[SEED], int32(settings[NOISE_STREAM]))
     step = stream_step(int32(settings[NOISE_STREAM]))
     slip = _F(settings[SLIP_CHANCE])
@@ -277,7 +280,7 @@ def _disturb(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
 
 @part
 def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, rewards: Any) -> None:
-    """Press a key in every row that moves: `episode.act`."""
+    """Press a key in every row that moves, as `episode.act` does."""
     is_sparse = settings[IS_SPARSE] != 0.0
     for j in range(count):
         x, y, fuel = scratch[X * _BLOCK + j], scratch[Y * _BLOCK + j], scratch[FUEL * _BLOCK + j]
@@ -316,11 +319,11 @@ def _press_block(first: Any, count: Any, scratch: Any, numbers: Any, settings: A
 
 @part
 def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Start new episodes in the marked rows of a block: `episode.start` and `harbour.sample_layout`."""
+    """Start new episodes in the marked rows of a block, as `episode.start` and `harbour.sample_layout` do."""
     base = stream_hash(settings[SEED], int32(settings[EPISODE_STREAM]))
     step = stream_step(int32(settings[EPISODE_STREAM]))
     first_env = int32(settings[FIRST_ENV]) + int32(first)
-    start_at, goal_at, turn_at = _SEEN * _BLOCK, (_SEEN + 1) * _BLOCK, (_SEEN + 2) * _BLOCK  # free at this moment
+    start_at, goal_at, turn_at = _SEEN * _BLOCK, (_SEEN + 1) * _BLOCK, (_SEEN + 2) * _BLOCK  # free at this point
     is_any = 0
     for j in range(count):
         is_any |= numbers[_IS_NEW * _BLOCK + j]
@@ -338,7 +341,7 @@ def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
                 start, goal, turn, is_near = _attempt(numbers[_BITS * _BLOCK + j], step, 3 * attempt)
                 if not is_near:
                     break
-                goal, turn = _QUARTER, _PI  # after the last try the goal lies on the far side of the centre
+                goal, turn = _QUARTER, _PI  # if the last try fails, the goal lies on the far side of the centre
             scratch[start_at + j], scratch[goal_at + j], scratch[turn_at + j] = start, goal, turn
     chosen, keymap = int32(settings[SET_CONTROLLER]), int32(settings[SET_KEYMAP])
     num_boats, last_boat = _F(settings[NUM_BOATS]), int32(settings[NUM_BOATS] - 1.0)
@@ -379,7 +382,7 @@ def _restart(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) 
 
 @part
 def _add_sensor_noise(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any) -> None:
-    """Write the six coordinates as noisy sensors see them to the first columns of the observation."""
+    """Write the six coordinates with sensor noise to the first columns of the observation."""
     deviation = _F(settings[SENSOR_NOISE])
     base = stream_hash(settings[SEED], int32(settings[NOISE_STREAM]))
     step = stream_step(int32(settings[NOISE_STREAM]))
@@ -393,8 +396,8 @@ def _add_sensor_noise(first: Any, count: Any, scratch: Any, numbers: Any, settin
 
 @part
 def _observe(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, observation: Any) -> None:
-    """Write what is observed of the rows of a block: `episode.observe`."""
-    # The six coordinates are the first columns of the state and, where the sensors are noisy, of the observation.
+    """Write the observations of a block, as `episode.observe` does."""
+    # The six coordinates are read from the first columns of the state or, if the sensors are noisy, of the observation.
     seen = 0
     if settings[SENSOR_NOISE] > 0.0:
         _add_sensor_noise(first, count, scratch, numbers, settings)
@@ -435,7 +438,7 @@ def _observe(first: Any, count: Any, scratch: Any, numbers: Any, settings: Any, 
 
 @part
 def _report(first: Any, count: Any, scratch: Any, numbers: Any, outcomes: Any, fuel: Any, flags: Any) -> None:
-    """Write outcomes, fractions of fuel and whether episodes are done, terminated and truncated."""
+    """Write outcomes, fractions of fuel, and the flags done, terminated and truncated."""
     for j in range(count):
         row, outcome = unsigned(first + j), numbers[OUTCOME * _BLOCK + j]
         outcomes[row] = outcome
@@ -465,7 +468,10 @@ def advance(
     flags: Any,
     rewards: Any,
 ) -> int:
-    """Press or restart in every row, in place; see `hpamdp.env.kernel_rows`. The one entry is the fraction of fuel."""
+    """Press or restart in every row, in place.
+
+    `hpamdp.env.kernel_rows` explains the arguments. The only entry is the fraction of fuel.
+    """
     invalid = invalid_row(option, discrete, parameters, places, integers, settings, mode)
     if invalid >= 0:
         return invalid

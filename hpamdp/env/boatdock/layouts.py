@@ -1,4 +1,4 @@
-"""Layouts that a user gives."""
+"""Checks of layouts that a user passes to `reset`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ def layout_columns(given: Mapping[str, np.ndarray], num_envs: int, rules: Rules)
 
     Args:
         given: `start` and `goal` `[N, 2]` in screen px and, optionally, `controller` and `keymap` `[N]`.
-        num_envs: N.
-        rules: of the environment; where the agent chooses the controller, the layout may not.
+        num_envs: number of environments N.
+        rules: rules of the environment. If the agent chooses the controller, the layout must not contain one.
 
     Raises:
-        ValueError: an entry has another shape or a value that is not allowed.
+        ValueError: an entry has the wrong shape or an invalid value.
     """
     points = {}
     for name in ("start", "goal"):

@@ -1,12 +1,15 @@
-"""Boats with NumPy in and out: Gymnasium's spaces, and the checks between its actions and the boats.
+"""Boats with NumPy in and out: Gymnasium's spaces, and the checks of its actions.
 
-Formats of an action, for one boat (batched spaces are Gymnasium's own: every leaf has a leading `[N]`):
+An action of one boat has one of two formats. In batched spaces every leaf has a leading `[N]`, as is usual in
+Gymnasium.
 
-- `dict`: `{"key": 0 to 2, "duration": [3] seconds in [0, 2]}`, a duration for each key, of which only the pressed
-  key's counts; with `controller="choose"` also `"option": 0 (incongruent) or 1 (congruent)`, or the number in `boats`,
-  which is read at an episode's first press and, with a `switch_cost`, at every one.
-- `tuple`, the field's convention: `(key, (seconds [1], seconds [1], seconds [1]))`; with `controller="choose"` the
-  option comes first: `(option, key, (...))`.
+- `dict`: `{"key": 0 to 2, "duration": [3] seconds in [0, 2]}`. There is a duration for each key, and only the pressed
+  key's duration counts.
+- `tuple`, the field's convention: `(key, (seconds [1], seconds [1], seconds [1]))`.
+
+With `controller="choose"` an action also has an option: 0 (incongruent) or 1 (congruent), or the number of a boat in
+`boats`. In a dict it is the entry `"option"`. In a tuple it comes first: `(option, key, (...))`. It is read at an
+episode's first press. With a `switch_cost` it is read at every press.
 """
 
 from __future__ import annotations
@@ -28,12 +31,12 @@ ActionFormat = Literal["dict", "tuple"]
 _TANK = np.float32(task.TANK)
 _OUTCOME_NAMES = np.array(task.OUTCOMES, dtype=object)
 _OPTION_SHAPES = {"start": (2,), "goal": (2,), "controller": (), "keymap": ()}
-# Gaussian numbers that are made from 23-bit uniform ones stay within 5.8 standard deviations.
+# Gaussian numbers from 23-bit uniform ones stay within 5.8 standard deviations.
 _LARGEST_NORMAL = 6.0
 
 
 def action_space(rules: Rules, action_format: ActionFormat) -> spaces.Dict | spaces.Tuple:
-    """Return the action space of one boat; see the module's docstring."""
+    """Return the action space of one boat. The module's docstring explains the formats."""
     has_choice = rules.controller == "choose"
     option = spaces.Discrete(len(rules.names))
     key = spaces.Discrete(task.NUM_KEYS)
@@ -48,17 +51,17 @@ def action_space(rules: Rules, action_format: ActionFormat) -> spaces.Dict | spa
 
 
 def observation_space(rules: Rules) -> spaces.Box:
-    """Return the observation space of one boat: float32, bounded by what layouts, motion and noise can reach."""
+    """Return the observation space of one boat, float32, with the bounds that layouts, motion and noise can reach."""
     is_pixels = rules.observation == "pixels"
     unit = 1.0 if is_pixels else 1.0 / task.HARBOUR_RADIUS
     top_speed = 1.01 * (task.SPEED_SCALE if is_pixels else 1.0)
-    # One px more than the geometry allows, for rounding.
+    # The extra px allows for rounding.
     reach = task.HARBOUR_RADIUS + 1.0 + _LARGEST_NORMAL * rules.sensor_noise
     bounds = {
         "radius": (0.0, 2.0 * task.HARBOUR_RADIUS * unit),
         "controller": (-1.0, len(rules.names) - 1.0),
         "fuel": (0.0, 1.0),
-        # In units of the distance at the start, which counts as at least the radius of the dock.
+        # The unit is the distance at the start, which counts as at least the radius of the dock.
         "distance": (0.0, 2.0 * 2.0**0.5 * reach / task.DOCK_RADIUS),
     }
     for axis, centre in zip("xy", task.CENTRE if is_pixels else (0.0, 0.0), strict=True):
@@ -71,7 +74,7 @@ def observation_space(rules: Rules) -> spaces.Box:
 
 
 def boat_rows(num_boats: int, rules: Rules) -> KernelRows:
-    """Return boats that the kernel moves."""
+    """Return the rows of boats, moved by the kernel."""
     has_choice = rules.controller == "choose"
     return KernelRows(
         kernel.advance,
@@ -85,13 +88,13 @@ def boat_rows(num_boats: int, rules: Rules) -> KernelRows:
 
 
 class NumpyBoats(NumpyRows):
-    """Boats with NumPy in and out: one (`batch=()`) or many (`batch=(N,)`).
+    """One boat or many, with NumPy in and out.
 
     Args:
-        rules: of the environment.
-        batch: see above.
+        rules: rules of the environment.
+        batch: `()` for one boat, `(N,)` for N boats.
         action_format: `dict` or `tuple`.
-        make_rows: returns what moves the boats; the kernel by default.
+        make_rows: function that returns the rows of boats. If None, `boat_rows`.
     """
 
     final_infos = ("score",)
@@ -119,7 +122,7 @@ class NumpyBoats(NumpyRows):
 
     @property
     def state(self) -> BoatState:
-        """The boats as they are."""
+        """A copy of the boats' state."""
         return BoatState(*self.rows.floats.copy(), *self.rows.integers.copy())
 
     def _invalid(self, row: int, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> ValueError:
@@ -134,7 +137,7 @@ class NumpyBoats(NumpyRows):
         )
 
     def infos(self) -> dict[str, np.ndarray]:
-        """Return the infos, `[N]` each; `score` is meaningless where the episode is not over."""
+        """Return the infos, `[N]` each. `score` has a meaning only if the episode is over."""
         integers = self.rows.integers
         fuel = (self.rows.floats[kernel.FUEL] / _TANK).astype(np.float64)
         outcome = integers[kernel.OUTCOME]
@@ -147,7 +150,7 @@ class NumpyBoats(NumpyRows):
         }
 
     def info(self) -> dict[str, Any]:
-        """Return the infos of the first boat as Python's numbers."""
+        """Return the infos of the first boat as Python numbers."""
         controller, _, presses, outcome, _ = self.rows.integers[:, 0].tolist()
         fuel = float(self.rows.floats[kernel.FUEL, 0] / _TANK)
         values = {"outcome": task.OUTCOMES[outcome], "fuel": fuel, "presses": presses, "controller": controller}
@@ -187,7 +190,7 @@ class NumpyBoats(NumpyRows):
         return option, self._integers("key", action["key"]), durations
 
     def _named(self, action: Any) -> dict[str, Any]:
-        """Return an action of nested tuples by the names of its leaves."""
+        """Return a tuple action as a dict of its leaves."""
         if not isinstance(action, (tuple, list)) or len(action) != len(self._leaf_names):
             names = ", ".join(self._leaf_names)
             raise ValueError(f"step: the action must be a tuple ({names}), but is {describe(action)}")

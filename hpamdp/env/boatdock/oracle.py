@@ -1,4 +1,4 @@
-"""The oracle of an environment: the better controller of each boat and each controller's next press, by the planner."""
+"""The oracle of an environment: the planner's best controller, and its next press with each controller."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hpamdp.env.boatdock.task import BoatState, Rules
 
 
 def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
-    """Return the spec of what `BoatDockOracle.read` returns."""
+    """Return the spec of the entries that `BoatDockOracle.read` returns."""
     shape = (num_envs, _num_plans(rules))
     return Composite(
         option=Categorical(len(rules.names), shape=(num_envs,), device=device),
@@ -25,23 +25,23 @@ def oracle_spec(num_envs: int, rules: Rules, device: torch.device) -> Composite:
 
 
 def _num_plans(rules: Rules) -> int:
-    """Return how many plans each boat has: one for each controller that it may get."""
+    """Return the number of plans per environment: one for each controller that the agent may choose."""
     return len(rules.names) if rules.controller == "choose" else 1
 
 
 class BoatDockOracle:
     """Keep the best plan of every option, made at the start of an episode.
 
-    With noise or a `switch_cost` it is made again before every press.
+    With noise or a `switch_cost`, the plans are made again before every press.
 
     Args:
         num_envs: number of boats.
-        rules: of the environment.
-        device: of the tensors.
+        rules: rules of the environment.
+        device: device of the tensors.
 
     Attributes:
-        option: the better controller, int64 `[N]`.
-        keys, durations: of the planned presses, `[N, num_plans, MAX_PRESSES]`.
+        option: the best controller, int64 `[N]`.
+        keys, durations: keys and durations of the planned presses, `[N, num_plans, MAX_PRESSES]`.
     """
 
     def __init__(self, num_envs: int, rules: Rules, device: torch.device) -> None:
@@ -52,16 +52,16 @@ class BoatDockOracle:
         self.durations = torch.zeros(shape, device=device, dtype=torch.float32)
 
     def plans(self) -> dict[str, Tensor]:
-        """Return the attributes for a checkpoint: a plan is made at the start of its episode."""
+        """Return the plans for a checkpoint. They are made only at the start of an episode."""
         return {"option": self.option, "keys": self.keys, "durations": self.durations}
 
     def set_plans(self, plans: Mapping[str, Tensor]) -> None:
-        """Continue with what `plans` returned."""
+        """Restore the result of `plans`."""
         for name, plan in plans.items():
             getattr(self, name).copy_(plan)
 
     def plan(self, state: BoatState, rows: Tensor) -> None:
-        """Plan for the boats of `rows` bool `[N]` from where they are."""
+        """Plan for the boats of `rows`, bool `[N]`, from their current positions."""
         boats = BoatState(*(column[rows] for column in state))
         plans = planner.plans_of_options(self.rules, boats)
         self.option[rows] = planner.better_option(plans)
@@ -71,7 +71,7 @@ class BoatDockOracle:
     def read(self, state: BoatState) -> TensorDict:
         """Return `option` `[N]` and the next press of each plan, `discrete` and `parameters` `[N, num_plans]`."""
         num_presses = state.presses.long()  # since the plan was made
-        # With a cost of changing boats, the plans of the other boats are no longer those from the start.
+        # Plan again if noise has moved the boat, or if changing boats takes fuel, which alters the other boats' plans.
         if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
             num_presses = torch.zeros_like(num_presses)

@@ -1,13 +1,14 @@
 """The boat's motion: one press of a key in closed form, on batches of columns.
 
-Units: pixels, seconds, pixels a second; screen axes (y points down). Positions are relative to the harbour's centre,
-which keeps float32 exact to about 1e-5 px. Every function is pure, takes and returns tensors of one shape `[*B]`, and
-has no Python loop over environments and no branch that depends on the data: the same code runs on CPU and CUDA, eager
-and compiled.
+Units are pixels, seconds and pixels per second. Axes are those of the screen (y points down). Positions are relative to
+the harbour's centre, which keeps float32 exact to about 1e-5 px.
 
-A press of x seconds accelerates the boat from rest along the key's direction; then the boat glides to rest along the
-same speed curve run backwards, stretched by GLIDE. The path is a straight segment, so the first crossing of the dock
-circle and of the harbour circle, and the speed there, have closed forms.
+Every function is pure, and takes and returns tensors of one shape `[*B]`. It has no Python loop over environments and
+no branch that depends on the data. So the same code runs on CPU and CUDA, eager and compiled.
+
+A press accelerates the boat from rest along the key's direction. Then the boat glides to rest: its speed runs back down
+the same curve, stretched in time by GLIDE. The path is a straight segment. So closed forms give the first crossing of
+the dock circle and of the harbour circle, and the speed there.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from hpamdp.env.boatdock.task import (
 
 
 class Press(NamedTuple):
-    """The result of one press, every field `[*B]`; see `press`."""
+    """The result of `press`, every field `[*B]`."""
 
     x: Tensor
     y: Tensor
@@ -52,20 +53,20 @@ def pressed_distance(duration: Tensor) -> Tensor:
 
 
 def total_distance(duration: Tensor) -> Tensor:
-    """Return the distance (px) that a press of `duration` seconds covers from rest to rest, with its glide."""
+    """Return the distance (px) that a press of `duration` seconds covers from rest to rest, including the glide."""
     return (1.0 + GLIDE) * pressed_distance(duration)
 
 
 def duration_for(distance: Tensor) -> Tensor:
     """Return the seconds of pressing that cover `distance` px while the key is down: the inverse of P.
 
-    Newton's method, started at the root of the cubic term with a first-order correction for the quartic one, which
-    changes the root by under 4 % on [0, 2] s. P is increasing and convex there, and three steps reach float32
-    accuracy. Negative distances count as 0.
+    Newton's method starts at the root of the cubic term, with a first-order correction for the quartic term. That
+    correction changes the root by under 4 % on [0, 2] s. P is increasing and convex there, and three steps reach
+    float32 accuracy. Negative distances count as 0.
     """
     distance = distance.clamp(min=0.0)
     # The offset keeps the root's slope and the division finite at 0. It changes the result by up to 1e-4 s, and only
-    # where the distance is under 1e-10 px.
+    # if the distance is under 1e-10 px.
     root = ((3.0 / 100.0) * distance + 1e-12) ** (1.0 / 3.0)
     duration = root * (1.0 + root / 60.0)
     for _ in range(3):
@@ -81,7 +82,7 @@ def press_for(distance: Tensor) -> Tensor:
 def distance_at(duration: Tensor, elapsed: Tensor) -> Tensor:
     """Return the distance (px) covered `elapsed` seconds after the beginning of a press of `duration` seconds."""
     pressed = pressed_distance(torch.minimum(elapsed, duration).clamp(min=0.0))
-    # The glide runs back down the speed curve; this is the press time that would give the speed at that moment.
+    # The glide runs back down the speed curve. `virtual` is the press time that would give the speed at that moment.
     virtual = (duration - (elapsed - duration).clamp(min=0.0) / GLIDE).clamp(min=0.0)
     return torch.where(elapsed > duration, pressed + GLIDE * (pressed - pressed_distance(virtual)), pressed)
 
@@ -89,7 +90,7 @@ def distance_at(duration: Tensor, elapsed: Tensor) -> Tensor:
 def time_at(duration: Tensor, distance: Tensor) -> Tensor:
     """Return the seconds until a press of `duration` seconds has covered `distance` px: the inverse of `distance_at`.
 
-    Where the boat comes to rest before, it is the time at which it does.
+    If the boat comes to rest before, return the time at which it does.
     """
     pressed = pressed_distance(duration)
     virtual = torch.minimum(duration_for(pressed - (distance - pressed) / GLIDE), duration)
@@ -98,12 +99,12 @@ def time_at(duration: Tensor, distance: Tensor) -> Tensor:
 
 
 def distance_to_dock(x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, dir_x: Tensor, dir_y: Tensor) -> Tensor:
-    """Return the distance (px) along the course to the dock circle; `inf` where the course misses it."""
+    """Return the distance (px) along the course to the dock circle, or `inf` if the course misses the circle."""
     ahead = (goal_x - x) * dir_x + (goal_y - y) * dir_y
     aside = (goal_x - x) * dir_y - (goal_y - y) * dir_x
     half_chord_squared = DOCK_RADIUS**2 - aside * aside
     entry = ahead - half_chord_squared.clamp(min=0.0).sqrt()
-    # Clamped: a boat that rounding has put just inside the circle meets it at once.
+    # The clamp serves boats that rounding has put just inside the circle: they meet it at once.
     return torch.where((half_chord_squared >= 0.0) & (ahead > 0.0), entry.clamp(min=0.0), torch.inf)
 
 
@@ -124,11 +125,12 @@ def press(
         fuel: seconds of pressing left in the tank, `[*B]`.
         goal_x, goal_y: centre of the dock, px from the harbour's centre, `[*B]`.
         dir_x, dir_y: unit direction of the key, `[*B]`.
-        duration: seconds in [0, MAX_DURATION], `[*B]`; cut short when the tank is empty.
+        duration: seconds in [0, MAX_DURATION], `[*B]`. The press ends early if the tank is empty.
 
     Returns:
-        The position at the event or at rest, the fuel left (s), the speed (px/s) when the acceleration ended (by the
-        key's release, an empty tank or the event) and the outcome (int32; SAILING at rest with fuel left).
+        The position at the event or at rest, the fuel left (s), the speed (px/s) at the end of the acceleration, and
+        the outcome (int32). The acceleration ends with the key's release, an empty tank or the event. A boat at rest
+        with fuel left is SAILING.
     """
     duration = torch.minimum(duration, fuel)
     pressed = pressed_distance(duration)
@@ -139,7 +141,8 @@ def press(
     leaves = (to_harbour < total) & ~docks
     travelled = torch.where(docks, to_dock, torch.where(leaves, to_harbour, total))
 
-    # The time on the speed curve: it grows to `duration` while the key is down and runs back to 0 in the glide.
+    # `virtual` is the time on the speed curve. It grows to `duration` while the key is down, and falls back to 0 in the
+    # glide.
     in_glide = travelled > pressed
     virtual = duration_for(torch.where(in_glide, (total - travelled) / GLIDE, travelled))
     virtual = torch.minimum(virtual, duration)

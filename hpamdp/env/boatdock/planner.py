@@ -1,18 +1,20 @@
-"""The ceiling: for each boat the plan of up to three presses that docks with the most fuel left, without noise.
+"""The ceiling: for each boat, the plan of up to three presses that docks with the most fuel left, without noise.
 
-The distance grows with the cube of the pressing time, so the seconds are concave in the lengths of the legs:
-- The last press is the shortest one that reaches the dock: its glide ends on the dock circle.
-- Consecutive presses use different keys: one long leg takes fewer seconds than the same course in two legs.
+The distance grows with the cube of the pressing time, so the seconds are concave in the lengths of the legs. Three
+facts follow:
+- The last press is the shortest one that reaches the dock. Its glide ends on the dock circle.
+- Consecutive presses use different keys. One long leg takes fewer seconds than the same course in two legs.
 - Detours are expensive, so the best plan has as few legs as harbour and dock allow: mostly two, and never four.
 
-This leaves the lengths of the first two of three legs to search for. A leg of length 0 is no press, so the same search
-covers the plans of one and two presses. A coarse grid over every sequence of keys finds the local minima, and shrinking
-grids around the best of them find the optimum. Because of the concavity most optima of three presses lie on the border
-of the feasible region (a leg that ends just short of harbour or dock), so the grid includes the borders and is denser
-there.
+This leaves two numbers to search for: the lengths of the first two of three legs. A leg of length 0 is no press, so the
+same search covers plans of one and two presses. A coarse grid over every sequence of keys finds the local minima.
+Shrinking grids around the best of them find the optimum.
 
-The same search serves other boats, and boats that may be changed before a press for some fuel: it then goes over the
-sequences of boats and keys, and adds what their changes cost.
+Because of the concavity, most optima of three presses lie on the border of the feasible region: a leg ends just short
+of harbour or dock. So the grid includes the borders and is denser there.
+
+The same search serves other boats, and agents that may change boats before a press for some fuel. It then covers the
+sequences of boats and keys, and adds the costs of the changes.
 """
 
 from __future__ import annotations
@@ -49,11 +51,12 @@ from hpamdp.env.boatdock.task import CONTROLLER_DEGREES, NOT_CHOSEN, Boats, Boat
 MAX_PRESSES = 3
 
 # Margins (px) that keep rounding from changing an outcome when a plan is replayed. Rounding moves a boat by about 1e-5
-# px, and its contact with the dock by 50 times that on a course that nearly misses it.
+# px. On a course that nearly misses the dock, it moves the point of contact by 50 times as much.
 _CLEARANCE = 0.01  # of all legs from harbour circle and dock, and of the last course from missing the dock
 _OVERSHOOT = 0.002  # by which the last press reaches into the dock
 
-# Sequences of three keys of which no two in a row are equal. No leg inside the harbour takes MAX_DURATION.
+# Sequences of three keys without equal neighbours. Repeating a key is never needed: no leg inside the harbour takes
+# MAX_DURATION.
 _SEQUENCES = [
     (first, second, last)
     for first in range(NUM_KEYS)
@@ -67,7 +70,7 @@ _MINIMA = 2  # local minima that are refined, for each sequence of keys
 _ZOOM_GRID = 5  # points along each side of the shrinking grids
 _ZOOM_ROUNDS = 14
 _ZOOM = 0.6  # factor by which they shrink each round
-_CHUNK = 64  # boats that are searched together: bounds the memory, and fits the cache
+_CHUNK = 64  # number of boats searched together, which bounds the memory and fits the cache
 
 
 class Plan(NamedTuple):
@@ -75,12 +78,12 @@ class Plan(NamedTuple):
 
     keys: Tensor  # [*B, 3] int64, 0 past the plan's end
     durations: Tensor  # [*B, 3] float32, seconds, 0 past the plan's end
-    num_presses: Tensor  # [*B] int64, 0 where no plan docks
-    score: Tensor  # [*B] float32, 5 x the fuel left (fraction of a tank) after docking, -1 where no plan docks
+    num_presses: Tensor  # [*B] int64, 0 if no plan docks
+    score: Tensor  # [*B] float32, 5 x the fuel left (fraction of a tank) after docking, -1 if no plan docks
 
 
 class _Course(NamedTuple):
-    """A boat at rest, its dock and the unit directions of three legs, every field of one shape; px."""
+    """A boat at rest, its dock (px) and the unit directions of three legs. All fields have the same shape."""
 
     x: Tensor
     y: Tensor
@@ -105,13 +108,14 @@ def _leg_seconds(length: Tensor) -> Tensor:
 
 
 def _durations(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the seconds of the three presses of a course; the last is `inf` where the course does not dock.
+    """Return the seconds of the three presses of a course. If the course does not dock, the last is `inf`.
 
     Args:
-        course: fields broadcast against `first` and `second`.
+        course: courses whose fields broadcast against `first` and `second`.
         first: length of the first leg as a fraction of its reach.
-        second: length of the second leg as a fraction of the interval from which the last leg meets the dock.
-        max_presses: with 2 the first leg has length 0, with 1 also the second.
+        second: place of the second leg's length in the interval of lengths from which the last leg meets the dock, in
+            [0, 1].
+        max_presses: largest number of presses. If 2, the first leg has length 0. If 1, also the second.
     """
     goal_x = course.goal_x
     goal_y = course.goal_y
@@ -132,7 +136,7 @@ def _durations(course: _Course, first: Tensor, second: Tensor, max_presses: int)
         second_reach = _reach(x, y, goal_x, goal_y, course.second_x, course.second_y)
     else:
         second_reach = torch.zeros_like(x)
-    # A leg shorter than half the clearance would only correct rounding, and cost some hundredths of a second.
+    # Skip legs shorter than half the clearance: they would only correct rounding, and take some hundredths of a second.
     shortest = torch.where(middle - half_width > 0.5 * _CLEARANCE, middle - half_width, 0.0)
     longest = torch.minimum(middle + half_width, second_reach)
     second_length = shortest + second * (longest - shortest)
@@ -140,7 +144,7 @@ def _durations(course: _Course, first: Tensor, second: Tensor, max_presses: int)
     y = y + second_length * course.second_y
 
     last_length = distance_to_dock(x, y, goal_x, goal_y, course.last_x, course.last_y)
-    # The harbour is convex: the boat docks before it leaves if and only if the point of contact lies inside.
+    # The harbour is convex, so the boat docks before it leaves if and only if the point of contact lies inside.
     contact_x = x + last_length * course.last_x
     contact_y = y + last_length * course.last_y
     is_inside = contact_x.square() + contact_y.square() <= (HARBOUR_RADIUS - _CLEARANCE) ** 2
@@ -158,8 +162,8 @@ def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Te
     """Find the local minima of the coarse grid.
 
     Args:
-        course: fields `[N, S]`, with a column for each of the S sequences of keys.
-        max_presses: see `_durations`.
+        course: courses with fields `[N, S]`, one column for each of the S sequences of keys.
+        max_presses: as for `_durations`.
 
     Returns:
         The index of the sequence and the two fractions of each boat's best minima, `[N, S * _MINIMA]` each.
@@ -167,7 +171,7 @@ def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Te
     fractions = (
         torch.linspace(0.0, 0.5 * math.pi, _GRID, device=course.x.device, dtype=torch.float32).sin().square()
     )  # denser at the ends
-    # Without a first leg one row of the grid is enough.
+    # Without a first leg, one row of the grid is enough.
     first, second = torch.meshgrid(fractions if max_presses > 2 else fractions[:1], fractions, indexing="ij")
     grid = _Course(*(field[..., None, None] for field in course))
     seconds = _total_seconds(grid, first, second, max_presses).expand(*course.x.shape, *first.shape)
@@ -179,7 +183,7 @@ def _local_minima(course: _Course, max_presses: int) -> tuple[Tensor, Tensor, Te
 
 
 def _zoom(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> tuple[Tensor, Tensor]:
-    """Refine the fractions `first` and `second` of C candidates, `[N, C]`, by shrinking grids; course `[N, C]`."""
+    """Refine the fractions `first` and `second` of C candidates by shrinking grids. All arguments are `[N, C]`."""
     offset = torch.linspace(-1.0, 1.0, _ZOOM_GRID, device=first.device, dtype=torch.float32)
     first_offset, second_offset = torch.cartesian_prod(offset, offset).unbind(1)
     course = _Course(*(field[..., None] for field in course))
@@ -195,7 +199,7 @@ def _zoom(course: _Course, first: Tensor, second: Tensor, max_presses: int) -> t
 
 
 def _search(course: _Course, max_presses: int) -> tuple[Tensor, Tensor]:
-    """Return the index of each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`; course `[N, S]`."""
+    """Return each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`, given courses `[N, S]`."""
     sequence, first, second = _local_minima(course, max_presses)
     candidates = _Course(*(field.gather(1, sequence) for field in course))
     first, second = _zoom(candidates, first, second, max_presses)
@@ -214,7 +218,7 @@ def best_plan(
     keymap: Tensor,
     max_presses: int = MAX_PRESSES,
 ) -> Plan:
-    """Return the best plan of every boat, from wherever it rests.
+    """Return the best plan of every boat from its current place of rest.
 
     Args:
         x, y: position of the boat, at rest, px from the harbour's centre, `[N]`.
@@ -222,7 +226,7 @@ def best_plan(
         fuel: seconds of pressing left in the tank, `[N]`.
         controller: INCONGRUENT or CONGRUENT, `[N]`.
         keymap: 1 or 2, `[N]`.
-        max_presses: of a plan, 1 to 3.
+        max_presses: largest number of presses of a plan, 1 to 3.
 
     Raises:
         ValueError: `max_presses` is out of range.
@@ -250,7 +254,7 @@ def best_plan(
     fuel_left = fuel.to(torch.float32) - durations.sum(1)
     is_solved = fuel_left >= 0.0
     is_press = (durations > 0.0) & is_solved[:, None]
-    # Legs of length 0 are no presses: move the others to the front.
+    # Legs of length 0 are no presses, so move the others to the front.
     order = (~is_press).to(torch.int8).argsort(dim=1, stable=True)
     return Plan(
         keys=torch.where(is_press, keys, 0).gather(1, order),
@@ -261,10 +265,10 @@ def best_plan(
 
 
 def best_plans(layout: Layout, keymap: Tensor) -> Plan:
-    """Return the best plans from the start with a full tank, `[N, 2]`: with the incongruent and the congruent boat.
+    """Return the best plans with the incongruent and the congruent boat, from the start with a full tank, `[N, 2]`.
 
     Args:
-        layout: fields `[N]`.
+        layout: layouts with fields `[N]`.
         keymap: 1 or 2, `[N]`.
     """
     num_options = len(CONTROLLERS)
@@ -276,10 +280,10 @@ def best_plans(layout: Layout, keymap: Tensor) -> Plan:
 
 
 class OptionPlans(NamedTuple):
-    """The best plan of each option, fields `[N, num_options, ...]`; see `Plan`.
+    """The best plan of each option, with the fields of `Plan` `[N, num_options, ...]`.
 
-    With `boats` of which one cannot reach the dock, or a `switch_cost`, a press of 0 s may stand before others: the
-    option presses nothing with its own boat.
+    A plan may begin with a press of 0 s: the option then does nothing with its own boat. This happens with a
+    `switch_cost`, and with `boats` of which one cannot reach the dock.
     """
 
     boats: Tensor  # [N, num_options, 3] int64, the boat of each press
@@ -290,10 +294,10 @@ class OptionPlans(NamedTuple):
 
 
 def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
-    """Return the best plan of each option from where the boats rest.
+    """Return the best plan of each option from the boats' current places of rest.
 
-    Where the agent does not choose, there is one option: the boat that each has. With a `switch_cost`, an option's plan
-    presses the first key with that option's boat, and may change boats before each press that follows.
+    If the agent does not choose, the only option is the boat that each row has. With a `switch_cost`, the plan of an
+    option begins with that option's boat, and may change boats before each later press.
     """
     position = state.x, state.y, state.goal_x, state.goal_y, state.fuel
     has_choice = rules.controller == "choose"
@@ -316,7 +320,7 @@ def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
 def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
     """Return the best score with each boat, from the start with a full tank, `[N, num_boats]`.
 
-    With a `switch_cost` it is the best one that begins with the boat.
+    With a `switch_cost`, it is the best score of a plan that begins with that boat.
     """
     if rules.are_peoples:
         return best_plans(layout, keymap).score
@@ -325,34 +329,35 @@ def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
 
 
 def better_option(plans: Plan | OptionPlans) -> Tensor:
-    """Return the option with the highest score, the first one of equals, int64 `[N]`; plans `[N, num_options]`.
+    """Return the option with the highest score, int64 `[N]`, given plans `[N, num_options]`.
 
-    An option that begins with a press of 0 s, to change boats then, is as good as the change at once; it loses, since
-    whoever asks again before the next press would idle for ever.
+    The first of equally good options wins. An option that begins with a press of 0 s, to change boats afterwards, is as
+    good as the option to change at once. It loses the tie, because an agent that asks again at every press would idle
+    forever.
     """
     return (plans.score - _IDLE * (plans.durations[..., 0] == 0.0).float()).argmax(1)
 
 
-_IDLE = 1e-3  # of score
+_IDLE = 1e-3  # subtracted from the score to break ties
 _Direction = tuple[float, float]
-_Press = tuple[int, int]  # the number of a kind of boat, and of one of its directions
+_Press = tuple[int, int]  # the number of a kind of boat, and the number of one of its directions
 
-_PARALLEL = 1e-3  # directions whose cross product is smaller count as parallel; one leg does for two such
+_PARALLEL = 1e-3  # two directions with a smaller cross product count as parallel, so one leg replaces two
 _CANDIDATES = 24  # local minima that are refined, over all sequences of presses
-_FEWER = 1e-4  # seconds by which a plan of more presses must be better
+_FEWER = 1e-4  # seconds by which a plan with more presses must be better
 
 
 def _plans_with_boats(
     rules: Rules, x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, fuel: Tensor, held: Tensor, keymap: Tensor
 ) -> OptionPlans:
-    """Return the best plan that begins with each boat, for boats of any number that may be changed at a cost.
+    """Return the best plan that begins with each boat, for any number of boats and with changes at a cost.
 
-    Boats that push in the same directions with other keys are of one kind, with one search.
+    Boats that push in the same directions with other keys are of one kind and share a search.
 
     Args:
-        rules: of the environment.
+        rules: rules of the environment.
         x, y, goal_x, goal_y, fuel, keymap: as in `best_plan`.
-        held: the controller so far, or NOT_CHOSEN, `[N]`.
+        held: current controllers, or NOT_CHOSEN, `[N]`.
     """
     peoples = Boats(CONTROLLERS, (CONTROLLER_DEGREES["incongruent1"], CONTROLLER_DEGREES["congruent"]))
     directions = (peoples if rules.boats is None else rules.boats).directions
@@ -362,7 +367,7 @@ def _plans_with_boats(
     position = tuple(column.to(torch.float32) for column in (x, y, goal_x, goal_y))
     found = [_plans_of_kind(kinds, kind, rules.switch_cost, position) for kind in range(len(kinds))]
 
-    # The key of each kind's directions on each boat, and which boat stands for a kind that others change to.
+    # The key of each direction of a kind, for each boat.
     key_of = torch.tensor(
         [[keys.index(each) for each in kinds[kind]] for keys, kind in zip(directions, kind_of, strict=True)],
         device=x.device,
@@ -370,6 +375,7 @@ def _plans_with_boats(
     plans = []
     for boat, kind in enumerate(kind_of):
         legs, durations, num_presses, seconds = found[kind]
+        # A plan names kinds. Its own kind stands for this boat, any other kind for the first boat of that kind.
         members = [boat if other == kind else kind_of.index(other) for other in range(len(kinds))]
         boats = torch.tensor(members, device=x.device)[legs[..., 0]]
         keys = key_of[boats, legs[..., 1]]
@@ -399,8 +405,9 @@ def _plans_of_kind(
     """Return the best plan that begins with a boat of this kind.
 
     Returns:
-        The presses int64 `[N, 3, 2]` (kind and direction), their seconds `[N, 3]`, their number `[N]`, and the seconds
-        of fuel that all of it takes, changes of boats after the first press included, `[N]`; `inf` where none docks.
+        The presses (kind and direction) int64 `[N, 3, 2]`, their seconds `[N, 3]`, their number `[N]`, and the fuel of
+        the plan in seconds `[N]`. The fuel includes changes of boats after the first press. It is `inf` if no plan
+        docks.
     """
     device = position[0].device
     legs = torch.zeros(len(position[0]), MAX_PRESSES, 2, dtype=torch.long, device=device)
@@ -433,7 +440,7 @@ def _plans_of_kind(
 def _sequences(
     kinds: Sequence[Sequence[_Direction]], first: int, num: int, *, may_change: bool
 ) -> list[tuple[_Press, ...]]:
-    """Return the sequences of `num` presses that begin with this kind, of which no two in a row are parallel."""
+    """Return the sequences of `num` presses that begin with this kind and have no parallel neighbours."""
     every = [(kind, number) for kind in range(len(kinds)) for number in range(NUM_KEYS) if may_change or kind == first]
 
     def is_turn(before: _Press, after: _Press) -> bool:
@@ -447,7 +454,7 @@ def _sequences(
 
 
 def _padded(course: Sequence[_Direction]) -> list[_Direction]:
-    """Return three directions, of which the first are those of legs of length 0; no leg is parallel to the last one."""
+    """Return a course padded to three directions. The added legs, of length 0, are not parallel to the last one."""
     aside = (-course[-1][1], course[-1][0])
     return [aside] * (MAX_PRESSES - len(course)) + list(course)
 
@@ -458,10 +465,10 @@ def _search_sequences(
     """Return the index of each boat's best sequence `[N]` and the seconds of its presses `[N, 3]`.
 
     Args:
-        directions: of each sequence's three legs, `[S, 3, 2]`.
-        cost: seconds of each sequence beside those of its presses, `[S]`.
-        position: x, y, goal x, goal y, `[N]` each.
-        num_presses: of each sequence; legs before these have length 0.
+        directions: directions of each sequence's three legs, `[S, 3, 2]`.
+        cost: seconds of fuel that each sequence takes besides its presses, `[S]`.
+        position: x, y, goal x and goal y, `[N]` each.
+        num_presses: number of presses of each sequence. Earlier legs have length 0.
     """
     num = len(position[0])
     place = (column[:, None].expand(num, len(directions)) for column in position)

@@ -1,20 +1,22 @@
-"""What people reached at the same task: the references beside an agent's figures.
+"""People's results at the same task, as references for an agent's figures.
 
 Source: `BDtrajectory40.mat`, the human data released with *A Benchmark for Hierarchical Parameterized Action Markov
 Decision Process* (MIT licence): 40 people, 360 episodes each. A score is 5 x the fuel left (the file's `tank`, as a
-fraction of 360 ticks) on success and -1 otherwise. Shares are fractions of episodes. People chose their boat at every
-episode, so their figures with one boat are those of the episodes in which they had chosen it.
+fraction of 360 ticks) on success and -1 otherwise. People chose their boat in every episode. So their figures with one
+boat cover the episodes in which they had chosen it.
 
-The figures have the names that they have in `metrics.csv`: `score`, `success`, `too_fast`, `out_of_bounds`,
-`out_of_fuel` and `time_limit` (shares of the outcomes), `steps`, `option_congruent`, `oracle_agreement` (share of
-episodes with the better boat).
+The figures have the names of `metrics.csv`:
+- `score` and `steps` are means.
+- `success`, `too_fast`, `out_of_bounds`, `out_of_fuel` and `time_limit` are fractions of episodes with that outcome.
+- `option_congruent` is the fraction of episodes with the congruent boat.
+- `oracle_agreement` is the fraction of episodes with the better boat.
 """
 
 from __future__ import annotations
 
 Figures = dict[str, float]
 
-# The first entry is the whole task, in which the boat is chosen.
+# The first entry is the whole task, in which people choose the boat.
 HUMAN: dict[str, Figures] = {
     "chosen": {
         "score": 1.970,
@@ -23,20 +25,21 @@ HUMAN: dict[str, Figures] = {
         "out_of_bounds": 0.022,
         "out_of_fuel": 0.032,
         "time_limit": 0.0,
-        "steps": 3.25,  # as logged; the log drops presses that overlapped another
+        "steps": 3.25,  # logged presses; the log drops presses that overlapped another
         "option_congruent": 0.582,
-        "oracle_agreement": 0.648,  # by the bearing: the congruent controller is the better one under 30 degrees
+        "oracle_agreement": 0.648,  # the congruent controller counts as better under 30 degrees
     },
     "congruent": {"score": 2.012, "success": 0.864},
     "incongruent": {"score": 1.912, "success": 0.854},
 }
-# Uniformly random keys and durations with either boat, over 200,000 random layouts (standard error .0013).
+# Uniformly random keys and durations with either boat, over 200,000 random layouts (standard error 0.0013).
 RANDOM: Figures = {"score": -0.925, "success": 0.017}
 HUMAN_LAST_60: Figures = {"score": 2.241, "success": 0.900}  # of each person's 360 episodes
 BEST_PERSON: Figures = {"score": 3.021, "success": 0.989}
 HUMAN_SUCCESS_BY_BLOCK = (0.764, 0.843, 0.873, 0.886, 0.894, 0.900)  # six blocks of 60 episodes
 
-# Share choosing the congruent controller, by the degrees between the goal's bearing and its nearest direction.
+# Probability of choosing the congruent controller, by the degrees between the goal's bearing and the nearest congruent
+# direction.
 OFFSET_EDGES = (0, 10, 20, 30, 40, 50, 60)
 HUMAN_CONGRUENT_BY_OFFSET = (0.788, 0.741, 0.654, 0.502, 0.427, 0.370)
 
@@ -46,14 +49,14 @@ def human_normalised(score: float, controller: str = "chosen") -> float:
 
     Args:
         score: mean score of an evaluation.
-        controller: `chosen`, `congruent` or `incongruent`; `random` is compared with people's own choices.
+        controller: `chosen`, `congruent`, `incongruent` or `random`. `random` is compared with people's own choices.
     """
     human = HUMAN.get(controller, HUMAN["chosen"])["score"]
     return (score - RANDOM["score"]) / (human - RANDOM["score"])
 
 
 def human_references(controller: str) -> dict[str, Figures]:
-    """Return what people on average (`human`) and the best of them (`best_person`) reached.
+    """Return the figures of people on average (`human`) and of the best person (`best_person`).
 
     Args:
         controller: as for `human_normalised`.

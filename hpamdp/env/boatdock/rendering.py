@@ -24,14 +24,14 @@ _DOCK, _DOCK_EDGE = "#f4dfb0", "#c8963e"
 _GAUGE_COLOUR = "#e3e1da"
 _LOW_FUEL = 0.25  # below it the gauge turns red
 
-_SCALE = 1.66  # units of paper for each px of the harbour
-_COMPASS = (54.0, 403.0)  # where the arrows of the keys start
-_ARROW = 26.0  # their length
+_SCALE = 1.66  # units of paper per px of the harbour
+_COMPASS = (54.0, 403.0)  # point where the arrows of the keys start
+_ARROW = 26.0  # length of the arrows
 _GAUGE = (346.0, 18.0, 462.0, 28.0)  # left, top, right, bottom
 
 
 class Leg(NamedTuple):
-    """The track of one press: px from the harbour's centre, and the share of it during which the key was down."""
+    """The track of one press, px from the harbour's centre, and the fraction of it with the key down."""
 
     start: Point
     end: Point
@@ -40,19 +40,19 @@ class Leg(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """What a picture shows; positions in px from the harbour's centre, y down.
+    """The content of a picture. Positions are px from the harbour's centre, with y pointing down.
 
     Attributes:
         start, goal, boat: positions.
-        heading: direction of the bow, of any length; (0, 0) before the first press.
+        heading: direction of the bow, of any length. (0, 0) before the first press.
         legs: the track so far.
-        fuel: fraction of the tank.
+        fuel: remaining fraction of the tank.
         presses: number of presses so far.
-        controller: its number, or -1 before one is chosen.
+        controller: number of the boat, or -1 before the choice.
         keymap: 1 or 2.
-        boats: that the numbers stand for; None: people's two.
         outcome: one of `physics.OUTCOMES`.
-        score: shown at the end of an episode, unless it is None.
+        score: score shown at the end of an episode. If None, none is shown.
+        boats: boats that the numbers stand for. If None, people's two.
     """
 
     start: Point
@@ -85,7 +85,7 @@ def draw(scene: Scene, size: int = 480) -> np.ndarray:
 
 @lru_cache(maxsize=2)
 def _empty_harbour(size: int) -> tuple[Image.Image, Image.Image]:
-    """Return the harbour before and after smoothing; both for reading only."""
+    """Return the harbour before and after smoothing. Callers must not draw on either."""
     canvas = Canvas.for_shapes(size)
     canvas.disc(_on_paper((0.0, 0.0)), physics.HARBOUR_RADIUS * _SCALE + 1.5, _WATER, _RIM, 3.0)
     return canvas.image, canvas.smoothed().image
@@ -96,8 +96,8 @@ def _on_paper(point: Point) -> Point:
     return PAPER / 2.0 + point[0] * _SCALE, PAPER / 2.0 + point[1] * _SCALE
 
 
-def _along(start: Point, end: Point, share: float) -> Point:
-    return start[0] + share * (end[0] - start[0]), start[1] + share * (end[1] - start[1])
+def _along(start: Point, end: Point, fraction: float) -> Point:
+    return start[0] + fraction * (end[0] - start[0]), start[1] + fraction * (end[1] - start[1])
 
 
 def _colours(scene: Scene) -> tuple[str, str]:
@@ -134,7 +134,7 @@ def _draw_boat(canvas: Canvas, scene: Scene) -> None:
         return
     forward_x = scene.heading[0] / length
     forward_y = scene.heading[1] / length
-    # The hull from above, from the bow around: (forward, sideways) in units of paper.
+    # The hull from above, starting at the bow: (forward, sideways) in units of paper.
     hull = [(13.0, 0.0), (7.5, 4.6), (0.0, 6.2), (-9.0, 5.0), (-9.0, -5.0), (0.0, -6.2), (7.5, -4.6)]
     turned = [(x + f * forward_x - s * forward_y, y + f * forward_y + s * forward_x) for f, s in hull]
     canvas.polygon(turned, _HULL, BACKGROUND, 1.6)
@@ -145,13 +145,13 @@ def _draw_gauge(canvas: Canvas, fuel: float) -> None:
     left, top, right, bottom = _GAUGE
     canvas.bar(_GAUGE, _GAUGE_COLOUR)
     if fuel > 0.0:
-        # At least as wide as high, so that the round ends fit.
+        # The bar is at least as wide as high, so that the round ends fit.
         width = max(fuel * (right - left), bottom - top)
         canvas.bar((left, top, left + width, bottom), _PRESSED if fuel >= _LOW_FUEL else BAD_EDGE)
 
 
 def _directions(scene: Scene) -> tuple[Point, ...]:
-    """Return the directions of the keys; none before a controller is chosen."""
+    """Return the directions of the keys, or no directions before a controller is chosen."""
     if scene.controller == harbour.NOT_CHOSEN:
         return ()
     if scene.boats is not None:
@@ -188,7 +188,10 @@ def _write_labels(canvas: Canvas, scene: Scene) -> None:
 
 
 def fuel_at_press(before: BoatState, after: BoatState, switch_cost: float | None) -> Tensor:
-    """Return the fuel (s) with which the press between two states of one boat began: a change of boats comes first."""
+    """Return the fuel (s) at the beginning of the press between two states of one boat.
+
+    A change of boats takes its fuel before the press.
+    """
     if switch_cost is None or before.controller.item() in (harbour.NOT_CHOSEN, after.controller.item()):
         return before.fuel
     return (before.fuel - switch_cost).clip(0.0)
@@ -198,7 +201,7 @@ def leg(before: BoatState, after: BoatState, switch_cost: float | None = None) -
     """Return the track of the press between two states of one boat."""
     start = (before.x.item(), before.y.item())
     end = (after.x.item(), after.y.item())
-    # The fuel burnt is the time that the key was down, after noise and with what was left in the tank.
+    # The fuel burnt equals the time that the key was down, after noise and after the limit of the tank.
     pressed = physics.pressed_distance(fuel_at_press(before, after, switch_cost) - after.fuel).item()
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     return Leg(start, end, min(pressed / length, 1.0) if length > 0.0 else 1.0)

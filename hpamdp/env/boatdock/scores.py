@@ -1,4 +1,4 @@
-"""Means of an evaluation on boats."""
+"""Mean figures of an evaluation on boats."""
 
 from __future__ import annotations
 
@@ -12,22 +12,29 @@ from hpamdp.env.boatdock.task import FAILURE_REWARD, Rules
 
 
 def measure_boats(played: Mapping[str, np.ndarray], controller: str, rules: Rules) -> dict[str, float]:
-    """Return the outcomes' shares, the ceiling and the figures of the choice.
+    """Return the fractions of outcomes, the ceiling and the figures of the choice.
 
-    - the share of each outcome, by its name;
-    - `ceiling`: the best possible mean score on the same layouts, with the better controller of each where the agent
-      chose (`option`), else with the one that was given (`controller`);
-    - `ceiling_success`: with other boats than people's, the share of these layouts in which a plan docks;
-    - `human_normalised`: the human-normalised score, 0 for random presses and 1 for the mean of people; only with the
-      two controllers of the recording;
-    - where the agent chose: `option_NAME`, the share of episodes with that controller, and with a `switch_cost` that
-      began with it; `oracle_agreement`, the share with the best one; `oracle_agreement_weighted`, the share of what the
-      choice is worth, from the worst to the best one, that the agent's was worth; 1 where all are equally good.
+    For every evaluation:
+    - the name of each outcome: the fraction of episodes that ended with it.
+    - `ceiling`: the best possible mean score on the same layouts. If the agent chose (`option`), it is with the best
+      controller of each layout, otherwise with the given one (`controller`).
+
+    With the two controllers of the recording:
+    - `human_normalised`: the human-normalised score, 0 for random presses and 1 for the mean of people.
+
+    With other controllers:
+    - `ceiling_success`: the fraction of these layouts in which a plan docks.
+
+    If the agent chose:
+    - `option_NAME`: the fraction of episodes with that controller. With a `switch_cost`, of those that began with it.
+    - `oracle_agreement`: the fraction of episodes with the best controller.
+    - `oracle_agreement_weighted`: how much the agent's choices gained over the worst ones, as a fraction of the gain of
+      the best ones. It is 1 if all choices are equally good.
 
     Args:
-        played: arrays of an evaluation, first dimension the episode.
+        played: arrays of an evaluation, whose first dimension is the episode.
         controller: `chosen`, the name of a boat, or `random`.
-        rules: of the environment.
+        rules: rules of the environment.
     """
     outcome, optimum, chosen = played["outcome"], played["optimum"], played.get("option")
     held = (played["controller"] if chosen is None else chosen).astype(int)

@@ -1,4 +1,4 @@
-"""What the task is made of: lengths, times, names, the settings and the state of boats; nothing here needs torch."""
+"""The parts of the task: lengths, times, names, and the rules and the state of boats. Nothing here needs torch."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ if TYPE_CHECKING:
 
 HARBOUR_RADIUS = 120.0
 DOCK_RADIUS = 15.0
-GLIDE = 0.95  # length and duration of the glide, as multiples of those of the pressed stretch
-DOCKING_SPEED = 74.0  # px/s, the highest speed of arrival that docks
+GLIDE = 0.95  # length and duration of the glide, as multiples of those while the key is down
+DOCKING_SPEED = 74.0  # px/s, the highest speed at which a boat docks
 TANK = 6.0  # seconds of pressing in a full tank
 MAX_DURATION = 2.0  # seconds
 
 
 def speed(duration: Any) -> Any:
-    """Return the speed (px/s) after pressing for `duration` seconds from rest: a number, an array or a tensor."""
+    """Return the speed (px/s) after pressing for `duration` seconds from rest, for a number, an array or a tensor."""
     return duration * duration * (100.0 - (20.0 / 3.0) * duration)
 
 
-# Going on, success, the failures, and the time limit at the end. `physics` and `kernel` decide among them.
+# In this order: going on, success, the failures, the time limit. `physics` and `kernel` determine the outcome.
 OUTCOMES = ("sailing", "success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit")
 SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(len(OUTCOMES))
 
-# With less fuel than this (seconds) the tank counts as empty: the rest is rounding in float32.
+# With no more fuel than this (seconds) the tank counts as empty. The remainder is a rounding error of float32.
 DRY = 1e-6
 
 CENTRE = (640.0, 512.0)  # px on the screen
@@ -38,15 +38,15 @@ INCONGRUENT, CONGRUENT = 0, 1
 CONTROLLERS = ("incongruent", "congruent")  # option 0, option 1
 NOT_CHOSEN = -1
 
-# Controllers that `boats` may name: the degrees in which each key pushes, 0 to the right, 90 down. People's incongruent
-# boat had one of two key maps, which are two controllers here.
+# Controllers that `boats` may name, with the direction of each key in degrees (0 to the right, 90 down). People's
+# incongruent boat had one of two key maps. Here these are two controllers.
 CONTROLLER_DEGREES: dict[str, tuple[float, ...]] = {
     "congruent": (150.0, 270.0, 30.0),
     "incongruent1": (330.0, 210.0, 90.0),
     "incongruent2": (90.0, 330.0, 210.0),
 }
 
-# Indices of an episode's random numbers: three for each try at a layout, then the others.
+# Indices of an episode's random numbers. The first are for the layout, three for each try.
 LAYOUT_TRIES = 4
 INDEX_ANGLE = 3 * LAYOUT_TRIES
 INDEX_CONTROLLER = 3 * LAYOUT_TRIES + 1
@@ -60,7 +60,7 @@ SPEED_SCALE = speed(MAX_DURATION)  # px/s
 RewardForm = Literal["paper", "sparse"]
 ObservationForm = Literal["scaled", "pixels"]
 
-FUEL = "fuel"  # the tensordict entry: the fraction of the tank that is left
+FUEL = "fuel"  # the tensordict entry with the remaining fraction of the tank
 
 OBSERVATION_NAMES = (
     "start_x",
@@ -82,25 +82,26 @@ SCALED_NAMES = (*OBSERVATION_NAMES, "to_goal_x", "to_goal_y")
 
 
 def observation_names(form: ObservationForm) -> tuple[str, ...]:
-    """Return the names of the observation's entries in one of its forms."""
+    """Return the names of the entries of one form of the observation."""
     return OBSERVATION_NAMES if form == "pixels" else SCALED_NAMES
 
 
-# Each press has 16 random numbers of its episode's noise; Gaussian number i is made of the uniform ones 2i and 2i + 1.
+# Each press has 16 random numbers for noise. Gaussian number i uses the uniform numbers 2i and 2i + 1.
 NUMBERS_PER_PRESS = 16
-# Indices of these: uniform ones, then Gaussian ones.
+# Indices of these numbers. SLIP and SLIPPED_KEY count uniform numbers, MOTOR and SENSOR Gaussian ones. SENSOR is the
+# first of six.
 SLIP, SLIPPED_KEY = 0, 1
 MOTOR, SENSOR = 1, 2
 
 
 def unit_directions(degrees: Sequence[float]) -> tuple[tuple[float, float], ...]:
-    """Return unit directions (x, y), rounded so that a right angle has exact ones."""
+    """Return unit directions (x, y), rounded so that multiples of 90 degrees are exact."""
     angles = [math.radians(each) for each in degrees]
     return tuple((round(math.cos(angle), 15) + 0.0, round(math.sin(angle), 15) + 0.0) for angle in angles)
 
 
 class Boats(NamedTuple):
-    """Boats to choose from, in place of people's two: their names, and the degrees in which each key pushes."""
+    """Boats that replace people's two: their names, and the direction of each key in degrees."""
 
     names: tuple[str, ...]
     degrees: tuple[tuple[float, ...], ...]
@@ -112,17 +113,17 @@ class Boats(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """The settings of an environment, as BoatDockEnv explains them."""
+    """The rules of an environment. The settings of BoatDockEnv explain them."""
 
     controller: str = "choose"
     keymap: Literal[1, 2, "random"] = 1
     reward: RewardForm = "paper"
     observation: ObservationForm = "scaled"
-    motor_noise: tuple[float, ...] = (0.0, 0.0)  # of each boat
+    motor_noise: tuple[float, ...] = (0.0, 0.0)  # one value per boat
     sensor_noise: float = 0.0
     slip: float = 0.0
-    boats: Boats | None = None  # None: people's two
-    switch_cost: float | None = None  # seconds of fuel; None: a boat is kept for the episode
+    boats: Boats | None = None  # if None, people's two
+    switch_cost: float | None = None  # seconds of fuel; if None, a boat is kept for the episode
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,14 +132,14 @@ class Rules(NamedTuple):
 
     @property
     def are_peoples(self) -> bool:
-        """Whether the boats are people's two, of which one is kept for the episode."""
+        """Whether the boats are people's two and the chosen one is kept for the episode."""
         return self.boats is None and self.switch_cost is None
 
 
 class BoatState(NamedTuple):
-    """Columns `[N]`; px from the harbour's centre, fuel in seconds, integers int32.
+    """The state of N boats, columns `[N]`: positions in px from the harbour's centre, fuel in seconds, int32 integers.
 
-    The velocity is that at the end of the last press, before the glide. `episode` is -1 before the first reset.
+    The velocity is the one at the end of the last press, before the glide. `episode` is -1 before the first reset.
     """
 
     start_x: Tensor

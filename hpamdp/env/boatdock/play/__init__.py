@@ -1,1 +1,1 @@
-"""People at the task: the page on which they play it, and the check and the file of what they did."""
+"""People at the task: the page on which they play, and the checks and the file of their episodes."""

@@ -21,23 +21,23 @@ from hpamdp.env.boatdock.reference import (
 from hpamdp.env.boatdock.task import MAX_PRESSES, Boats, Rules
 from hpamdp.env.play_page import EpisodeError
 
-BLOCK, NUM_BLOCKS = 60, 6  # as people had them
+BLOCK, NUM_BLOCKS = 60, 6  # as in the recording of people
 _PRACTICE, _FREE = 10, 120
-# The page's own boats, in the words of an environment's settings.
+# The page's own boats, as settings of an environment.
 _PLAIN = {"boats": None, "switch_cost": None, "motor_noise": 0.0, "sensor_noise": 0.0, "slip": 0.0}
-_OF_PEOPLE = {**_PLAIN, "controller": "choose", "keymap": 1}  # both are chosen on the page
+_OF_PEOPLE = {**_PLAIN, "controller": "choose", "keymap": 1}  # the player chooses both on the page
 _OF_AGENTS = {**_PLAIN, "observation": "scaled"}
 
 
 class BoatPage:
-    """The page, with layouts of its own, which no training and no evaluation meets.
+    """The page, with its own layouts, which neither training nor evaluation uses.
 
     Args:
-        seed: of the layouts.
-        rules: of the environment.
+        seed: seed of the layouts.
+        rules: rules of the environment.
 
     Raises:
-        ValueError: the rules are not those of the page.
+        ValueError: the rules differ from those of the page.
     """
 
     folder = Path(__file__).resolve().parent / "page"
@@ -50,7 +50,7 @@ class BoatPage:
         self.seed = seed
 
     def data(self, agents: Sequence[Mapping[str, Any]], *, has_server: bool) -> dict[str, Any]:
-        """Return the rules, the layouts with their best plans, the agents, and what people reached."""
+        """Return the rules, the layouts with their best plans, the agents, and people's results."""
         for agent in agents:
             _check_agent(agent)
         return {
@@ -95,21 +95,21 @@ class BoatPage:
         }
 
     def check(self, episode: object) -> dict[str, Any]:
-        """Return an episode as it is to be stored; see `hpamdp.env.boatdock.play.episodes.check`."""
+        """Check an episode, as `episodes.check` does, and return it in the form of the file."""
         return episodes.check(episode).model_dump(mode="json")
 
     def identity(self, episode: Mapping[str, Any]) -> str:
-        """Return the player and the episode's number."""
+        """Return a text that identifies an episode: the player and the episode's number."""
         return episodes.identity(episode["player"], episode["index"])
 
     def _layouts(self) -> dict[str, list[dict[str, Any]]]:
         """Return the layouts of each mode: start, goal, people's choice, and each boat's best score and plan.
 
-        The keys of the plans are those under key map 1. Numbers are exact, as some plans barely touch the dock.
+        The keys of the plans belong to key map 1. Numbers are not rounded, because some plans barely touch the dock.
         """
         sizes = {"practice": _PRACTICE, "round": BLOCK * NUM_BLOCKS, "free": _FREE}
         num = sum(sizes.values())
-        # The seeds of evaluations are small; so these layouts are not theirs.
+        # Evaluations use small seeds, so their layouts differ from these.
         layout = harbour.fixed_layouts(num, 2**31 + self.seed)
         plans = planner.best_plans(layout, torch.ones(num, dtype=torch.int32))
         bins = torch.bucketize(harbour.bearing_offset(layout), torch.tensor(OFFSET_EDGES[1:-1], dtype=torch.float32))
@@ -142,10 +142,10 @@ class BoatPage:
 
 
 def _check_agent(agent: Mapping[str, Any]) -> None:
-    """Check that an agent knows the boats of the page.
+    """Check that an agent was trained with the boats of the page.
 
     Raises:
-        EpisodeError: with the setting that differs.
+        EpisodeError: a setting differs. The message names it.
     """
     other = _other_setting(agent["env"], _OF_AGENTS)
     if other is not None:
@@ -153,7 +153,7 @@ def _check_agent(agent: Mapping[str, Any]) -> None:
 
 
 def _other_setting(settings: Mapping[str, Any], of_page: Mapping[str, Any]) -> str | None:
-    """Return in words the first setting that differs from the page's; those that are missing do not."""
+    """Return a text about the first setting that differs from the page's, or None. Missing settings do not differ."""
     for name, value in of_page.items():
         given = settings.get(name, value)
         if given != value and given != [value, value] and given != (value, value):

@@ -1,7 +1,8 @@
-"""The episodes that people played on the page: their schema, their check, and the file that keeps them.
+"""Episodes that people played on the page: their schema, their checks, and the file that stores them.
 
-A file has one JSON object a line, in the order in which the episodes arrived. `docs/play.md` explains the fields; the
-models below are the schema. There is no personal data in it: a player is a random number that a page draws anew.
+A file has one JSON object per line, in the order in which the episodes arrived. `docs/play.md` explains the fields. The
+models below are the schema. The file has no personal data: a player is a random number, drawn again whenever the page
+is loaded.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ from hpamdp.messages import reason_of, warn
 
 FORMAT = 1
 PRACTICE = "practice"
-# How far what the page says may lie from what its presses come to: px, s, fractions of the fuel.
+# Largest difference between the page's figures and those computed from its presses: px, s, fractions of the fuel.
 _TOLERANCE = 1e-6
-_LONGEST = 3600.0  # s; nobody sails for an hour
+_LONGEST = 3600.0  # s, longest episode
 _MAX_EVENTS = 2000
 _MAX_BYTES = 256 * 2**20
 
@@ -41,7 +42,7 @@ _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=Fal
 
 
 class RawEvent(BaseModel):
-    """A key event as the browser had it."""
+    """A key event as the browser reported it."""
 
     model_config = _STRICT
 
@@ -52,7 +53,7 @@ class RawEvent(BaseModel):
 
 
 class SettledPress(BaseModel):
-    """A press as the game had it."""
+    """A press as the game counted it."""
 
     model_config = _STRICT
 
@@ -62,7 +63,10 @@ class SettledPress(BaseModel):
 
 
 class Episode(BaseModel):
-    """One line of the file; lengths in px from the harbour's centre (y down), times in s since the boat was chosen."""
+    """One line of the file.
+
+    Lengths are px from the harbour's centre (y down), times are s since the boat was chosen.
+    """
 
     model_config = _STRICT
 
@@ -86,10 +90,10 @@ class Episode(BaseModel):
 
 
 def check(value: object) -> Episode:
-    """Return an episode if it is one, and if its events come to its presses, and these to its end.
+    """Return a valid episode. Its presses must follow from its events, and its end from its presses.
 
     Raises:
-        EpisodeError: with what is wrong, in one line.
+        EpisodeError: the episode is not valid. The message is one line.
     """
     episode = _parse(value)
     (problem,) = _problems([episode])
@@ -99,12 +103,12 @@ def check(value: object) -> Episode:
 
 
 def identity(player: object, index: object) -> str:
-    """Return a text that no other episode has: the player, and the episode's number among that player's."""
+    """Return a text that identifies an episode: the player, and the episode's number among that player's."""
     return f"{player}-{index}"
 
 
 def sail(episodes: Sequence[Episode], presses: Sequence[Sequence[Press | SettledPress]] | None = None) -> Replay:
-    """Sail episodes from their presses, or from others."""
+    """Replay episodes from the given presses. If None, from their own presses."""
     rows = [episode.presses for episode in episodes] if presses is None else presses
     num, longest = len(episodes), max(map(len, rows), default=0)
     keys = torch.zeros(num, longest, dtype=torch.long)
@@ -118,17 +122,18 @@ def sail(episodes: Sequence[Episode], presses: Sequence[Sequence[Press | Settled
 
 
 def direction_rows(episodes: Sequence[Episode]) -> Tensor:
-    """Return the rows of `harbour.DIRECTIONS` with the keys of the episodes' boats, int64 `[E]`."""
+    """Return each episode's row in `harbour.DIRECTIONS`, int64 `[E]`."""
     return torch.tensor([2 if e.controller == "congruent" else e.keymap - 1 for e in episodes], dtype=torch.long)
 
 
 def read(path: Path) -> dict[int, Episode]:
-    """Read a file and return its episodes by the numbers of their lines, each checked as by `check`.
+    """Read a file and return its valid episodes by line number.
 
-    Lines that hold no episode, or the same episode as an earlier line, are left out. A warning names these lines.
+    Each episode is checked as by `check`. Lines without a valid episode, and lines that repeat an earlier episode, are
+    left out. A warning names these lines.
 
     Raises:
-        EpisodeError: the file cannot be read, or it has lines but no episode.
+        EpisodeError: the file cannot be read, or it has lines but no valid episode.
     """
     episodes, problems = read_with_problems(path)
     if problems:
@@ -140,7 +145,7 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
     """Return the episodes of a file, as `read` does, and the problem of each line that is left out.
 
     Raises:
-        EpisodeError: as `read` does.
+        EpisodeError: as for `read`.
     """
     try:
         data = read_regular(path, _MAX_BYTES)
@@ -174,20 +179,20 @@ def read_with_problems(path: Path) -> tuple[dict[int, Episode], dict[int, str]]:
 
 @cache
 def warn_once(message: str) -> None:
-    """Warn once about the lines left out of a file, however many environments read it."""
+    """Warn about the lines left out of a file, once even if many environments read it."""
     warn(message)
 
 
 def _parse(value: object) -> Episode:
     try:
-        # As JSON, in which the strict mode takes a list for a tuple.
+        # Validate JSON text, for which the strict mode accepts lists as tuples.
         return Episode.model_validate_json(json.dumps(value, allow_nan=False))
     except ValidationError as error:
         wrong = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, wrong["loc"])) or "episode"
         raise EpisodeError(f"{where[:80]}: {wrong['msg']}") from error
     except (ValueError, TypeError) as error:
-        raise EpisodeError("episode: no JSON object") from error
+        raise EpisodeError("episode: is not a JSON object") from error
 
 
 def _points(points: Sequence[Point]) -> Tensor:
@@ -195,7 +200,7 @@ def _points(points: Sequence[Point]) -> Tensor:
 
 
 def _problems(episodes: Sequence[Episode]) -> list[str | None]:
-    """Return the problem of each episode, or None if its key events lead to the presses and the end that it holds."""
+    """Return the problem of each episode, or None if its presses and its end follow from its key events."""
     settled = [settle((event.t, event.type, event.key) for event in episode.events) for episode in episodes]
     from_events, from_presses = sail(episodes, settled), sail(episodes)
     problems: list[str | None] = []
@@ -223,21 +228,21 @@ def _check_layout(episode: Episode) -> None:
 def _check_presses(episode: Episode, settled: Sequence[Press], played: Replay, row: int) -> None:
     times = [event.t for event in episode.events]
     if times != sorted(times):
-        raise EpisodeError("events: their times go back")
+        raise EpisodeError("events: times must not decrease")
     num = int(played.num_presses[row])
     if len(episode.presses) != num:
-        raise EpisodeError(f"presses: {len(episode.presses)}, but the events come to {num}")
+        raise EpisodeError(f"presses: {len(episode.presses)}, but the events give {num}")
     burnt = played.burnt[row].tolist()
     for i, (said, found) in enumerate(zip(episode.presses, settled[:num], strict=True)):
         errors = (said.start - found.start, said.duration - burnt[i])
         if said.key != found.key or max(map(abs, errors)) > _TOLERANCE:
-            raise EpisodeError(f"presses.{i}: not what the events come to")
+            raise EpisodeError(f"presses.{i}: does not follow from the events")
 
 
 def _check_outcome(episode: Episode, played: Replay, row: int) -> None:
     outcome = physics.OUTCOMES[int(played.outcome[row])]
     if outcome != episode.outcome:
-        raise EpisodeError(f"outcome: {episode.outcome}, but the presses come to {outcome}")
+        raise EpisodeError(f"outcome: {episode.outcome}, but the presses lead to {outcome}")
 
 
 def _check_end(episode: Episode, played: Replay, row: int) -> None:
@@ -249,33 +254,33 @@ def _check_end(episode: Episode, played: Replay, row: int) -> None:
     end = math.dist(episode.end, (played.end_x[row].item(), played.end_y[row].item()))
     for name, error in (("fuel", episode.fuel - fuel.item()), ("score", episode.score - score.item()), ("end", end)):
         if abs(error) > _TOLERANCE:
-            raise EpisodeError(f"{name}: not what the presses come to")
+            raise EpisodeError(f"{name}: does not follow from the presses")
 
 
 def figures(episodes: Sequence[Episode], controller: str | None = None) -> dict[str, float]:
-    """Return the mean figures of episodes, without those of practice, by the names of `hpamdp.env.boatdock.reference`.
+    """Return the mean figures of episodes, except practice, by the names of `hpamdp.env.boatdock.reference`.
 
     Args:
-        episodes: of one recording.
-        controller: only episodes with this one; None: with either.
+        episodes: episodes of one recording.
+        controller: only count episodes with this controller. If None, with either.
 
     Raises:
-        EpisodeError: there is none.
+        EpisodeError: no episode counts.
     """
     counted = [e for e in episodes if e.mode != PRACTICE and controller in (None, e.controller)]
     if not counted:
         raise EpisodeError(
-            f"recording: no episode{'' if controller is None else f' with the {controller} boat'}, practice aside"
+            f"recording: has no episode{'' if controller is None else f' with the {controller} boat'} except practice"
         )
     num = len(counted)
-    shares = {
+    fractions = {
         name: sum(episode.outcome == name for episode in counted) / num
         for code, name in enumerate(physics.OUTCOMES)
         if code != physics.SAILING
     }
     return {
         "score": sum(episode.score for episode in counted) / num,
-        **shares,
+        **fractions,
         "steps": sum(len(episode.presses) for episode in counted) / num,
         "option_congruent": sum(episode.controller == "congruent" for episode in counted) / num,
     }

@@ -1,11 +1,11 @@
-"""The game as people have it: keys are held and released at any time, and a new press ends the one before.
+"""The game as people play it: keys may be pressed and released at any time, and a new press ends the previous one.
 
-In the environment a press lasts until the boat is at rest again. In people's game the next key can be pressed while
-the boat still glides, or while another key is down: that ends the press before and its glide, and the boat starts again
-from rest where it is. A press that began and ended at the same reading of the clock is none.
+In the environment a press lasts until the boat is at rest again. In people's game the next key may be pressed while the
+boat still glides, or while another key is down. That ends the previous press and its glide, and the boat starts again
+from rest where it is. A press that begins and ends at the same reading of the clock does not count.
 
-The page's script `page/physics.js` has the same functions; a test compares them. Positions are px from the harbour's
-centre, times are seconds since the boat was chosen, and everything is computed in float64.
+The page's script `page/physics.js` has the same functions, and a test compares them. Positions are px from the
+harbour's centre, times are seconds since the boat was chosen, and all computations are in float64.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from hpamdp.env.boatdock.harbour import DIRECTIONS
 from hpamdp.env.boatdock.task import MAX_PRESSES
 
 DOWN, UP, BLUR = "down", "up", "blur"
-# A press that is not over yet.
+# The duration of a press that is not over yet.
 HELD = float("inf")
 
 
 class Press(NamedTuple):
-    """A settled press: its key (0 to 2), when it began (s), and for how long the key was down (s)."""
+    """A settled press: its key (0 to 2), its beginning (s), and how long the key was down (s)."""
 
     key: int
     start: float
@@ -34,16 +34,17 @@ class Press(NamedTuple):
 
 
 class Replay(NamedTuple):
-    """What became of E episodes.
+    """The course of E replayed episodes.
 
     Attributes:
-        x, y: where each press began, `[E, T]`.
-        burnt: how long each press burnt fuel, until release, the end of the fuel or of the episode, s, `[E, T]`.
-        end_x, end_y: where the boat was last, `[E]`.
+        x, y: position at the beginning of each press, `[E, T]`.
+        burnt: seconds for which each press burnt fuel, `[E, T]`. Burning ends with the release of the key, an empty
+            tank or the end of the episode.
+        end_x, end_y: last position of the boat, `[E]`.
         fuel: seconds of fuel left, `[E]`.
-        outcome: as in `physics`, int32 `[E]`; SAILING where the boat rests with fuel left.
-        ended: when the episode ended, s, or when the boat came to rest, `[E]`.
-        num_presses: presses up to the end of the episode, int64 `[E]`.
+        outcome: outcome as in `physics`, int32 `[E]`. It is SAILING if the boat rests with fuel left.
+        ended: time at which the episode ended or the boat came to rest, s, `[E]`.
+        num_presses: number of presses up to the end of the episode, int64 `[E]`.
     """
 
     x: Tensor
@@ -58,13 +59,15 @@ class Replay(NamedTuple):
 
 
 def settle(events: Iterable[tuple[float, str, int]]) -> list[Press]:
-    """Return the presses that raw key events come to: one key at a time, each ended by release, the next key or a blur.
+    """Return the presses that follow from raw key events.
+
+    Only one key is down at a time. A press ends with the release of its key, with the next key, or with a blur.
 
     Args:
-        events: time (s), DOWN, UP or BLUR, and the key, in ascending order of time; a BLUR's key is ignored.
+        events: time (s), kind (DOWN, UP or BLUR) and key, in ascending order of time. The key of a BLUR is ignored.
 
     Returns:
-        At most MAX_PRESSES presses; the last one lasts for HELD seconds if its key is still down.
+        At most MAX_PRESSES presses. If the last key is still down, its press lasts HELD seconds.
     """
     presses: list[Press] = []
     open_key, begun = -1, 0.0
@@ -92,14 +95,14 @@ def replay(
     starts: Tensor,
     durations: Tensor,
 ) -> Replay:
-    """Sail E episodes from their settled presses.
+    """Replay E episodes from their settled presses.
 
     Args:
-        start, goal: float64 `[E, 2]`.
-        row: of DIRECTIONS: the keys of each boat, int64 `[E]`.
-        keys: int64 `[E, T]`.
-        starts: ascending, s, `[E, T]`; `inf` past an episode's last press.
-        durations: s, `[E, T]`.
+        start, goal: positions of start and goal, float64 `[E, 2]`.
+        row: row of DIRECTIONS with the keys of each boat, int64 `[E]`.
+        keys: key of each press, int64 `[E, T]`.
+        starts: beginning of each press, s, ascending, `[E, T]`. It is `inf` past an episode's last press.
+        durations: duration of each press, s, `[E, T]`.
     """
     (x, y), (goal_x, goal_y) = start.unbind(-1), goal.unbind(-1)
     fuel = torch.full_like(x, physics.TANK)
@@ -116,7 +119,7 @@ def replay(
         whole = physics.press(x, y, fuel, goal_x, goal_y, dir_x, dir_y, duration)
         length = (whole.x - x) * dir_x + (whole.y - y) * dir_y
         seconds = physics.time_at(duration, length)
-        # The tank of a boat that runs dry is empty for the next press, too, so that nothing interrupts its last glide.
+        # After the tank has run dry, a new press has no fuel, so it cannot interrupt the last glide.
         is_last = (whole.outcome == physics.OUT_OF_FUEL) | (i + 1 == MAX_PRESSES)
         available = following[:, i] - starts[:, i]
         is_cut = (available < seconds) & ~is_last

@@ -1,7 +1,7 @@
 "use strict";
-// The game: screens, keys and touches, the picture, the table and the curve. Key times are those of the browser's
-// events (`event.timeStamp`), not of the pictures, and every picture is computed anew from all events so far; so an
-// event that is told late still counts from when it happened.
+// The game: screens, keys and touches, the picture, the table and the curve. Key times come from the browser's events
+// (`event.timeStamp`), not from the pictures. Every picture is computed again from all events so far. So an event that
+// the browser reports late still counts from the time when it happened.
 
 (function () {
   const data = window.HPAMDP_DATA;
@@ -9,7 +9,7 @@
   const physics = makePhysics(rules);
   const crew = makeAgents(data, physics);
 
-  const LATE = 0.12; // s that the end of an episode waits for events from before it
+  const LATE = 0.12; // s for which the end of an episode waits for earlier events that are reported late
   const LONGEST = 3600; // s
   const KEYS = {
     Digit1: 0, Numpad1: 0, KeyJ: 0, ArrowLeft: 0,
@@ -96,17 +96,17 @@
   function note(type, key, code, time) {
     if (game.screen !== "sail") return;
     const last = game.events.length ? game.events[game.events.length - 1].t : 0;
-    // Different kinds of events may be told in another order than their times.
+    // The browser may report events of different kinds out of order.
     const t = Math.max((time - game.origin) / 1000, last);
     if (t > LONGEST) return leaveOpen();
     if (game.events.length >= 1990) return;
     game.events.push({ t, type, key, code });
   }
 
-  // Times of more than an hour are refused when an episode is read: this one begins anew, with the choice of a boat.
+  // The check of episodes allows at most an hour. A longer episode starts again, with the choice of a boat.
   function leaveOpen() {
     choose();
-    $("#result").innerHTML = "<p>This episode was open for more than an hour. Choose a boat to begin it anew.</p>";
+    $("#result").innerHTML = "<p>This episode was open for more than an hour. Choose a boat to start it again.</p>";
   }
 
   function releaseAll(event) {
@@ -124,7 +124,7 @@
     } else if (game.screen === "choose" && !event.repeat && (event.code === "KeyC" || event.code === "KeyI")) {
       sail(event.code === "KeyC" ? "congruent" : "incongruent", event.timeStamp);
     } else if (game.screen === "result" && !event.repeat && (event.code === "Enter" || event.code === "Space")) {
-      if (event.target.closest("button:not(#next)")) return; // that button does what it says
+      if (event.target.closest("button:not(#next)")) return; // the focused button handles the key itself
       event.preventDefault();
       next();
     }
@@ -215,7 +215,7 @@
     show("end");
     $("#go-on").hidden = isDone;
     $("#download").disabled = game.stored.length === 0;
-    $("#download").title = game.stored.length ? "" : "Nothing was recorded: you did not agree to it at the start";
+    $("#download").title = game.stored.length ? "" : "Nothing was recorded, because you did not agree at the start";
     $("#end-text").textContent = `${MODES[game.mode]}: ${results.length} episodes${isStopped || isDone ? "" : " so far"}, ` +
       `mean score ${mean(results.map((r) => r.score)).toFixed(2)}, ${percent(share(results))} docked.`;
     if (game.mode === "round") {
@@ -248,7 +248,7 @@
   }
 
   let isSending = false;
-  let isWaiting = false; // and the notice says so
+  let isWaiting = false; // whether the notice says that episodes wait
   async function send() {
     if (isSending) return;
     isSending = true;
@@ -268,7 +268,7 @@
       isWaiting = false;
     } catch (error) {
       const num = game.unsent.length;
-      notice(`${num} ${num === 1 ? "episode waits" : "episodes wait"} for the server (${error.message}); you can go on playing`);
+      notice(`${num} ${num === 1 ? "episode waits" : "episodes wait"} for the server (${error.message}). You can go on playing.`);
       isWaiting = true;
       setTimeout(send, 3000);
     } finally {
@@ -282,11 +282,11 @@
     link.href = URL.createObjectURL(new Blob([text], { type: "application/x-ndjson" }));
     link.download = `episodes-${game.player}.jsonl`;
     link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 10000); // some browsers begin to read it later
+    setTimeout(() => URL.revokeObjectURL(link.href), 10000); // some browsers start reading only later
     game.downloaded = game.stored.length;
   }
 
-  // Episodes that are nowhere else go with the page.
+  // Ask before the page closes if it holds the only copy of an episode.
   window.addEventListener("beforeunload", (event) => {
     if (data.has_server ? game.unsent.length : game.downloaded < game.stored.length) event.preventDefault();
   });
@@ -315,7 +315,7 @@
       `<p>${swatch(COLOURS.plan, "dashed")}Best plan, ${result.better}: ${result.best.toFixed(2)}</p>`,
       ...result.agents.map((sailed, i) =>
         `<p>${swatch(colourOf(i), "solid")}${escape(data.agents[i].title)}, ${sailed.controller}: ${sailed.score.toFixed(2)}</p>`),
-      `<p>People at this bearing: ${percent(chosen)} took the congruent boat, ${percent(1 - chosen)} the incongruent one.</p>`,
+      `<p>People at this bearing: ${percent(chosen)} chose the congruent boat, ${percent(1 - chosen)} the incongruent one.</p>`,
     ];
     $("#result").innerHTML = lines.join("");
   }
@@ -505,7 +505,7 @@
 
   // ---- the start ----
 
-  // The smallest step of the clock that this browser gives a page, s.
+  // The resolution of the clock that this browser gives a page, s.
   function clockStep() {
     let step = Infinity;
     const begun = performance.now();
@@ -521,10 +521,10 @@
   const bytes = crypto.getRandomValues(new Uint8Array(8));
   game.player = Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
   game.resolution = clockStep();
-  $("#consent-text").textContent = "Record my episodes: the times and keys of my presses, the layout, the boat and how it " +
-    "ended, under a random number that is drawn anew each time the page is loaded. " +
+  $("#consent-text").textContent = "Record my episodes: the times and keys of my presses, the layout, the boat and the " +
+    "outcome. They carry a random number, which changes each time the page is loaded. " +
     (data.has_server ? "They are stored in a file on the computer that serves this page." :
-      "They stay in this page until you download them as a file.") + " Without this, nothing is kept.";
+      "They stay in this page until you download them as a file.") + " If you do not agree, nothing is recorded.";
   window.addEventListener("resize", () => {
     if (game.screen === "end") drawCurve(game.results[game.mode]);
     else if (game.screen !== "start") draw(game.screen === "result" ? game.results[game.mode].at(-1) : undefined);

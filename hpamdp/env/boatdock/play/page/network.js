@@ -1,6 +1,6 @@
 "use strict";
-// The agents, in the page: plain matrix products on weights from `data.js`, in the forms that
-// `hpamdp.policies.shared.portable` explains. An agent acts greedily, and each of its presses ends at rest.
+// The agents in the page: matrix products on weights from `data.js`. `hpamdp.policies.shared.exported_policy` explains
+// their form. An agent acts greedily, and each of its presses ends at rest.
 
 function makeAgents(data, physics) {
   const { rules } = data;
@@ -120,7 +120,7 @@ function makeAgents(data, physics) {
     return { name: entry.name, title: entry.title, controller: entry.controller, choose, act, sail };
   }
 
-  // The best plan of a boat; plans are told by the keys of key map 1.
+  // The best plan of a boat. The keys of plans belong to key map 1.
   function sailPlan(layout, controller) {
     const plan = layout.best[controller];
     const sailed = sailPresses(layout, directionsOf(controller, 1), (boat, number) => plan.presses[number] || null);

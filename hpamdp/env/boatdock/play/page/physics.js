@@ -1,7 +1,7 @@
 "use strict";
-// The boat's motion and the rules of the game, in closed form: the same functions as in `hpamdp.env.boatdock.physics`
-// and `hpamdp.env.boatdock.play.replay`, with which a test compares them. The constants come from Python (`data.js`).
-// Lengths are px from the harbour's centre (y down), times seconds.
+// The boat's motion and the rules of the game, in closed form. The functions are those of `hpamdp.env.boatdock.physics`
+// and `hpamdp.env.boatdock.play.replay`, and a test compares them. The constants come from Python (`data.js`).
+// Lengths are px from the harbour's centre (y down), times are seconds.
 
 function makePhysics(rules) {
   const GLIDE = rules.glide;
@@ -53,7 +53,7 @@ function makePhysics(rules) {
     return Math.max(Math.sqrt(Math.max(rules.harbour_radius ** 2 - aside * aside, 0)) - ahead, 0);
   }
 
-  // One press from rest up to the first event: where it ends, the fuel left, how far it went and how it ended.
+  // One press from rest up to the first event: the final position, the fuel left, the distance and the outcome.
   function press(x, y, fuel, goal, dir, wanted) {
     const duration = Math.min(wanted, fuel);
     const pressed = pressedDistance(duration);
@@ -75,7 +75,7 @@ function makePhysics(rules) {
       arrival: speed(virtual) };
   }
 
-  // The presses that raw key events come to: one key at a time, each ended by release, the next key or a blur.
+  // The presses that follow from raw key events. A press ends with the release of its key, the next key or a blur.
   function settle(events) {
     const presses = [];
     let key = -1;
@@ -97,7 +97,7 @@ function makePhysics(rules) {
     return presses.slice(0, rules.max_presses);
   }
 
-  // The boat at the time `now`, given the settled presses; `now = Infinity` plays to the end.
+  // The boat at the time `now`, given the settled presses. `now = Infinity` plays to the end.
   function sail(layout, directions, presses, now) {
     let [x, y] = layout.start;
     let fuel = rules.tank;

@@ -1,4 +1,4 @@
-"""How often people choose each controller in the layouts at hand."""
+"""The probability that people choose each controller in a layout."""
 
 from __future__ import annotations
 
@@ -12,13 +12,17 @@ from hpamdp.env.boatdock.task import BoatState
 
 
 def human_spec(num_envs: int, device: torch.device) -> Composite:
-    """Return the spec of `human_shares`, as the entry `option`."""
-    shares = Bounded(0.0, 1.0, shape=(num_envs, len(harbour.CONTROLLERS)), device=device, dtype=torch.float32)
-    return Composite(option=shares, shape=(num_envs,))
+    """Return the spec of `choice_probabilities`, as the entry `option`."""
+    shape = (num_envs, len(harbour.CONTROLLERS))
+    probabilities = Bounded(0.0, 1.0, shape=shape, device=device, dtype=torch.float32)
+    return Composite(option=probabilities, shape=(num_envs,))
 
 
-def human_shares(state: BoatState) -> Tensor:
-    """Return how often people choose the incongruent and the congruent controller at these bearings, `[N, 2]`."""
+def choice_probabilities(state: BoatState) -> Tensor:
+    """Return the probabilities that people choose the incongruent and the congruent controller, `[N, 2]`.
+
+    They depend on the bearing offset of the layout.
+    """
     layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
     offset = harbour.bearing_offset(layout)
     bins = torch.bucketize(offset, offset.new_tensor(OFFSET_EDGES[1:-1]))
