@@ -93,7 +93,7 @@ def test_trajectories_show_the_paths_and_scores_from_the_best_to_the_worst(tmp_p
         np.testing.assert_array_equal(axes.lines[0].get_xydata(), path[np.isfinite(path).all(1)])
 
 
-def test_choices_show_the_share_of_the_congruent_boat_in_each_bin_with_its_interval(tmp_path):
+def test_choices_show_the_probability_of_the_congruent_boat_in_each_bin_with_its_interval(tmp_path):
     offset = np.repeat([5.0, 15.0, 25.0, 35.0, 45.0, 55.0], 10)
     option = np.tile(np.arange(10) < 7, 6).astype(int)
     write_evaluation(tmp_path, num=60, option=option, controller=option, bearing_offset=offset)
@@ -194,7 +194,7 @@ def spoil_compressed(folder):
         (lambda folder: (folder / "evaluation.npz").write_bytes(pickle.dumps(Bomb())), "evaluation.npz cannot be"),
         (lambda folder: os.mkfifo(folder / "evaluation.npz"), "is a named pipe"),
         (spoil_compressed, "evaluation.npz cannot be read"),
-        (lambda folder: (folder / "summary.json").write_text("[1]"), "it is no JSON object"),
+        (lambda folder: (folder / "summary.json").write_text("[1]"), "it is not a JSON object"),
         (lambda folder: (folder / "summary.json").write_text("[" * 99_999), "summary.json cannot be read"),
         (lambda folder: (folder / "summary.json").symlink_to("/dev/zero"), "is a device"),
     ],

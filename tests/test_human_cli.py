@@ -50,7 +50,7 @@ def error_of(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
 
 def test_check_and_summary_print_what_a_file_holds(capsys, path):
     output = printed(capsys, "check", path, "--any-file")
-    assert "3 people, 210 episodes" in output and "the boat may still have been gliding" in output
+    assert "3 people, 210 episodes" in output and "The boat may still have been gliding" in output
     output = printed(capsys, "summary", path, "--any-file")
     assert re.search(r"^all +210 ", output, re.MULTILINE)
     figures = json.loads(printed(capsys, "summary", path, "--any-file", "--json"))
@@ -62,7 +62,7 @@ def test_check_and_summary_of_the_released_file_print_its_known_figures(capsys, 
     output = printed(capsys, "check")
     for line in (
         "40 people, 14400 episodes, 46757 presses",
-        "without a press 15, with a single one 1823, completely logged 675",
+        "without a press 15, with a single press 1823, completely logged 675",
         "harbour at [640, 512]: 20 people; harbour at [672, 504]: 20 people",
         "key map 1: 36 people; key map 2: 4 people",
         "94.6% of 204 single presses",

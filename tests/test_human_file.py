@@ -244,7 +244,7 @@ def test_foreign_files_are_refused(tmp_path, data):
 WRONG = {
     "R": ("R is not the harbour's radius", lambda v: v - 1),
     "outcome": ("outcome is not 1, 2, 3 or 4", lambda v: v + 4),
-    "tank": ("tank is not a number of frames", lambda v: v + 361),
+    "tank": ("tank is not a number of ticks", lambda v: v + 361),
     "boatchoice": ("boatchoice is not 0 or 1", lambda v: v + 2),
     "incongkm": ("incongkm is not 1 or 2", lambda v: v + 2),
     "boatdir": ("boatdir does not hold the directions", lambda v: -v),

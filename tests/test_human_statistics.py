@@ -35,12 +35,12 @@ def test_scores_are_five_times_the_tank_left_or_minus_one(data):
 def test_no_synthetic_player_beats_the_best_plan(data):
     data = keep(data, torch.arange(len(data.episodes)) < 40)
     gaps = statistics.optimality_gaps(data, statistics.best_scores(data))
-    assert (gaps["press_gap"] > -0.05).all()  # the tank is recorded in whole frames, each worth a score of .014
+    assert (gaps["press_gap"] > -0.05).all()  # the tank is recorded in whole ticks of a score of 0.014
     assert (gaps["choice_gap"] >= 0).all() and (gaps["choice_gap"] > 0).any()
     torch.testing.assert_close(gaps["gap"], gaps["choice_gap"] + gaps["press_gap"])
 
 
-def test_choice_curve_is_the_share_of_congruent_choices_by_bearing(data):
+def test_choice_curve_is_the_probability_of_the_congruent_choice_by_bearing(data):
     offset = harbour.bearing_offset(statistics.layouts(data)).numpy()
     congruent = data.episodes["controller"].numpy() == harbour.CONGRUENT
     expected = [congruent[(offset >= low) & (offset < low + 10)].mean() for low in range(0, 60, 10)]

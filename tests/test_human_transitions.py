@@ -75,7 +75,7 @@ def test_transitions_are_those_of_the_environment_for_the_same_presses(data, rew
             assert torch.equal(ours[keys.OBSERVATION], rows[keys.OBSERVATION])
         scale = 1.0 if observation == "scaled" else 120.0
         for name in (keys.OBSERVATION, ("next", keys.OBSERVATION)):
-            # The tank is recorded in whole frames.
+            # The tank is recorded in whole ticks.
             torch.testing.assert_close(ours[name], rows[name], atol=2e-3 * scale, rtol=1e-3)
         torch.testing.assert_close(ours["next", keys.REWARD], rows["next", keys.REWARD], atol=2e-2, rtol=0)
         for name in (keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED):
@@ -240,7 +240,7 @@ def test_a_foreign_folder_of_rows_runs_no_code_and_is_refused_in_one_line(path, 
     spoil(folder)
     with pytest.raises(DataError, match=said) as refused:
         HumanExperienceReplay(4, **arguments)
-    assert "\n" not in str(refused.value) and str(refused.value).endswith("and it is made again")
+    assert "\n" not in str(refused.value) and str(refused.value).endswith("and the next call makes it again")
     assert not Bomb.is_lit
 
 

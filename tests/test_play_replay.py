@@ -1,4 +1,4 @@
-"""The game's rules: the presses that follow from key events, their effects, and that the page's script does the same."""
+"""The game's rules: the presses that follow from key events, their effects, and the equality of the page's script."""
 
 import json
 import random
@@ -130,7 +130,7 @@ GOOD = docked(1)[0]
         ({"player": "Ada Lovelace"}, "player"),
         ({"address": "secret"}, "address"),
         ({"format": 2}, "format"),
-        ({"score": float("nan")}, "no JSON"),
+        ({"score": float("nan")}, "not a JSON"),
     ],
 )
 def test_an_episode_that_nobody_can_have_played_is_refused_in_a_line(change, said):

@@ -118,7 +118,7 @@ def test_figures_of_one_boat_are_of_its_episodes_alone(file):
 
 def test_the_commands_of_the_recording_work_on_the_file(file, tmp_path, capsys):
     assert main(["check", str(file)]) == 0
-    assert f"every one of {len(EPISODES)} episodes" in capsys.readouterr().out
+    assert f"all {len(EPISODES)} episodes, including practice" in capsys.readouterr().out
     assert main(["summary", str(file), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["all"]["episodes"] == len(EPISODES) - 1
     assert main(["export", str(file), "--format", "csv", "--to", str(tmp_path / "tables"), "--successes"]) == 0
@@ -137,7 +137,7 @@ def test_the_commands_of_the_recording_work_on_the_file(file, tmp_path, capsys):
             json.dumps({**EPISODES[0], "outcome": "too_fast", "score": -1.0}) + "\n",
             "line 1: outcome: too_fast, but the presses lead to success",
         ),
-        (json.dumps(EPISODES[-1]) + "\n", "but those of practice"),
+        (json.dumps(EPISODES[-1]) + "\n", "except practice"),
         ("\x00\xff" * 10 + "\n", "line 1"),
     ],
 )

@@ -124,7 +124,7 @@ def test_idling_at_minus_one_refuels_without_limit_and_success_rewards_the_fuel(
     assert reward == pytest.approx(2.0 * (5.0 + 400.0 + 0.92))
 
 
-def test_the_reward_before_the_end_is_the_decrease_of_the_distance_as_a_share_of_that_at_the_start():
+def test_the_reward_before_the_end_is_the_decrease_of_the_distance_as_a_fraction_of_that_at_the_start():
     env = one()
     place(env, (640.0, 570.0), (640.0, 450.0))
     outcome, reward, *flags = end(press(env, 1, -0.96))

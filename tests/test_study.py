@@ -123,7 +123,7 @@ def test_linked_folders_count_once_and_unreadable_runs_are_named(tmp_path, capsy
     assert sorted(capsys.readouterr().err.splitlines()) == [
         f"{study / 'aliases'}: config.yaml is missing or damaged, left out",
         f"{study / 'cut'}: summary.json is missing or damaged, left out",
-        f"{study / 'gone'}: a link to nothing, left out",
+        f"{study / 'gone'}: is a broken link, left out",
         f"{study / 'nested'}: config.yaml is missing or damaged, left out",
         f"{study / 'pipe'}: summary.json is missing or damaged, left out",
     ]

@@ -26,11 +26,11 @@ from hpamdp.run_files import FIGURES_NAME, MAX_TEXT_BYTES
 def draw_all(output_dir: Path, env: type[PAMDPEnv]) -> list[Path]:
     """Draw all figures for which a run's folder has the files, and return their paths.
 
-    `learning_curves.png` shows `metrics.csv` with the references of `summary.json`. The environment draws its figures
-    from `evaluation.npz`. If a file is missing or broken, its figures are left out.
+    `learning_curves.png` shows `metrics.csv` and the references of `summary.json`. The environment draws its figures
+    from `evaluation.npz`. If a file is missing or damaged, its figures are left out.
 
     Args:
-        output_dir: the run's folder, which gets the figures.
+        output_dir: the run's folder, to which the figures are written.
         env: the environment's class, which names the curves and draws its own figures.
     """
     summary = _read_summary(output_dir / "summary.json")
@@ -52,7 +52,7 @@ def _read_summary(path: Path) -> dict[str, Any]:
     try:
         summary = json.loads(read_regular(path, MAX_TEXT_BYTES)) if path.exists() else {}
         if not isinstance(summary, dict):
-            raise ValueError("it is no JSON object")
+            raise ValueError("it is not a JSON object")
     except (ValueError, OSError, RecursionError) as error:
         warn(f"{path} cannot be read; its references are left out: {one_line(error)}")
         return {}

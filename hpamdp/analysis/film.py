@@ -1,6 +1,6 @@
-"""Write films of episodes: GIF by Pillow, which also draws the pictures, and MP4 by imageio, which has an encoder.
+"""Write films of episodes, as GIF with Pillow or as MP4 with imageio.
 
-Matplotlib's writers are ten times slower, since they draw through a figure. They also need an installed ffmpeg.
+Matplotlib's writers are ten times slower, because they draw through a figure. They also need an installed ffmpeg.
 """
 
 from __future__ import annotations
@@ -17,21 +17,20 @@ from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
 
 SUFFIXES = (".gif", ".mp4")
-GIF_FPS = 50  # pictures per second that a GIF shows at most
+GIF_FPS = 50  # largest number of pictures per second of a GIF
 COLUMNS = 3
-# Seconds that the last picture stays.
-_PAUSE = 1.5
+_PAUSE = 1.5  # seconds for which the last picture stays
 _GIF_COLOURS = 128
 
 Track = Sequence[Mapping[str, Tensor]]
 
 
 class FilmError(ValueError):
-    """Raised if a film cannot be written; the message is one line."""
+    """Raised if a film cannot be written. The message is one line."""
 
 
 def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> list[np.ndarray]:
-    """Return the pictures of episodes side by side, uint8 `[height, width, 3]`; empty if the problem draws none.
+    """Return the pictures of episodes side by side, uint8 `[height, width, 3]`, or none if the problem draws none.
 
     Args:
         env: the problem, which draws the pictures.
@@ -59,7 +58,7 @@ def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = No
 
     Args:
         states: the columns `[N, ...]` at the start and after every step.
-        num_steps: largest number of steps of a track. If None, all steps.
+        num_steps: largest number of steps in a track. If None, all steps.
     """
     if not states or not states[0]:
         return []
@@ -69,10 +68,10 @@ def tracks_of(states: Sequence[Mapping[str, Tensor]], num_steps: int | None = No
 
 
 def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
-    """Write pictures as a GIF that repeats forever, or as an MP4, by the ending of the path.
+    """Write pictures as a GIF that repeats forever or as an MP4, depending on the path's suffix.
 
     Raises:
-        FilmError: the path has another ending, there is no picture, or imageio is missing.
+        FilmError: the path has another suffix, there is no picture, or imageio is missing.
     """
     remaining = iter(pictures)
     first = next(remaining, None)
@@ -89,7 +88,7 @@ def write(path: Path, pictures: Iterable[np.ndarray], fps: float) -> None:
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
     images = [Image.fromarray(picture) for picture in pictures]
-    # All pictures share one palette, made from three of them, since separate palettes would flicker.
+    # All pictures share one palette, made from three of them, because separate palettes would flicker.
     samples = [np.asarray(images[i]) for i in (0, len(images) // 2, -1)]
     palette = Image.fromarray(np.concatenate(samples)).quantize(_GIF_COLOURS)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
@@ -102,7 +101,7 @@ def _write_gif(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
 def _write_mp4(path: Path, pictures: Iterator[np.ndarray], fps: float) -> None:
     try:
         import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401  (the encoder, which imageio misses only when it writes)
+        import imageio_ffmpeg  # noqa: F401  (the encoder; without it imageio fails only when it writes)
     except ImportError as error:
         raise FilmError(f"{path}: imageio is not installed; pip install 'hpamdp[video]', or write a .gif") from error
     encoding = {"fps": fps, "macro_block_size": 2, "codec": "libx264", "quality": 8}

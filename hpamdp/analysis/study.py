@@ -20,7 +20,7 @@ from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_
 
 Rows = list[dict[str, Any]]
 
-MIN_SEEDS = 5  # least number of seeds for an interquartile mean
+MIN_SEEDS = 5  # smallest number of seeds for an interquartile mean
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Run:
 
 
 def finished(folders: Iterable[Path | str]) -> list[Run]:
-    """Return the finished runs under the folders, in the order of their names, and warn about all other runs.
+    """Return the finished runs under the folders, sorted by name, and warn about all other runs.
 
     Links to folders are followed. A run that is found twice counts once.
     """
@@ -60,7 +60,7 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
 
 
 def _run_folders(folder: Path, seen: set[str]) -> Iterator[Path]:
-    """Yield the folders with a summary that are not in `seen`; warn about links to nothing."""
+    """Yield the folders with a summary that are not in `seen`, and warn about broken links."""
 
     def report(error: OSError) -> None:
         warn(f"{error.filename}: {error.strerror}, left out")
@@ -76,14 +76,14 @@ def _run_folders(folder: Path, seen: set[str]) -> Iterator[Path]:
             if name == SUMMARY_NAME:
                 yield Path(path)
             elif not os.path.exists(os.path.join(path, name)):
-                warn(f"{os.path.join(path, name)}: a link to nothing, left out")
+                warn(f"{os.path.join(path, name)}: is a broken link, left out")
 
 
 def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:
-    """Write each table as a csv file of its name, unless one of them has no rows.
+    """Write each table to a csv file of its name.
 
     Raises:
-        SystemExit: a table has no rows; nothing is written.
+        SystemExit: a table has no rows. Then nothing is written.
     """
     empty = [name for name, rows in tables.items() if not rows]
     if empty:
@@ -120,18 +120,18 @@ def groups(rows: Rows, *names: str) -> dict[tuple[Any, ...], Rows]:
 
 
 def first_at(rows: Rows, column: str, level: float) -> dict[str, Any] | None:
-    """Return the first row whose column is at least `level`, such as a run's evaluation; None if there is none."""
+    """Return the first row whose column is at least `level`, or None. A row may be an evaluation of a run."""
     return next((row for row in rows if row[column] >= level), None)
 
 
 def spread(values: Sequence[float], digits: int = 3) -> str:
-    """Return mean ± standard deviation (of a sample, n - 1) over seeds, or the single value."""
+    """Return a text: mean ± standard deviation (of a sample, n - 1) over seeds, or a single value."""
     mean = f"{np.mean(values):.{digits}f}"
     return f"{mean} ± {np.std(values, ddof=1):.{digits}f}" if len(values) > 1 else mean
 
 
 def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
-    """Return the mean of the middle half, and its 95 % bootstrap interval over seeds.
+    """Return the mean of the middle half, and the bounds of its 95 % bootstrap interval over seeds.
 
     With fewer than `MIN_SEEDS` values it is close to the plain mean, so `middle_half` omits it.
 
@@ -145,7 +145,7 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def middle_half(values: Sequence[float]) -> str:
-    """Return the interquartile mean and its interval, empty with fewer than `MIN_SEEDS` seeds."""
+    """Return a text with the interquartile mean and its interval. It is empty with fewer than `MIN_SEEDS` seeds."""
     if len(values) < MIN_SEEDS:
         return ""
     middle, low, high = interquartile_mean(values)
@@ -218,7 +218,7 @@ def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., np.ndarr
 
 
 def curve(runs: Rows, x: str, y: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `x`, and the mean and standard deviation of `y` over seeds, up to the shortest run.
+    """Return `x`, and the mean and the standard deviation of `y` over seeds, up to the end of the shortest run.
 
     The standard deviation is that of a sample, as in `spread`. With one seed it is 0.
     """

@@ -1,4 +1,4 @@
-"""The command line of the recording: `python -m hpamdp.data.human download | check | summary | export`."""
+"""The command line for the recording: `python -m hpamdp.data.human download | check | summary | export`."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
     Args:
-        arguments: the words after the program's name; None: those it was started with.
+        arguments: the words after the program's name. If None, the words from the command line.
 
     Returns:
-        The exit code: 0, 1 if stdout takes no text, 2 after an error (printed to stderr in one line) or 130 after an
-        interrupt.
+        The exit code: 0 after success, 1 if stdout cannot be written, 2 after an error, 130 after an interrupt. An
+        error is printed to stderr in one line.
     """
     reopen_standard_streams()
     with lenient_streams():
@@ -54,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except SystemExit as stop:
             if stop.code or lost_output() is None:
                 raise
-            code = 0  # argparse has shown its help
+            code = 0  # argparse has printed its help
         error = lost_output()
         if code or error is None:
             return code
@@ -76,7 +76,7 @@ def _main(arguments: Sequence[str] | None) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line, like all of hpamdp's."""
+    """A parser that reports errors in one line, like all of hpamdp."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(_USAGE_ERROR, f"{message}; see --help\n")
@@ -85,7 +85,7 @@ class _Parser(argparse.ArgumentParser):
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="python -m hpamdp.data.human",
-        description="The recording of 40 people at the boat-docking task: fetch, check, summarise and export it.",
+        description="Fetch, check, summarise and export the recording of 40 people at the boat-docking task.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=_Parser)
 
@@ -102,24 +102,24 @@ def _parser() -> argparse.ArgumentParser:
         help=f"the recording (default: ${PATH_VARIABLE}, else the one in the cache), or a .jsonl of `hpamdp play`",
     )
     file_arguments.add_argument(
-        "--any-file", action="store_true", help="take any file of the same schema, whatever its checksum"
+        "--any-file", action="store_true", help="accept any file of the same schema, whatever its checksum"
     )
 
     check_parser = commands.add_parser(
-        "check", parents=[file_arguments], help="check the file's contents, and our physics against them"
+        "check", parents=[file_arguments], help="check the file's contents, and compare our physics with them"
     )
     check_parser.set_defaults(run=_check)
 
     summary_parser = commands.add_parser(
         "summary", parents=[file_arguments], help="print people's scores, outcomes and choices"
     )
-    summary_parser.add_argument("--json", action="store_true", help="as json, by person, block and controller")
+    summary_parser.add_argument("--json", action="store_true", help="print json, by person, block and controller")
     summary_parser.set_defaults(run=_summary)
 
     export_parser = commands.add_parser(
         "export", parents=[file_arguments], help="write the tables or the transitions for other programs"
     )
-    export_parser.add_argument("--to", required=True, help="file or folder to make, or the Minari data set's name")
+    export_parser.add_argument("--to", required=True, help="file or folder to make, or name of the Minari data set")
     export_parser.add_argument("--format", required=True, choices=(*_TABLE_FORMATS, *_TRANSITION_FORMATS))
     export_parser.add_argument("--complete", action="store_true", help="only completely logged episodes")
     export_parser.add_argument("--successes", action="store_true", help="only episodes that ended in the dock")
@@ -147,7 +147,7 @@ def _read(options: argparse.Namespace, one_frame: bool = False) -> HumanData:
 
 
 def _is_played(options: argparse.Namespace) -> bool:
-    """Return whether the file is one of `hpamdp play`."""
+    """Return whether the file comes from `hpamdp play`."""
     return options.file is not None and options.file.suffix == played_file.SUFFIX
 
 
@@ -158,18 +158,18 @@ def _download(options: argparse.Namespace) -> None:
 def _check(options: argparse.Namespace) -> None:
     if _is_played(options):
         num = played_file.verify(options.file)
-        checksum = f"every one of {num} episodes, practice too, is what its key events come to"
+        checksum = f"all {num} episodes, including practice, follow from their key events"
     else:
         checksum = "any file was allowed" if options.any_file else f"SHA-256 {SHA256}"
     data = _read(options)
     episodes, presses = data
     people = episodes["person"].unique()
     say(f"{options.file or default_path()}: {checksum}")
-    say(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses; contents fit together")
+    say(f"{len(people)} people, {len(episodes)} episodes, {len(presses)} presses; contents are consistent")
     num_empty = (episodes["presses"] == 0).sum()
     num_single = (episodes["presses"] == 1).sum()
     say(
-        f"episodes without a press {num_empty}, with a single one {num_single}, "
+        f"episodes without a press {num_empty}, with a single press {num_single}, "
         f"completely logged {episodes['complete'].sum()}"
     )
     first_episodes = torch.stack([(episodes["person"] == person).nonzero()[0, 0] for person in people])
@@ -178,18 +178,18 @@ def _check(options: argparse.Namespace) -> None:
     say(f"longest press {presses['duration'].max():.2f} s")
     singles = validation.single_presses(data)
     if len(singles.outcome):
-        share = validation.agreement(singles)
-        say(f"replayed in our physics: {share:.1%} of {len(singles.outcome)} single presses end as recorded")
+        fraction = validation.agreement(singles)
+        say(f"replayed in our physics: {fraction:.1%} of {len(singles.outcome)} single presses end as recorded")
     firsts = validation.first_presses(data)
     if len(firsts.is_inside):
-        share = firsts.is_inside.float().mean().item()
-        say(f"first presses go as far as our physics allows: {share:.1%} of {len(firsts.is_inside)}")
+        fraction = firsts.is_inside.float().mean().item()
+        say(f"first presses cover a distance that our physics allows: {fraction:.1%} of {len(firsts.is_inside)}")
     if not _is_played(options):
-        say("\n- ".join(("To know:", *QUIRKS)))
+        say("\n- ".join(("Know before you use it:", *QUIRKS)))
 
 
 def _print_counts(name: str, values: Tensor) -> None:
-    """Print how many people have each of the values `[people]` or `[people, K]`."""
+    """Print the number of people with each distinct value of `[people]` or `[people, K]`."""
     distinct, counts = values.unique(dim=0, return_counts=True)
     say(
         "; ".join(
@@ -211,7 +211,7 @@ def _summary(options: argparse.Namespace) -> None:
             "controller": by_controller,
             "block": by_block,
             "person": by_person,
-            "congruent_by_offset": [None if math.isnan(share) else share for share in curve],
+            "congruent_by_offset": [None if math.isnan(probability) else probability for probability in curve],
         }
         say(json.dumps(summary, indent=1))
         return
@@ -225,7 +225,7 @@ def _summary(options: argparse.Namespace) -> None:
     _print_row(f"best person ({best})", by_person[best])
     say("congruent controller chosen, by degrees between the bearing and its nearest direction:")
     bins = zip(OFFSET_EDGES[:-1], OFFSET_EDGES[1:], curve, strict=True)
-    say(", ".join(f"{low}-{high}: {share:.3f}" for low, high, share in bins))
+    say(", ".join(f"{low}-{high}: {probability:.3f}" for low, high, probability in bins))
 
 
 def _print_row(name: str, figures: Figures) -> None:

@@ -26,7 +26,7 @@ from hpamdp.env.boatdock.task import MAX_PRESSES, ObservationForm, RewardForm
 from hpamdp.messages import reason_of
 from hpamdp.specs import PAMDPSpecs
 
-_FORMAT = 1  # raise it if the transitions of the same file change
+_FORMAT = 1  # increase it if the transitions of the same file change
 
 
 def slices(length: int) -> SliceSampler:
@@ -45,24 +45,25 @@ def whole_episodes() -> SliceSampler:
 class HumanExperienceReplay(BaseDatasetExperienceReplay):
     """The recorded presses, sampled by press, slice or episode, in the keys and observations of BoatDockEnv.
 
-    `hpamdp.data.human.transitions` gives the rows, and explains what it fills in. The first use makes memory-mapped
-    files, which all processes share that ask for the same rows.
+    The rows come from `hpamdp.data.human.transitions`, which also explains the values that it fills in. The first use
+    makes memory-mapped files. All processes that ask for the same rows share them.
 
     Args:
         batch_size: rows in a sample.
         path: the released file. If None, `released_file.default_path`.
         root: folder of the memory-mapped files. If None, the user's cache.
-        complete, successes, best_people, controller: which episodes, as in `hpamdp.data.human.episodes.select`.
+        complete, successes, best_people, controller: conditions on episodes, as in
+            `hpamdp.data.human.episodes.select`.
         reward, observation, has_choice: as in `hpamdp.data.human.transitions.transitions`.
-        sampler: a TorchRL sampler. If None, presses at random. `slices(length)` and `whole_episodes()` keep successive
-            presses together.
+        sampler: a TorchRL sampler. If None, it samples presses at random. `slices(length)` and `whole_episodes()` keep
+            successive presses together.
         transform: a TorchRL transform, applied to every sample.
-        checksum: the SHA-256 that the file must have. If None, any.
-        options: further arguments of TorchRL's TensorDictReplayBuffer.
+        checksum: the SHA-256 that the file must have. If None, any file is accepted.
+        buffer_arguments: further arguments of TorchRL's TensorDictReplayBuffer.
 
     Raises:
-        DataError: the file is missing or not the right one, an argument is out of range, no episode is left, or `root`
-            has files of other rows.
+        DataError: the file is missing or has another checksum, an argument is out of range, no episode is left, or
+            `root` has files with other rows.
     """
 
     def __init__(
@@ -81,7 +82,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         sampler: Sampler | None = None,
         transform: Callable[[TensorDict], TensorDict] | None = None,
         checksum: str | None = SHA256,
-        **options: Any,
+        **buffer_arguments: Any,
     ) -> None:
         self.root = user_cache_path("hpamdp") / "datasets" if root is None else Path(root)
         if checksum is None:
@@ -108,7 +109,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
             try:
                 write_memmap(rows, self.data_path)
             except DataError:
-                if not self._is_downloaded():  # otherwise another process was faster
+                if not self._is_downloaded():  # otherwise another process has just written the files
                     raise
         super().__init__(
             storage=TensorStorage(self._checked_rows(reward, observation, has_choice)),
@@ -116,7 +117,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
             writer=ImmutableDatasetWriter(),
             batch_size=batch_size,
             transform=transform,
-            **options,
+            **buffer_arguments,
         )
 
     @property
@@ -130,7 +131,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
         return self.root / self._name
 
     def _checked_rows(self, reward: RewardForm, observation: ObservationForm, has_choice: bool) -> TensorDict:
-        """Return the checked rows of the files, which may be somebody else's."""
+        """Load and check the rows, because another program may have written the files."""
         controller = "choose" if has_choice else "random"
         env = BoatDockEnv(1, controller=controller, reward=reward, observation=observation)
         try:
@@ -138,7 +139,7 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
             check_transitions(rows)
             check_actions(rows, PAMDPSpecs.from_env(env))
         except DataError as error:
-            raise DataError(f"{error}; remove {self.data_path}, and it is made again") from error
+            raise DataError(f"{error}; remove {self.data_path}, and the next call makes it again") from error
         return rows
 
     def _is_downloaded(self) -> bool:
@@ -149,6 +150,6 @@ class HumanExperienceReplay(BaseDatasetExperienceReplay):
 
 
 def _name(**settings: Any) -> str:
-    """Return the name of the folder with the rows of these settings."""
+    """Return the name of the folder for the rows of these settings."""
     text = json.dumps({**settings, "format": _FORMAT}, sort_keys=True)
     return f"human-{hashlib.sha256(text.encode()).hexdigest()[:16]}"

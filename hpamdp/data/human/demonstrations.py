@@ -21,51 +21,51 @@ from hpamdp.settings import SettingError, Settings
 
 
 class PeoplesOptions(Settings):
-    """Settings of people's presses: which episodes, and in which form."""
+    """Settings that select people's episodes and the form of their presses."""
 
     successes: bool = False
     """Take only episodes that ended in the dock."""
     best_people: PositiveInt | None = None
-    """Take only episodes of this many people, those with the highest mean score. If None, of all."""
+    """Take only episodes of this many people with the highest mean scores. If None, of all people."""
     rest_to_rest: bool = True
-    """Convert presses that the next one interrupted to rest-to-rest presses, the only ones that the environment has."""
+    """Convert interrupted presses to rest-to-rest presses, the only presses that the environment has."""
 
 
 class HumanOptions(PeoplesOptions):
     """Settings of `HumanDemonstrations`."""
 
     path: str | None = None
-    """The released file. If None, the path in $HPAMDP_HUMAN_DATA, else the file that was downloaded."""
+    """The released file. If None, the path in $HPAMDP_HUMAN_DATA, or else the downloaded file."""
     checksum: str | None = SHA256
-    """The SHA-256 that the file must have, by default the released file's. If None, any."""
+    """The SHA-256 that the file must have, by default the released file's. If None, any file is accepted."""
     complete: bool = False
-    """Take only episodes whose log misses no press."""
+    """Take only episodes with a complete log of presses."""
 
 
 class PlayedOptions(PeoplesOptions):
     """Settings of `PlayedDemonstrations`."""
 
     path: str = "played.jsonl"
-    """The file of episodes. Lines that are no episode are left out, with a warning."""
+    """The file of episodes. Lines without a valid episode are left out, with a warning."""
     practice: bool = False
-    """Take episodes of practice, too."""
+    """Also take practice episodes."""
 
 
 class HumanDemonstrations(Demonstrations):
     """The recorded presses of the selected episodes, as the given environment would have returned them.
 
-    If the environment has a fixed key map, each key is replaced by the one that pushes the boat in the same direction
-    under that key map. If it has a fixed controller, only the episodes with this controller are taken.
+    If the environment has a fixed key map, each key is replaced by the key that pushes in the same direction under that
+    key map. If it has a fixed controller, only the episodes with this controller are taken.
 
-    Selectors learn from all episodes as they were recorded, with their outcomes and their remaining fuel. Neither
-    missing presses nor `rest_to_rest` changes that.
+    Selectors learn from all episodes with their recorded outcomes and their recorded remaining fuel. Missing presses
+    and `rest_to_rest` do not change that.
 
     Args:
         env: the boat-docking environment, which determines controller, key map, reward and observation.
 
     Raises:
         ValueError: `env` is not a boat-docking environment.
-        DataError: the file is missing or not the right one, or no episode is left.
+        DataError: the file is missing or has another checksum, or no episode is left.
     """
 
     Options = HumanOptions
@@ -80,7 +80,7 @@ class HumanDemonstrations(Demonstrations):
 
 
 class PlayedDemonstrations(Demonstrations):
-    """The presses of episodes that were played in the page of `hpamdp play`, otherwise as in `HumanDemonstrations`.
+    """The presses of episodes that were played on the page of `hpamdp play`. Otherwise as `HumanDemonstrations`.
 
     Args:
         env: the boat-docking environment, which determines controller, key map, reward and observation.
@@ -117,7 +117,7 @@ def _controller_of(env: BoatDockEnv) -> str | None:
 def _as_returned(
     data: HumanData, env: BoatDockEnv, options: PeoplesOptions, *, complete: bool = False
 ) -> tuple[TensorDict, TensorDict | None]:
-    """Return the transitions and, if the agent chooses, the decisions, as the environment would have them."""
+    """Return the transitions and, if the agent chooses, the decisions, as the environment would return them."""
     rules = env.rules
     data = select(
         data,
@@ -136,7 +136,7 @@ def _as_returned(
 
 
 def with_keymap(data: HumanData, keymap: int) -> HumanData:
-    """Return the recording under one key map: each press has the key that pushes the boat in the same direction."""
+    """Return the recording under one key map. Each press gets the key that pushes the boat in the same direction."""
     episodes = data.episodes[data.presses["episode"]]  # the episode of each press
     controller = episodes["controller"].int()
     recorded_key = data.presses["key"].int()

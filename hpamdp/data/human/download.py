@@ -1,4 +1,4 @@
-"""The released file, fetched into the user's cache and kept only if it is the right one."""
+"""Download of the released file into the user's cache, with a check of its checksum."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from hpamdp.messages import reason_of
 
 
 def download(url: str, target: Path | None = None, *, checksum: str = SHA256) -> Path:
-    """Fetch the file and return its path; an existing file is checked and kept.
+    """Fetch the file and return its path. An existing file is only checked.
 
-    The download appears at the target once it is whole and its checksum is right. Otherwise nothing is left behind. The
-    next call does not resume a broken download but starts again (the file has 4 MB).
+    The file appears at the target when the download is complete and its checksum is right. A failed download leaves
+    nothing behind, and the next call starts again (the file has 4 MB).
 
     Args:
-        url: of any kind that pooch fetches, such as `https://…` or `doi:…/<file>`.
+        url: address of any kind that pooch supports, such as `https://…` or `doi:…/<file>`.
         target: the file to make. If None, `released_file.default_path`.
         checksum: the SHA-256 that the file must have.
 
     Raises:
-        DataError: the file cannot be fetched, or it is another one.
+        DataError: the file cannot be fetched, or it has another checksum.
     """
     target = default_path() if target is None else target
     try:
@@ -36,7 +36,7 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
     if is_there:
         check_sum(load_bytes(target), checksum, target)
         return target
-    pooch.get_logger().setLevel(logging.WARNING)  # no lines about what it fetches
+    pooch.get_logger().setLevel(logging.WARNING)  # silence pooch's lines about each download
     try:
         pooch.retrieve(
             url,
@@ -45,7 +45,7 @@ def download(url: str, target: Path | None = None, *, checksum: str = SHA256) ->
             path=target.parent,
             progressbar=sys.stderr.isatty(),
         )
-    # requests raises OSErrors. An archive without the file raises a LookupError.
+    # The requests library raises OSErrors. An archive without the file raises a LookupError.
     except (OSError, ValueError, EOFError, LookupError, ftplib.Error) as error:
         raise DataError(f"{url}: cannot be fetched ({error}); you can also put the file at {target} by hand") from error
     return target

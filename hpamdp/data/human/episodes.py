@@ -16,13 +16,13 @@ def score(data: HumanData) -> Tensor:
 
 
 def scores_by_person(data: HumanData) -> Tensor:
-    """Return the mean score of each person from 0 to the highest number in `person`, `[P]`; NaN without episodes."""
+    """Return the mean score of each person from 0 to the highest number in `person`, `[P]`. NaN without episodes."""
     person = data.episodes["person"]
     return torch.bincount(person, score(data)) / torch.bincount(person)
 
 
 def keep(data: HumanData, mask: Tensor) -> HumanData:
-    """Return the episodes of `mask` `[E]` with their presses, whose `episode` is the row in the new table."""
+    """Return the episodes of `mask` `[E]` with their presses. `episode` is then the row in the new table."""
     new_row = mask.cumsum(0) - 1
     episode = data.presses["episode"]
     presses = data.presses[mask[episode]].clone()
@@ -41,10 +41,10 @@ def select(
     """Return the episodes that meet every condition.
 
     Args:
-        complete: only episodes whose log misses no press.
+        complete: only episodes with a complete log of presses.
         successes: only episodes that ended in the dock.
-        best_people: only episodes of this many people, those with the highest mean score over all their episodes in
-            `data`. If None, of all.
+        best_people: only episodes of this many people with the highest mean scores over all their episodes in `data`.
+            If None, of all people.
         controller: only episodes with the `congruent` or the `incongruent` controller. If None, with either.
 
     Raises:

@@ -1,9 +1,9 @@
 """A bounded reader of the part of MATLAB's level 5 MAT format that the recording uses.
 
-SciPy's reader is not used because a damaged file can break it: cells nested 30,000 deep crash the interpreter, and a
-cell array whose header claims 2^30 entries takes 8 GB. This reader checks every length against the bytes of the file,
-and opens an array only when its contents are needed. It reads numeric arrays, cells and structs, compressed or not, in
-little-endian order. Source: MathWorks, *MAT-File Format*, "Level 5 MAT-File Format".
+A damaged file can break SciPy's reader: cells nested 30,000 deep crash the interpreter, and a cell array whose header
+claims 2^30 entries takes 8 GB. This reader checks every length against the bytes of the file, and opens an array only
+if its contents are needed. It reads numeric arrays, cells and structs, compressed or not, in little-endian order.
+Source: MathWorks, *MAT-File Format*, "Level 5 MAT-File Format".
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _COMPRESSED = 15
 _FORMATS = {1: "i1", 2: "u1", 3: "<i2", 4: "<u2", 5: "<i4", 6: "<u4", 7: "<f4", 9: "<f8", 12: "<i8", 13: "<u8"}
 _DTYPES = {code: np.dtype(name) for code, name in _FORMATS.items()}
 _MAX_INFLATED = 64 * 2**20  # bytes; the released file takes about 20 million
-_MAX_OTHERS = 100  # variables before the one that is looked for; the released file has no other
+_MAX_OTHERS = 100  # largest number of variables before the wanted one; the released file has no other variable
 
 _tag = struct.Struct("<II").unpack_from  # an element's type and size
 
@@ -66,7 +66,7 @@ def _element(data: memoryview, offset: int) -> _Element:
 
 
 class MatArray:
-    """An array of a MAT file. Only its header is read; `numbers`, `cells` and `fields` read the contents.
+    """An array of a MAT file. Only its header is read. `numbers`, `cells` and `fields` read the contents.
 
     Args:
         content: the bytes of the array's element.
@@ -105,7 +105,7 @@ class MatArray:
         """Return the values of a numeric array, column by column, float64 `[size]`.
 
         Raises:
-            DataError: it is not an array of real numbers, or its bytes are damaged.
+            DataError: the array has no real numbers, or its bytes are damaged.
         """
         if self._kind not in _NUMERIC or self._is_complex:
             raise DataError(f"an array of class {self._kind} where real numbers were expected")
@@ -119,17 +119,17 @@ class MatArray:
         """Yield the arrays in a cell array, column by column.
 
         Raises:
-            DataError: it is no cell array, or its bytes are damaged.
+            DataError: the array is not a cell array, or its bytes are damaged.
         """
         if self._kind != _CELL:
             raise DataError(f"an array of class {self._kind} where a cell array was expected")
         yield from self._arrays(self._start, self.size)
 
     def fields(self) -> dict[str, MatArray]:
-        """Return the fields of a struct of size 1, by their names.
+        """Return the fields of a struct of size 1 by name.
 
         Raises:
-            DataError: it is no such struct, or its bytes are damaged.
+            DataError: the array is not such a struct, or its bytes are damaged.
         """
         if self._kind != _STRUCT or self.size != 1:
             raise DataError(f"an array of class {self._kind} and size {self.size} where one struct was expected")

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 LAYOUT = generic.MinariLayout(discrete="key", parameters="duration", infos=("outcome", "fuel"))
 
 _DESCRIPTION = (
-    "People docking boats with one of two controllers, from BDtrajectory40.mat. Rows are logged presses; presses that "
-    "overlapped another are missing; the observation after a final press is filled in. Infos: outcome, fuel."
+    "People docking boats with one of two controllers, from BDtrajectory40.mat. Rows are logged presses. Presses that "
+    "overlapped another are missing. The observation after a final press is filled in. Infos: outcome, fuel."
 )
 
 
@@ -30,11 +30,11 @@ def export(batch: TensorDict, dataset_id: str) -> minari.MinariDataset:
     Actions are the dicts of `hpamdp/BoatDock-v0`; `outcome` (an index of `physics.OUTCOMES`) and `fuel` are infos.
 
     Args:
-        batch: `[N]`, in the order of episodes and presses.
-        dataset_id: such as `hpamdp/people-v0`; it must not exist yet.
+        batch: transitions `[N]`, in the order of episodes and presses.
+        dataset_id: name of the new data set, such as `hpamdp/people-v0`.
 
     Raises:
-        DataError: Minari is missing or refuses the data, or the data set exists.
+        DataError: Minari is missing or rejects the data, or the data set already exists.
     """
     is_scaled = batch[keys.OBSERVATION].shape[-1] == len(SCALED_NAMES)
     return generic.export(
@@ -52,10 +52,10 @@ def export(batch: TensorDict, dataset_id: str) -> minari.MinariDataset:
 
 
 def load(dataset_id: str) -> TensorDict:
-    """Return a Minari data set that `export` wrote as the transitions `[N]` that it was made of.
+    """Load a Minari data set that `export` wrote, as transitions `[N]`.
 
     Raises:
-        DataError: Minari is missing, there is no such data set, or it holds something else.
+        DataError: Minari is missing, the data set does not exist, or it has other contents.
     """
     batch = generic.load(dataset_id, LAYOUT)
     if not (batch["next", keys.OUTCOME] < len(physics.OUTCOMES)).all():

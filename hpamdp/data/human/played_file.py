@@ -1,10 +1,10 @@
-"""Episodes that were played in a page (`hpamdp play`), read into the tables of the recording of 40 people.
+"""Episodes that were played on a page (`hpamdp play`), read into the tables of the recording of 40 people.
 
 Differences from that recording:
-- every press is logged, so all episodes are complete;
-- an interrupted press has its duration until the interruption;
-- `person` numbers the players in their order in the file;
-- `tank` is the fuel in whole frames.
+- Every press is logged, so all episodes are complete.
+- An interrupted press has its duration until the interruption.
+- `person` numbers the players in their order in the file.
+- `tank` is the fuel in whole ticks.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from hpamdp.data.errors import DataError
-from hpamdp.data.human.released_file import EPISODES_PER_BLOCK, FRAMES_PER_SECOND, HumanData, table
+from hpamdp.data.human.released_file import EPISODES_PER_BLOCK, TICKS_PER_SECOND, HumanData, table
 from hpamdp.env.boatdock import harbour, physics
 from hpamdp.env.boatdock.play import episodes as played
 from hpamdp.env.boatdock.play.episodes import Episode
@@ -26,11 +26,11 @@ SUFFIX = ".jsonl"
 
 
 def read(path: Path | str, *, practice: bool = False) -> HumanData:
-    """Read a file of played episodes; leave out lines that hold no episode, with a warning.
+    """Read a file of played episodes. Lines without a valid episode are left out, with a warning.
 
     Args:
-        path: the file that `hpamdp play` wrote, or that its page downloaded.
-        practice: whether the episodes of practice count, too.
+        path: a file written by `hpamdp play` or downloaded from its page.
+        practice: whether practice episodes also count.
 
     Raises:
         DataError: the file cannot be read, or no episode counts.
@@ -41,12 +41,12 @@ def read(path: Path | str, *, practice: bool = False) -> HumanData:
         raise DataError(str(error)) from error
     counted = [episode for episode in read_episodes if practice or episode.mode != played.PRACTICE]
     if not counted:
-        raise DataError(f"{path}: no episode{' but those of practice' if read_episodes else ''}")
+        raise DataError(f"{path}: no episode{' except practice' if read_episodes else ''}")
     return _tables(counted)
 
 
 def verify(path: Path | str) -> int:
-    """Check every line of a file as the page's server does, from the raw events on; return how many episodes there are.
+    """Check every line of a file from its raw events on, as the page's server does, and return the number of episodes.
 
     Raises:
         DataError: the file cannot be read, or a line holds no valid episode or repeats an earlier one.
@@ -57,7 +57,7 @@ def verify(path: Path | str) -> int:
         raise DataError(str(error)) from error
     if problems:
         number, problem = min(problems.items())
-        raise DataError(f"{path}, line {number}: {problem}; {len(found)} of {len(found) + len(problems)} are right")
+        raise DataError(f"{path}, line {number}: {problem}; {len(found)} of {len(found) + len(problems)} are valid")
     return len(found)
 
 
@@ -88,7 +88,7 @@ def _tables(episodes: list[Episode]) -> HumanData:
             keymap=np.array([episode.keymap for episode in episodes]),
             presses=num_presses,
             outcome=outcome,
-            tank=np.rint(_numpy(sailed.fuel) * FRAMES_PER_SECOND).astype(np.int64),
+            tank=np.rint(_numpy(sailed.fuel) * TICKS_PER_SECOND).astype(np.int64),
             complete=np.ones(len(episodes), bool),
             start=np.array([episode.start for episode in episodes]) + centre,
             goal=goal,
@@ -115,7 +115,7 @@ def _numpy(values: Tensor) -> np.ndarray:
 
 
 def _count(person: np.ndarray) -> np.ndarray:
-    """Return the number of each episode among those of its person, in the order of the file."""
+    """Return the number of each episode among its person's episodes, in the order of the file."""
     index = np.zeros_like(person)
     for each in np.unique(person):
         index[person == each] = np.arange((person == each).sum())

@@ -1,8 +1,8 @@
 """The released recording of people at the task, read into two tables.
 
 The file is `BDtrajectory40.mat`, released with *A Benchmark for Hierarchical Parameterized Action Markov Decision
-Process* (MIT licence): 40 people, 360 episodes each. The log drops presses that overlapped another, so only a
-twentieth of the episodes are completely logged; `QUIRKS` lists what else to know before using it.
+Process* (MIT licence): 40 people, 360 episodes each. The log drops presses that overlapped another, so only a twentieth
+of the episodes are completely logged. `QUIRKS` lists further properties that users should know.
 """
 
 from __future__ import annotations
@@ -28,36 +28,40 @@ FILE_NAME = "BDtrajectory40.mat"
 SHA256 = "9de16874b43de9e377c2c10749cb2bd435a6db3ca7cead445b826d64ec399d20"
 PATH_VARIABLE = "HPAMDP_HUMAN_DATA"  # environment variable with the file's path
 
-FRAMES_PER_SECOND = 60
-FULL_TANK = int(physics.TANK * FRAMES_PER_SECOND)
+TICKS_PER_SECOND = 60
+FULL_TANK = int(physics.TANK * TICKS_PER_SECOND)
 EPISODES_PER_BLOCK = 60
-_LOG_TOLERANCE = 2.5  # frames by which the tank and the logged presses may differ in a complete log
+_LOG_TOLERANCE = 2.5  # ticks by which the tank and the logged presses may differ in a complete log
 _MAX_BYTES = 64 * 2**20  # larger files are not read; the released one has 4 million
 
-# The environment's numbers of the file's outcomes 1 to 4.
+# The environment's numbers for the file's outcomes 1 to 4.
 _OUTCOMES = np.array([physics.OUT_OF_FUEL, physics.SUCCESS, physics.TOO_FAST, physics.OUT_OF_BOUNDS])
 
 QUIRKS = (
-    "A press's next position is where the next logged press began: the boat may still have been gliding.",
-    "An episode's final press has no next position (NaN here); where a single press was logged, `obs` is empty.",
-    "Presses that overlapped another are not logged; in some episodes not even the first or the only one.",
-    "`gas` (1 - sum of x / 5) ignores the presses that are not logged; `tank` (frames left of 360) counts them.",
-    "`complete` marks the episodes whose log agrees with the tank: |tank + 60 x sum of x - 360| <= 2.5 frames.",
+    "A press's next position is where the next logged press began. The boat may still have been gliding.",
+    "An episode's final press has no next position (NaN here). If a single press was logged, `obs` is empty.",
+    "Presses that overlapped another are not logged. In some episodes the first or the only press is missing.",
+    "`gas` (1 - sum of x / 5) ignores the missing presses. `tank` (ticks left of 360) counts them.",
+    "`complete` marks the episodes whose log agrees with the tank: |tank + 60 x sum of x - 360| <= 2.5 ticks.",
 )
 
 
 class HumanData(NamedTuple):
     """The recording: a table of episodes and a table of logged presses. Lengths are in screen px (y points down).
 
-    Attributes:
-        episodes: `[E]`, with the int64 columns `person`, `index` (number of the person's episode), `block` (of 60
-            episodes), `controller` (0 incongruent, 1 congruent), `keymap` (1 or 2), `presses` (how many are logged),
-            `outcome` (index of `physics.OUTCOMES`) and `tank` (frames of fuel left, of 360); `complete` (bool); and
-            `start`, `goal`, `centre` (float32 `[E, 2]`).
-        presses: `[N]`, with the int64 columns `episode` (row of `episodes`), `press` (number in the episode) and `key`;
-            `is_final` (bool); and float32 `position` and `next_position` (`[N, 2]`, where this press and the next one
-            began, the latter NaN for a final press), `duration` (s), `speed` (px/s, at release), `distance` (to the
-            goal when the press began) and `gas`.
+    Columns of `episodes` `[E]`:
+    - int64: `person`, `index` (number of the person's episode), `block` (of 60 episodes), `controller` (0 incongruent,
+      1 congruent), `keymap` (1 or 2), `presses` (number of logged presses), `outcome` (index of `physics.OUTCOMES`) and
+      `tank` (ticks of fuel left, of 360).
+    - bool: `complete`.
+    - float32 `[E, 2]`: `start`, `goal` and `centre`.
+
+    Columns of `presses` `[N]`:
+    - int64: `episode` (row of `episodes`), `press` (number in the episode) and `key`.
+    - bool: `is_final`.
+    - float32 `[N, 2]`: `position` and `next_position`, where this press and the next one began. The latter is NaN for a
+      final press.
+    - float32: `duration` (s), `speed` (px/s, at release), `distance` (to the goal when the press began) and `gas`.
     """
 
     episodes: TensorDict
@@ -65,7 +69,7 @@ class HumanData(NamedTuple):
 
 
 def default_path() -> Path:
-    """Return the expected path of the file: the one in the environment variable, else one in the user's cache."""
+    """Return the expected path of the file, from the environment variable or else in the user's cache."""
     path = os.environ.get(PATH_VARIABLE)
     return Path(path) if path else user_cache_path("hpamdp") / FILE_NAME
 
@@ -75,12 +79,12 @@ def read(path: Path | str | None = None, *, checksum: str | None = SHA256, one_f
 
     Args:
         path: the file. If None, `default_path`.
-        checksum: the SHA-256 that the file must have. If None, any, as long as the contents are consistent.
-        one_frame: whether to move every position so that all harbours have the environment's centre, (640, 512);
-            half the people saw theirs at (672, 504).
+        checksum: the SHA-256 that the file must have. If None, any file with consistent contents is accepted.
+        one_frame: whether to move every position so that all harbours have the environment's centre, (640, 512). Half
+            the people saw theirs at (672, 504).
 
     Raises:
-        DataError: there is no such file, it is not the released one, or its contents are inconsistent.
+        DataError: the file does not exist, has another checksum, or has inconsistent contents.
     """
     path = default_path() if path is None else Path(path)
     data = load_bytes(path)
@@ -115,7 +119,7 @@ def check_sum(data: bytes, checksum: str, path: Path) -> None:
     """Check the SHA-256 of a file's bytes.
 
     Raises:
-        DataError: it is another one.
+        DataError: the checksum differs.
     """
     found = hashlib.sha256(data).hexdigest()
     if found != checksum:
@@ -138,7 +142,7 @@ def _tables(columns: schema.Columns, one_frame: bool) -> HumanData:
     if one_frame:
         shift = np.array(harbour.CENTRE) - fields["center"]
     duration = fields["actions"].sum(1)
-    pressed = np.bincount(episode, duration, minlength=num_episodes) * FRAMES_PER_SECOND
+    pressed = np.bincount(episode, duration, minlength=num_episodes) * TICKS_PER_SECOND
     tank = fields["tank"][:, 0]
     next_position = np.full((len(episode), 2), np.nan)
     next_position[~is_final] = fields["next_obs"]
@@ -175,7 +179,7 @@ def _tables(columns: schema.Columns, one_frame: bool) -> HumanData:
 
 
 def table(size: int, **columns: np.ndarray) -> TensorDict:
-    """Return a table of these columns, with float64 made float32."""
+    """Return a table of these columns, with float64 converted to float32."""
     table = TensorDict(batch_size=[size])
     for name, values in columns.items():
         dtype = np.float32 if values.dtype == np.float64 else values.dtype

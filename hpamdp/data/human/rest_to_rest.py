@@ -1,12 +1,13 @@
 """Recorded presses converted to rest-to-rest presses, the only ones that the environment has.
 
-A learner that imitates the recorded presses learns presses that are too short, for two reasons. First, a press that
-begins during a glide ends the glide. So a recorded press often moved its boat less far than the same press does in the
-environment. Second, the log misses presses that overlapped another, and most presses that ended their episodes are
-among them. Four of five final presses in the log are too short to have ended their episodes, or aimed past the dock.
+A learner that imitates the recorded presses learns presses that are too short, for two reasons:
+- A press that begins during a glide ends the glide. So a recorded press often moved its boat less far than the same
+  press does in the environment.
+- The log misses presses that overlapped another, among them most presses that ended their episodes. Four of five final
+  presses in the log are too short to have ended their episodes, or aimed past the dock.
 
 A rest-to-rest press starts from rest and lasts until the boat has come to rest again:
-- A press gets the duration that takes the boat, from rest to rest, to where the next press began.
+- The new duration of a press takes the boat, from rest to rest, to the point where the next press began.
 - Presses that moved the boat by less than `TAP` are left out.
 - Final presses are left out if, by our physics, they would not have ended their episode as recorded.
 
@@ -20,7 +21,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from hpamdp.data.human.released_file import FRAMES_PER_SECOND, FULL_TANK, HumanData
+from hpamdp.data.human.released_file import FULL_TANK, TICKS_PER_SECOND, HumanData
 from hpamdp.env.boatdock import harbour, physics
 
 TAP = 4.0  # px
@@ -30,10 +31,10 @@ _CENTRE = torch.tensor(harbour.CENTRE, dtype=torch.float32)
 def to_rest_to_rest(data: HumanData) -> HumanData:
     """Return the recording with rest-to-rest presses.
 
-    Each episode's `tank` is a full one less these presses.
+    Each episode's `tank` is a full tank less these presses.
 
     Args:
-        data: read with `one_frame=True`.
+        data: the recording, read with `one_frame=True`.
     """
     presses = data.presses
     is_final = presses["is_final"]
@@ -57,7 +58,7 @@ def to_rest_to_rest(data: HumanData) -> HumanData:
 
     pressed = torch.zeros(len(data.episodes), dtype=torch.float32).index_add(0, episode, kept["duration"])
     converted = data.episodes.clone()
-    converted["tank"] = (FULL_TANK - pressed * FRAMES_PER_SECOND).clamp(min=0.0).round().long()
+    converted["tank"] = (FULL_TANK - pressed * TICKS_PER_SECOND).clamp(min=0.0).round().long()
     converted["presses"] = torch.bincount(episode, minlength=len(data.episodes))
     return HumanData(converted, kept)
 
@@ -70,6 +71,6 @@ def _ends_as_recorded(presses: TensorDict, episodes: TensorDict, heading: Tensor
     tank = torch.full_like(presses["duration"], physics.TANK)
     sailed = physics.press(x, y, tank, goal_x, goal_y, dir_x, dir_y, presses["duration"])
     outcome = episodes["outcome"]
-    # A full tank outlasts any press, so a press that ran dry just comes to rest here.
+    # A full tank outlasts any press, so a press that ran dry in the recording comes to rest here.
     ran_dry = (outcome == physics.OUT_OF_FUEL) & (sailed.outcome == physics.SAILING)
     return (sailed.outcome == outcome) | ran_dry

@@ -1,7 +1,7 @@
 """The schema of the released file: the fields of an episode, and the rules between them.
 
-Much of the recording is redundant, so the rules find most damaged files: distances follow from positions, speeds and
-`gas` from durations, the directions of the keys from controller and key map.
+Much of the recording is redundant, so the rules find most damaged files. Distances follow from positions, speeds and
+`gas` from durations, and the directions of the keys from controller and key map.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from hpamdp.env.boatdock import harbour, physics, task
 SPEED_UNIT = 10.0  # px/s of the column `velocity`
 _DIRECTION_UNIT = 10.0
 _GAS_SECONDS = 5.0
-_EXACT = 1e-6  # px, s: redundant values agree to rounding
-_MAX_OVERBURN = 15.0  # frames by which the presses may exceed what the tank lost; 10.9 in the released file
+_EXACT = 1e-6  # px, s: tolerance for redundant values, which agree up to rounding
+_MAX_OVERBURN = 15.0  # ticks by which the presses may exceed the fuel that the tank lost; 10.9 in the released file
 
-# The fields, with how many numbers each has for every press, every non-final press, and every episode. `terminals` has
-# one for every press, and one in an episode without a press.
+# The fields, and how many numbers each has per press, per non-final press or per episode. `terminals` has one number
+# per press, and one in an episode without a press.
 _PER_PRESS = {"actions": 3, "velocity": 3, "gas": 1, "distance": 1}
 _PER_NON_FINAL_PRESS = {"obs": 2, "next_obs": 2}
 _PER_EPISODE = {"center": 2, "SG": 4, "R": 1, "outcome": 1, "boatdir": 6, "boatchoice": 1, "incongkm": 1, "tank": 1}
@@ -36,9 +36,9 @@ class Columns(NamedTuple):
     """The fields of all episodes, one episode after another.
 
     Attributes:
-        person, episode_index: of each episode, the latter counted by person, int64 `[E]`.
-        num_presses: logged in each episode, int64 `[E]`.
-        fields: each field's numbers, float64 `[rows, width]`.
+        person, episode_index: the person of each episode, and the episode's number among that person's, int64 `[E]`.
+        num_presses: number of logged presses of each episode, int64 `[E]`.
+        fields: numbers of each field, float64 `[rows, width]`.
     """
 
     person: np.ndarray
@@ -48,10 +48,12 @@ class Columns(NamedTuple):
 
 
 def columns(trajectories: MatArray) -> Columns:
-    """Return the columns of the variable `trajectories`, a cell array of people, each a cell array of structs.
+    """Return the columns of the variable `trajectories`.
+
+    It is a cell array of people. Each person is a cell array of episodes, and each episode is a struct.
 
     Raises:
-        DataError: it is not built like this, or a field is missing or has the wrong size.
+        DataError: the variable has another structure, or a field is missing or has the wrong size.
     """
     gathered: dict[str, list[np.ndarray]] = {name: [] for name in sorted(_WIDTHS)}
     rows: list[tuple[int, int, int]] = []
@@ -65,17 +67,17 @@ def columns(trajectories: MatArray) -> Columns:
             for name, values in gathered.items():
                 values.append(fields[name])
     if not rows:
-        raise DataError("there are no episodes in it")
+        raise DataError("the file has no episodes")
     person, episode_index, num_presses = np.array(rows, np.int64).T
     stacked = {name: np.concatenate(values).reshape(-1, _WIDTHS[name]) for name, values in gathered.items()}
     return Columns(person, episode_index, num_presses, stacked)
 
 
 def _num_presses(fields: dict[str, np.ndarray]) -> int:
-    """Return how many presses an episode has.
+    """Return the number of presses of an episode.
 
     Raises:
-        DataError: a field is missing, unknown or of the wrong size.
+        DataError: a field is missing or unknown, or has the wrong size.
     """
     if set(fields) != set(_WIDTHS):
         raise DataError(f"the fields are {some(sorted(fields))}")
@@ -93,9 +95,9 @@ def _num_presses(fields: dict[str, np.ndarray]) -> int:
 
 
 def positions(columns: Columns) -> np.ndarray:
-    """Return where each press began, px, `[N, 2]`.
+    """Return the position at the beginning of each press, px, `[N, 2]`.
 
-    The file has no position of a final press, but it began where the press before it ended; a single press began at
+    The file has no position for a final press. That press began where the previous press ended. A single press began at
     the start.
     """
     num = columns.num_presses
@@ -114,7 +116,7 @@ def check(columns: Columns) -> None:
     """Check the rules that hold for the released file.
 
     Raises:
-        DataError: a rule is broken. It is named with the first episode that breaks it.
+        DataError: a rule is broken. The message names the rule and the first episode that breaks it.
     """
     for name, values in columns.fields.items():
         if not np.isfinite(values).all():
@@ -138,13 +140,13 @@ def _is_one_of(values: np.ndarray, *allowed: float) -> np.ndarray:
 
 
 def _episode_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
-    """Yield what is wrong with an episode that breaks a rule, and whether each episode keeps it, `[E]`."""
+    """Yield, for each rule, the message for an episode that breaks it, and which episodes keep it, `[E]`."""
     fields = columns.fields
     yield "R is not the harbour's radius, 120 px", fields["R"][:, 0] == physics.HARBOUR_RADIUS
     yield "outcome is not 1, 2, 3 or 4", _is_one_of(fields["outcome"], 1, 2, 3, 4)
     yield "boatchoice is not 0 or 1", _is_one_of(fields["boatchoice"], 0, 1)
     yield "incongkm is not 1 or 2", _is_one_of(fields["incongkm"], 1, 2)
-    yield "tank is not a number of frames from 0 to 360", _is_one_of(fields["tank"], *range(361))
+    yield "tank is not a number of ticks from 0 to 360", _is_one_of(fields["tank"], *range(361))
     num_terminals = np.maximum(columns.num_presses, 1)
     last = np.cumsum(num_terminals) - 1
     num_marked = np.add.reduceat(fields["terminals"][:, 0] != 0, last - num_terminals + 1)
@@ -164,7 +166,7 @@ def _episode_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
     separation = np.linalg.norm(start - goal, axis=1)
     yield "start and goal are less than 30 px apart", separation >= harbour.MIN_SEPARATION - _EXACT
     pressed = np.bincount(episode_of_press, fields["actions"].sum(1), minlength=len(separation))
-    yield "its presses take more fuel than the tank lost", fields["tank"][:, 0] + 60 * pressed <= 360 + _MAX_OVERBURN
+    yield "the presses take more fuel than the tank lost", fields["tank"][:, 0] + 60 * pressed <= 360 + _MAX_OVERBURN
 
 
 def directions(controller: np.ndarray, keymap: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +180,7 @@ def directions(controller: np.ndarray, keymap: np.ndarray) -> tuple[np.ndarray, 
 
 
 def _press_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
-    """Yield what is wrong with a press that breaks a rule, and whether each press keeps it, `[N]`."""
+    """Yield, for each rule, the message for a press that breaks it, and which presses keep it, `[N]`."""
     fields = columns.fields
     actions = fields["actions"]
     num_presses = columns.num_presses
@@ -205,4 +207,4 @@ def _press_rules(columns: Columns, episode_of_press: np.ndarray) -> _Rules:
     follows = np.ones(len(duration), bool)
     non_final = np.flatnonzero(~is_final)
     follows[non_final] = (fields["next_obs"] == position[non_final + 1]).all(1)
-    yield "a press does not begin where the one before says", follows
+    yield "a press does not begin where the previous one ended", follows

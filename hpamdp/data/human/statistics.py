@@ -11,8 +11,8 @@ from hpamdp.data.human.released_file import HumanData
 from hpamdp.env.boatdock import harbour, physics, planner
 from hpamdp.env.boatdock.reference import OFFSET_EDGES, Figures
 
-# The congruent controller counts as the better one if the goal's bearing is less than this many degrees off the nearest
-# of its directions.
+# The congruent controller counts as better if the goal's bearing is less than this many degrees off the nearest of its
+# directions.
 _CONGRUENT_IS_BETTER_BELOW = 30.0
 
 
@@ -26,8 +26,8 @@ def layouts(data: HumanData) -> harbour.Layout:
 def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
     """Return the mean figures of the episodes of `mask` `[E]`, by the names of `hpamdp.env.boatdock.reference`.
 
-    Beside them: `presses`, the mean number of presses (called `steps` there), `score_error`, the standard error of the
-    mean score, and `episodes`, the number of episodes.
+    There are three more figures: `presses`, the mean number of presses (called `steps` there); `score_error`, the
+    standard error of the mean score; and `episodes`, the number of episodes.
     """
     if mask is None:
         mask = torch.ones(len(data.episodes), dtype=torch.bool)
@@ -35,16 +35,14 @@ def figures(data: HumanData, mask: Tensor | None = None) -> Figures:
     scores = score(data)[mask]
     is_congruent = episodes["controller"] == harbour.CONGRUENT
     congruent_is_better = harbour.bearing_offset(layouts(data))[mask] < _CONGRUENT_IS_BETTER_BELOW
-    shares = {
-        name: episodes["outcome"] == code for code, name in enumerate(physics.OUTCOMES) if code != physics.SAILING
-    }
-    shares["option_congruent"] = is_congruent
-    shares["oracle_agreement"] = is_congruent == congruent_is_better
+    cases = {name: episodes["outcome"] == code for code, name in enumerate(physics.OUTCOMES) if code != physics.SAILING}
+    cases["option_congruent"] = is_congruent
+    cases["oracle_agreement"] = is_congruent == congruent_is_better
     return {
         "episodes": len(scores),
         "score": scores.double().mean().item(),
         "score_error": (scores.double().std() / len(scores) ** 0.5).item(),
-        **{name: share.double().mean().item() for name, share in shares.items()},
+        **{name: is_case.double().mean().item() for name, is_case in cases.items()},
         "presses": episodes["presses"].double().mean().item(),
     }
 
@@ -56,13 +54,13 @@ def figures_by(data: HumanData, column: str) -> dict[int, Figures]:
 
 
 def offset_bins(data: HumanData) -> Tensor:
-    """Return the bin of each episode's bearing offset among those of `OFFSET_EDGES`, `[E]`."""
+    """Return the bin of `OFFSET_EDGES` in which each episode's bearing offset lies, `[E]`."""
     edges = torch.tensor(OFFSET_EDGES[1:-1], dtype=torch.float32)
     return torch.bucketize(harbour.bearing_offset(layouts(data)), edges)
 
 
 def choice_curve(data: HumanData, mask: Tensor | None = None) -> np.ndarray:
-    """Return the fraction of congruent choices in each bin of `offset_bins`, `[6]`; NaN without episodes."""
+    """Return the probability of the congruent choice in each bin of `offset_bins`, `[6]`. NaN without episodes."""
     if mask is None:
         mask = torch.ones(len(data.episodes), dtype=torch.bool)
     bins = offset_bins(data)[mask]
@@ -74,20 +72,20 @@ def choice_curve(data: HumanData, mask: Tensor | None = None) -> np.ndarray:
 def best_scores(data: HumanData) -> Tensor:
     """Return the best possible score of each episode with the incongruent and the congruent controller, `[E, 2]`.
 
-    Takes about a second for a thousand episodes.
+    A thousand episodes take about a second.
     """
     return planner.best_plans(layouts(data), data.episodes["keymap"]).score
 
 
 def optimality_gaps(data: HumanData, best: Tensor) -> dict[str, Tensor]:
-    """Return how far each episode's score is below the best possible score, each `[E]`.
+    """Return the gap between each episode's score and the best possible score, in three parts `[E]`.
 
-    `gap` is the distance to the best plan with the better controller. It is the sum of `choice_gap`, lost by choosing
-    the worse controller, and `press_gap`, lost with the chosen controller.
+    `gap` is the difference to the best plan with the better controller. It is the sum of two parts: `choice_gap` is due
+    to the choice of the controller, `press_gap` is due to the presses with that controller.
 
     Args:
         data: the recording.
-        best: `best_scores` of it.
+        best: `best_scores` of this recording.
     """
     scores = score(data)
     chosen = best.gather(1, data.episodes["controller"].unsqueeze(1)).squeeze(1)

@@ -1,16 +1,16 @@
 """The recorded presses as BoatDockEnv would have returned them: the same keys, observations and rewards.
 
-What the recording does not hold is filled in:
-- The fuel before a press is a full tank less the logged presses. That is too much if presses are missing from the log;
-  `complete` marks the episodes in which none is missing. After the final press the fuel is the recorded tank.
+Values that the recording does not contain are filled in:
+- The fuel before a press is a full tank less the logged presses. That is too much if presses are missing from the log.
+  `complete` marks the episodes with a complete log. After the final press the fuel is the recorded tank.
 - The observed velocity is the one at which the previous logged press was released.
 - A final press that docked or was too fast ends where its course meets the dock's circle. If they do not meet, it ends
   at the point of the circle that is nearest to the start of the press. Our physics gives the ends of other final
   presses. All these states are terminal, so no value bootstraps from them, and only the progress reward depends on
   them.
-- If the first press was not logged, the first observation shows the boat already on its way.
+- If the first press was not logged, the first observation shows the boat away from its start.
 
-Episodes without a logged press give no transition.
+Episodes without a logged press have no transitions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.data.errors import DataError
-from hpamdp.data.human.released_file import FRAMES_PER_SECOND, HumanData
+from hpamdp.data.human.released_file import TICKS_PER_SECOND, HumanData
 from hpamdp.data.row_checks import TRAJECTORY
 from hpamdp.env.boatdock import episode, harbour, physics
 from hpamdp.env.boatdock.task import FUEL, BoatState, ObservationForm, RewardForm, Rules
@@ -35,20 +35,23 @@ def transitions(
 ) -> TensorDict:
     """Return the presses as transitions `[N]`, in the order of episodes and presses.
 
-    At the root: `observation` `[N, 16]` (14 with `pixels`), `option` `[N]`, `("action", "discrete")` `[N]`,
-    `("action", "parameters")` `[N, 3]` (0 for the keys that were not pressed), `is_decision`, `done`, `terminated`,
-    `truncated` `[N, 1]`, `outcome` `[N]`, `fuel` `[N, 1]`, and `("collector", "traj_ids")` `[N]`, the episode. Under
-    `next`: all of these but action, option and episode, and `reward` `[N, 1]`.
+    Entries at the root:
+    - `[N]`: `option`, `("action", "discrete")`, `outcome` and `("collector", "traj_ids")`, the number of the episode.
+    - `[N, 1]`: `is_decision`, `done`, `terminated`, `truncated` and `fuel`.
+    - `observation` `[N, 16]` (14 with `pixels`).
+    - `("action", "parameters")` `[N, 3]`, 0 for the keys that were not pressed.
+
+    Entries under `next`: all of these except action, option and episode, and `reward` `[N, 1]`.
 
     Args:
-        data: read with `one_frame=True`, so that every harbour has the environment's centre.
+        data: the recording, read with `one_frame=True`, so that every harbour has the environment's centre.
         reward, observation: as in BoatDockEnv.
-        has_choice: whether the controller is chosen at the first press, as with `controller="choose"`: there is an
-            `option`, and the first observation does not show the controller yet. Otherwise it is known from the start,
-            and there is no `option`.
+        has_choice: whether the agent chooses the controller at the first press, as with `controller="choose"`. If so,
+            there is an `option`, and the first observation does not show the controller. Otherwise all observations
+            show it, and there is no `option`.
 
     Raises:
-        DataError: no such reward or observation, or the harbours have different centres.
+        DataError: the reward or the observation is unknown, or the harbours have different centres.
     """
     _check(data, reward, observation)
     rules = Rules(controller="choose" if has_choice else "random", reward=reward, observation=observation)
@@ -74,7 +77,7 @@ def transitions(
 
 
 def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: ObservationForm = "scaled") -> TensorDict:
-    """Return each recorded episode as one decision for a selector, `[E]`: the first observation, the boat, the return.
+    """Return each recorded episode as one decision of a selector, `[E]`: first observation, boat and return.
 
     The return is the environment's return for the recorded outcome and `tank`, even if the log of presses is not
     complete. Every episode is terminated. Episodes without a logged press are included.
@@ -84,18 +87,18 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
     `truncated` `[E, 1]`.
 
     Args:
-        data: as recorded, read with `one_frame=True`.
+        data: the unchanged recording, read with `one_frame=True`.
         reward, observation: as in BoatDockEnv.
 
     Raises:
-        DataError: no such reward or observation, or the harbours have different centres.
+        DataError: the reward or the observation is unknown, or the harbours have different centres.
     """
     _check(data, reward, observation)
     rules = Rules(reward=reward, observation=observation)
     episodes = data.episodes
     start = episodes["start"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
     goal = episodes["goal"] - torch.tensor(harbour.CENTRE, dtype=torch.float32)
-    # The last logged press; without one, the boat heads for its goal from the start.
+    # Find the end of the last logged press. Without a press, let the boat head for its goal from the start.
     position, heading = start.clone(), torch.nn.functional.normalize(goal - start, dim=1)
     duration = torch.zeros(len(start), dtype=torch.float32)
     last = data.presses[data.presses["is_final"]]
@@ -128,14 +131,14 @@ def decisions(data: HumanData, *, reward: RewardForm = "paper", observation: Obs
     after = before._replace(
         x=end[:, 0],
         y=end[:, 1],
-        fuel=episodes["tank"] / FRAMES_PER_SECOND,
+        fuel=episodes["tank"] / TICKS_PER_SECOND,
         controller=controller,
         presses=steps.to(torch.int32),
         outcome=episodes["outcome"].int(),
     )
     ended = _read(after, rules)
     ended[keys.DECISION_OBSERVATION] = _read(before, rules)[keys.OBSERVATION]
-    # The progress of an episode's presses sums to that of one step from its start to its end.
+    # The progress rewards of an episode's presses sum to that of one step from its start to its end.
     ended[keys.OPTION_RETURN] = episode.reward_of(before, after, rules).unsqueeze(-1)
     ended[keys.OPTION_STEPS] = steps.unsqueeze(-1)
     ended[keys.IS_DECISION] = ended[keys.DONE].clone()
@@ -214,17 +217,17 @@ def _states(presses: TensorDict, episodes: TensorDict, has_choice: bool) -> tupl
 def _fuel(duration: Tensor, is_first: Tensor, is_final: Tensor, tank: Tensor) -> tuple[Tensor, Tensor]:
     """Return the fuel before and after each press, seconds `[N]`: a full tank less the logged presses.
 
-    It is never less than the tank left at the end, from which the logged durations can differ by a few frames.
+    It is never less than the tank at the end of the episode. The logged durations can differ from that by a few ticks.
 
     Args:
-        duration: of each press, seconds `[N]`.
+        duration: duration of each press, seconds `[N]`.
         is_first, is_final: whether the press is its episode's first or final one, `[N]`.
-        tank: frames of fuel left at the end of each press's episode, `[N]`.
+        tank: ticks of fuel left at the end of each press's episode, `[N]`.
     """
     total = duration.double().cumsum(0)  # over all episodes
     total_at_start = (total - duration)[is_first]
     elapsed = total - total_at_start[is_first.cumsum(0) - 1]
-    left_at_end = tank / FRAMES_PER_SECOND
+    left_at_end = tank / TICKS_PER_SECOND
     before = torch.maximum(physics.TANK - (elapsed - duration), left_at_end).float()
     after = torch.maximum(physics.TANK - elapsed, left_at_end)
     return before, torch.where(is_final, left_at_end, after).float()
@@ -233,7 +236,7 @@ def _fuel(duration: Tensor, is_first: Tensor, is_final: Tensor, tank: Tensor) ->
 def _final_position(
     position: Tensor, goal: Tensor, fuel: Tensor, heading: Tensor, duration: Tensor, outcome: Tensor
 ) -> Tensor:
-    """Return where each press would end if it were its episode's final one `[N, 2]`; see the module's docstring."""
+    """Return the end of each press if it were its episode's final one, `[N, 2]`. The module's docstring explains it."""
     x, y = position.unbind(1)
     goal_x, goal_y = goal.unbind(1)
     dir_x, dir_y = heading.unbind(1)

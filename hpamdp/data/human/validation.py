@@ -12,8 +12,8 @@ from hpamdp.env.boatdock import harbour, physics
 
 AIMED_WITHIN = 14.0  # px; a course that passes the goal's centre closer than this is aimed at the dock
 MIN_PRESSED = 5.0  # px; first presses that cover less while the key is down are not measured
-# What a press may travel: from 0.97 of its shortest way (the next key is pressed at once) to 1.03 of its longest way
-# (the boat comes to rest).
+# The distance that a press may travel: from 0.97 of the shortest (the next key is pressed at once) to 1.03 of the
+# longest (the boat comes to rest).
 _SHORTEST_MARGIN = 0.97
 _LONGEST_MARGIN = 1.03
 
@@ -32,17 +32,17 @@ class FirstPresses(NamedTuple):
 
     pressed: Tensor  # px covered while the key is down
     travelled: Tensor  # px covered until the next press began
-    is_inside: Tensor  # whether our physics allows that
+    is_inside: Tensor  # whether our physics allows the distance travelled
 
 
 class Fit(NamedTuple):
     """The glide and the docking speed (px/s) fitted to people's single presses, with 95 % bootstrap intervals.
 
     Attributes:
-        likely_glide, likely_speed: the constants of the largest likelihood, as (value, low, high).
-        agreeing_glide, agreeing_speed: the constants that predict most outcomes right, as (value, low, high).
+        likely_glide, likely_speed: the constants of largest likelihood, as (value, low, high).
+        agreeing_glide, agreeing_speed: the constants that predict the most outcomes correctly, as (value, low, high).
         glides, speeds: the grid, `[G]` and `[S]`.
-        agreement: fraction of outcomes predicted right on the grid, `[G, S]`.
+        agreement: fraction of outcomes predicted correctly on the grid, `[G, S]`.
     """
 
     likely_glide: tuple[float, float, float]
@@ -89,7 +89,7 @@ def agreement(singles: Singles) -> float:
 
 
 def _reached(outcome: Tensor) -> Tensor:
-    """Return the outcomes with every one that is not at the dock replaced by SAILING."""
+    """Return the outcomes, with SAILING for every outcome that is not at the dock."""
     reached_dock = (outcome == physics.SUCCESS) | (outcome == physics.TOO_FAST)
     return torch.where(reached_dock, outcome, physics.SAILING)
 
@@ -111,8 +111,8 @@ def first_presses(data: HumanData) -> FirstPresses:
 def fit(singles: Singles, num_bootstraps: int = 400, seed: int = 0) -> Fit:
     """Fit the glide and the docking speed to people's single presses, on a grid, and bootstrap over presses.
 
-    The likelihood has a Gaussian error of the speed at the dock and one of the distance made; their sizes are fitted
-    too.
+    The likelihood has two Gaussian errors: of the speed at the dock, and of the distance covered. Their standard
+    deviations are fitted, too.
     """
     glides = torch.arange(0.7, 1.305, 0.02, dtype=torch.float64)
     speeds = torch.arange(60.0, 100.5, 1.0, dtype=torch.float64)
@@ -144,7 +144,7 @@ def fit(singles: Singles, num_bootstraps: int = 400, seed: int = 0) -> Fit:
 
 
 def _bootstrap_weights(num: int, num_bootstraps: int, seed: int) -> Tensor:
-    """Return how often each press counts, `[1 + num_bootstraps, num]`: once each, then as resampled."""
+    """Return the weight of each press `[1 + num_bootstraps, num]`: 1 in the first row, then resampled counts."""
     sampled = torch.randint(num, (num_bootstraps, num), generator=torch.Generator().manual_seed(seed))
     resampled = torch.zeros(num_bootstraps, num, dtype=torch.float64)
     resampled.scatter_add_(1, sampled, torch.ones(sampled.shape, dtype=torch.float64))
@@ -157,11 +157,14 @@ def _grid(*axes: Tensor) -> list[Tensor]:
 
 
 def _arrival(singles: Singles, glide: Tensor) -> tuple[Tensor, Tensor]:
-    """Return how far beyond the dock's circle each press would go (px) and the speed there (px/s), `[points, M]`."""
+    """Return the distance that each press would go beyond the dock's circle (px), and the speed there (px/s).
+
+    Both are `[points, M]`.
+    """
     pressed = singles.pressed.double()
     to_dock = singles.to_dock.double()
     spare = (1.0 + glide) * pressed - to_dock
-    # While the key is down the speed follows from the distance made, in the glide from the distance left.
+    # The speed follows from the distance covered while the key is down, and from the distance left in the glide.
     in_glide = to_dock > pressed
     distance = torch.where(in_glide, (spare / glide).clamp(min=0.0), to_dock)
     return spare, physics.speed(physics.duration_for(distance))
