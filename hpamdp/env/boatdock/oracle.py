@@ -71,7 +71,8 @@ class BoatDockOracle:
     def read(self, state: BoatState) -> TensorDict:
         """Return `option` `[N]` and the next press of each plan, `discrete` and `parameters` `[N, num_plans]`."""
         num_presses = state.presses.long()  # since the plan was made
-        # Plan again if noise has moved the boat, or if changing boats takes fuel, which alters the other boats' plans.
+        # Plan again if noise may have moved the boat, or if a change of controllers takes fuel, which alters the other
+        # controllers' plans.
         if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
             num_presses = torch.zeros_like(num_presses)
