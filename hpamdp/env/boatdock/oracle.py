@@ -35,7 +35,7 @@ class BoatDockOracle:
     With noise or a `switch_cost`, the plans are made again before every press.
 
     Args:
-        num_envs: number of boats.
+        num_envs: number of environments.
         rules: rules of the environment.
         device: device of the tensors.
 
@@ -61,7 +61,7 @@ class BoatDockOracle:
             getattr(self, name).copy_(plan)
 
     def plan(self, state: BoatState, rows: Tensor) -> None:
-        """Plan for the boats of `rows`, bool `[N]`, from their current positions."""
+        """Plan for the environments of `rows`, bool `[N]`, from their current positions."""
         boats = BoatState(*(column[rows] for column in state))
         plans = planner.plans_of_options(self.rules, boats)
         self.option[rows] = planner.better_option(plans)
