@@ -29,6 +29,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.config.stand_ins import quick_imports
+from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.limits import limit_in
 from hpamdp.messages import (
     first_line,
@@ -91,6 +92,10 @@ def _main() -> None:
         _exit_with(not_understood(error.override))
     except ConfigError as error:
         _exit_with(str(error))
+    except EnvironmentFaultError as error:  # of the user's own code: its lines of the traceback help, ours do not
+        warn(error.line)
+        sys.stderr.write(error.frames)
+        sys.exit(1)
     except _LostOutputError as error:
         if isinstance(error.__cause__, BrokenPipeError):  # the reader has seen enough
             sys.exit(1)

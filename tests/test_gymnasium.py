@@ -371,9 +371,3 @@ def test_copies_with_different_spaces_are_refused(monkeypatch):
     monkeypatch.setattr(Toy, "__init__", lambda self, form: make_toy(self, next(forms)))
     with pytest.raises(ValueError, match="the action_space of copy 1 is "):
         make(2)
-
-
-def test_a_bug_in_an_environment_is_not_reported_as_a_mistake_of_the_user():
-    for name in ({"id": "Toy-v0", "entry_point": None}, {"entry_point": TOY}):
-        with pytest.raises(TypeError, match="has no len"):
-            make(**name, kwargs={"broken": True})

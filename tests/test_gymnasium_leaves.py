@@ -14,6 +14,7 @@ from toy_environments import Toy
 
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.scaling import ObservationScaling
 
 INT64 = spaces.Box(-9, 9, (2,), np.int64)
 BYTES = spaces.Box(0, 255, (2,), np.uint8)
@@ -22,6 +23,14 @@ HALVES = spaces.Box(-np.inf, np.inf, (2,), np.float16)
 UNIT = spaces.Box(-1.0, 1.0, (2,))
 WIDE = spaces.Box(-np.inf, np.inf, (2,), np.float64)
 PARTS = spaces.Dict(a=spaces.Box(-9, 9, (2,)), b=spaces.Dict(c=spaces.Box(-9, 9, (3,))))
+
+
+def quickly(space: ObservationSpace, value) -> np.ndarray:
+    """Return an observation as a vector, in the way of an environment with many copies."""
+    vectors = np.zeros((1, space.dim))
+    if space.write(value, space.parts(vectors[0])) and space.unsettled(vectors):
+        vectors[0] = space.settled(vectors[0])
+    return space.rounded(vectors)[0]
 
 
 @pytest.mark.parametrize(
@@ -69,10 +78,11 @@ PARTS = spaces.Dict(a=spaces.Box(-9, 9, (2,)), b=spaces.Dict(c=spaces.Box(-9, 9,
     ],
 )  # fmt: skip
 def test_a_value_outside_its_space_is_refused_in_a_line_that_names_the_leaf(space, value, complaint):
-    with warnings.catch_warnings(), pytest.raises(ProblemError, match=complaint) as raised:
-        warnings.simplefilter("error")
-        ObservationSpace(space, "bounds").flat(value)
-    assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
+    for flat in (ObservationSpace.flat, quickly):
+        with warnings.catch_warnings(), pytest.raises(ProblemError, match=complaint) as raised:
+            warnings.simplefilter("error")
+            flat(ObservationSpace(space), value)
+        assert "\n" not in str(raised.value) and len(str(raised.value)) < 400
 
 
 @pytest.mark.parametrize(
@@ -95,20 +105,43 @@ def test_a_value_outside_its_space_is_refused_in_a_line_that_names_the_leaf(spac
     ],
 )
 def test_a_value_inside_its_space_is_accepted_in_any_dtype(space, value, vector):
-    assert ObservationSpace(space, "none").flat(value).tolist() == list(vector)
+    assert ObservationSpace(space).flat(value).tolist() == list(vector)
+    assert quickly(ObservationSpace(space), value).tolist() == list(vector)
+
+
+@pytest.mark.parametrize("out_of_bounds", ["refuse", "clip", "allow"])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.int8, np.int64, bool])
+@pytest.mark.parametrize("given", [np.float16, np.float32, np.float64, np.int16, np.int64, bool])
+def test_the_quick_check_of_all_copies_agrees_with_the_check_of_one(out_of_bounds, dtype, given):
+    own = spaces.Box(0 if dtype is bool else -1, 1, (3,), dtype)
+    parts = spaces.Dict(a=own, b=spaces.Discrete(3, start=-1), c=spaces.MultiDiscrete([2, 3]), d=spaces.MultiBinary(2))
+    space = ObservationSpace(parts, None, out_of_bounds)
+    numbers = [[0, 1, 1], [-1, 0, 1], [2, 0, -2], [0.5, 0.1, 1.0000001], [np.nan, 0, 0], [np.inf, 0, 0], [1e4, 0, 0]]
+    for number, values in enumerate(numbers):
+        with np.errstate(invalid="ignore"):
+            a, c, d = (np.array(part).astype(given) for part in (values, [number % 3, 2], [1, number % 3]))
+        value = {"a": a, "b": number % 4 - 1, "c": c, "d": d}
+        assert outcome(ObservationSpace.flat, space, value) == outcome(quickly, space, value)
+
+
+def outcome(flat, space: ObservationSpace, value) -> list[float] | str:
+    try:
+        return flat(space, value).tolist()
+    except ProblemError as error:
+        return str(error)
 
 
 def test_numbers_outside_their_bounds_are_clipped_or_kept_if_asked():
     given = {"clip": [[0.0, 255.0], [-1.0, 1.0]], "allow": [[-1.0, 300.0], [-7.0, 2.5]]}
     for setting, (counts, units) in given.items():
-        space = ObservationSpace(spaces.Tuple([BYTES, UNIT]), "none", None, setting)
+        space = ObservationSpace(spaces.Tuple([BYTES, UNIT]), None, setting)
         assert space.flat(([-1, 300], [-7.0, 2.5])).tolist() == counts + units
         with pytest.raises(ProblemError, match=r"entry 0 is 0\.5 at index 0, which uint8 cannot hold"):
             space.flat(([0.5, 0], [0.0, 0.0]))
         with pytest.raises(ProblemError, match="entry 1 is nan at index 0, which is not finite"):
             space.flat(([0, 0], [np.nan, 0.0]))
     with pytest.raises(ValueError, match="out_of_bounds=wrap, but must be one of refuse, clip, allow"):
-        ObservationSpace(UNIT, "none", None, "wrap")
+        ObservationSpace(UNIT, None, "wrap")
 
 
 @pytest.mark.parametrize("entry_point", ["toy_environments:Toy", "toy_environments:OldToy"])
@@ -132,4 +165,4 @@ def test_bounds_of_any_size_give_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for space in (spaces.Box(low, high, dtype=np.float64), spaces.Box(-np.inf, np.inf, (5,))):
-            assert ObservationSpace(space, "bounds").scaled(np.ones((1, 5))).tolist() == [[1.0] * 5]
+            assert ObservationScaling(ObservationSpace(space), "bounds").scaled(np.ones((1, 5))).tolist() == [[1.0] * 5]

@@ -51,8 +51,8 @@ def test_running_statistics_are_those_of_all_observations_so_far():
         after = step(env)["observation"]
     everything = torch.cat(so_far).double()
     mean, deviation = everything.mean(0), everything.std(0, correction=0)
-    assert np.allclose(env.observations.statistics.mean, mean)
-    assert np.allclose(np.sqrt(env.observations.statistics.var), deviation)
+    assert np.allclose(env.scaling.statistics.mean, mean)
+    assert np.allclose(np.sqrt(env.scaling.statistics.var), deviation)
     assert torch.allclose(after.double(), (so_far[3].double() - mean) / deviation, atol=1e-5)
     check_env_specs(env)
 
@@ -86,7 +86,7 @@ def test_an_environment_for_evaluation_follows_the_statistics_without_updating_t
     evaluation.set_seed(0)
     seen = evaluation.reset()["observation"].double()
     assert all(torch.equal(column, before[name]) for name, column in training.env_state().items())
-    statistics = training.observations.statistics
+    statistics = training.scaling.statistics
     deviation = np.where(statistics.var > 0, np.sqrt(statistics.var), 1.0)
     assert np.allclose(seen.numpy(), (plain.numpy() - statistics.mean) / deviation, atol=1e-5)
     training.set_env_state({name: column + 1.0 for name, column in before.items()})
@@ -108,7 +108,7 @@ def test_an_entry_outside_its_space_is_named_with_the_setting_that_leaves_it_out
 
 @pytest.mark.parametrize("value", [-1, 4, 1.5, "a"])
 def test_no_value_outside_a_discrete_space_is_made_one_hot(value):
-    space = ObservationSpace(spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(3, start=1)), "none")
+    space = ObservationSpace(spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(3, start=1)))
     with pytest.raises(ValueError, match="entry b is"):
         space.flat({"a": np.zeros(2), "b": value})
     assert space.flat({"a": np.zeros(2), "b": np.array([3])}).tolist() == [0.0, 0.0, 0.0, 0.0, 1.0]
@@ -116,7 +116,7 @@ def test_no_value_outside_a_discrete_space_is_made_one_hot(value):
 
 def test_entries_are_chosen_in_their_order():
     parts = spaces.Dict(a=spaces.Box(0, 1, (2,)), b=spaces.Discrete(2), c=spaces.Tuple([spaces.MultiBinary(2)]))
-    space = ObservationSpace(parts, "none", ["c", "a"])
+    space = ObservationSpace(parts, ["c", "a"])
     assert space.dim == 4
     vector = space.flat({"a": np.float32([0.25, 0.5]), "b": 7, "c": (np.array([0, 1], np.int8),)})
     assert vector.tolist() == [0.0, 1.0, 0.25, 0.5]

@@ -11,6 +11,7 @@ from toy_environments import FORMS, MIXED, ONE, PAIR, TWO, Toy, old_space
 from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.four_value import FourValueEnv, to_gymnasium
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.scaling import ObservationScaling
 
 UNIT = Box(0, 1, (1,))
 TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
@@ -51,6 +52,11 @@ def test_another_action_space_is_refused_in_one_line(space, reason):
     assert f": {reason}" in line and "; accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P" in line
 
 
+def native(space: ActionSpace, discrete: int, parameters) -> tuple:
+    (action,) = space.to_native(np.array([discrete]), np.float32([parameters]))
+    return action
+
+
 @pytest.mark.parametrize(
     ("low", "high"), [(1.7e9, 1.7e9 + 3600.0), (-5e4, -5e4 + 1e-3), (0.0, 1e-320), (1e30, 1e30 + 1e20), (99.0, 100.0)]
 )
@@ -60,7 +66,7 @@ def test_bounds_that_float32_cannot_resolve_are_reached_in_float64(low, high):
     assert space.parameter_dims == (1, 1)
     assert space.low.tolist() == [-3.0, -1.0] and space.high.tolist() == [5.0, 1.0]
     units = np.linspace(-1.0, 1.0, 3601, dtype=np.float32)
-    values = np.array([space.to_native(1, np.array([0.5, unit], np.float32))[1][1][0] for unit in units])
+    values = np.array([native(space, 1, [0.5, unit])[1][1][0] for unit in units])
     assert values[0] == low and values[-1] == high and values.dtype == np.float64
     exact = low + 0.5 * (units.astype(np.float64) + 1.0) * (high - low)
     np.testing.assert_allclose(
@@ -69,8 +75,8 @@ def test_bounds_that_float32_cannot_resolve_are_reached_in_float64(low, high):
     if high - low > 1e-300:
         assert len(np.unique(values)) == 3601
     others = {-np.inf: low, np.inf: high, 9.0: high, np.nan: low}
-    assert all(space.to_native(1, np.float32([9.0, given]))[1][1][0] == value for given, value in others.items())
-    assert space.to_native(0, np.float32([9.0, 0.0]))[1][0] == 5.0
+    assert all(native(space, 1, [9.0, given])[1][1][0] == value for given, value in others.items())
+    assert native(space, 0, [9.0, 0.0])[1][0] == 5.0
 
 
 def test_bounds_that_float32_resolves_are_passed_as_they_are():
@@ -78,7 +84,7 @@ def test_bounds_that_float32_resolves_are_passed_as_they_are():
     space = ActionSpace(Tuple([Discrete(3), Tuple(boxes)]))
     assert space.low.tolist() == [-1.0, np.float32(1.7e9), 0.0]
     given = np.float32([0.123, 1.7e9 + 256, 0.25])
-    values = [part[0] for part in space.to_native(0, given)[1]]
+    values = [part[0] for part in native(space, 0, given)[1]]
     assert values == given.tolist()
 
 
@@ -104,24 +110,28 @@ def test_boxes_in_a_dict_belong_to_the_discrete_actions_in_its_order_unless_all_
 
 def test_observations_are_flattened():
     value = (np.array([[1.5], [-2.0]], np.float32), np.int64(2), {"a": np.array([1, 0], np.int8)})
-    plain, scaled = (ObservationSpace(MIXED, scaling) for scaling in ("none", "bounds"))
-    assert plain.scaled(plain.flat(value)[None]).tolist() == [[1.5, -2.0, 0.0, 1.0, 0.0, 1.0, 0.0]]
-    assert scaled.scaled(scaled.flat(value)[None]).tolist() == [[0.75, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0]]
+    space = ObservationSpace(MIXED)
+    plain, scaled = (ObservationScaling(space, scaling) for scaling in ("none", "bounds"))
+    assert plain.scaled(space.flat(value)[None]).tolist() == [[1.5, -2.0, 0.0, 1.0, 0.0, 1.0, 0.0]]
+    assert scaled.scaled(space.flat(value)[None]).tolist() == [[0.75, -1.0, -1.0, 1.0, -1.0, 1.0, -1.0]]
 
 
 def test_entries_without_bounds_stay_as_they_are():
     low = np.array([0.0, -np.inf, -3.4e38, -1.0, -1e10, 5.0, 1e5])
     high = np.array([4.0, 1.0, 3.4e38, np.inf, 1e10, 5.0, 1.00001e5])
     for dtype in (np.float32, np.float64):
-        space = ObservationSpace(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype), "bounds")
-        seen = space.scaled(np.array([[1.0, 7.0, 7.0, 7.0, 7.0, 5.0, 1e5], [9.0, 7.0, 7.0, 7.0, 7.0, 5.0, 1e5]]))
+        space = ObservationSpace(spaces.Box(low.astype(dtype), high.astype(dtype), dtype=dtype))
+        seen = ObservationScaling(space, "bounds").scaled(
+            np.array([[1.0, 7.0, 7.0, 7.0, 7.0, 5.0, 1e5], [9.0, 7.0, 7.0, 7.0, 7.0, 5.0, 1e5]])
+        )
         assert seen.tolist() == [[-0.5, 7.0, 7.0, 7.0, 7.0, 5.0, -1.0], [3.5, 7.0, 7.0, 7.0, 7.0, 5.0, -1.0]]
-    image = ObservationSpace(spaces.Box(0, 255, (2, 2), np.uint8), "bounds")
-    assert image.scaled(image.flat(np.array([[0, 255], [0, 255]], np.uint8))[None]).tolist() == [[-1.0, 1.0, -1.0, 1.0]]
+    image = ObservationSpace(spaces.Box(0, 255, (2, 2), np.uint8))
+    seen = ObservationScaling(image, "bounds").scaled(image.flat(np.array([[0, 255], [0, 255]], np.uint8))[None])
+    assert seen.tolist() == [[-1.0, 1.0, -1.0, 1.0]]
 
 
 def test_running_statistics_keep_the_unit_of_constant_entries_and_clip():
-    space = ObservationSpace(spaces.Box(-np.inf, np.inf, (2,)), "running")
+    space = ObservationScaling(ObservationSpace(spaces.Box(-np.inf, np.inf, (2,))), "running")
     for _ in range(300):
         assert space.scaled(np.array([[3.0, 1e8]])).tolist() == [[0.0, 0.0]]
     assert space.scaled(np.array([[4.0, 1e8]]))[0].tolist() == [10.0, 0.0]

@@ -14,6 +14,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.geometry import PlaneGeometry, Symmetries
 
@@ -40,10 +41,6 @@ class Metric:
     name: str
     title: str
     kind: Literal["number", "share", "count"] = "number"
-
-
-class ProblemError(ValueError):
-    """A problem breaks its own contract, such as with an observation outside its space; the message is one line."""
 
 
 class PAMDPEnv(EnvBase):

@@ -54,7 +54,7 @@ def advance(
     mode: Any,
     observations: Any,
     outcomes: Any,
-    extras: Any,
+    entries: Any,
     flags: Any,
     rewards: Any,
 ) -> int:

@@ -409,7 +409,7 @@ def advance(
     mode: Any,
     observations: Any,
     outcomes: Any,
-    extras: Any,
+    entries: Any,
     flags: Any,
     rewards: Any,
 ) -> int:

@@ -77,35 +77,49 @@ class ActionSpace:
         self._low = np.concatenate([box.low.ravel().astype(np.float64) for box in self._boxes])
         self._high = np.concatenate([box.high.ravel().astype(np.float64) for box in self._boxes])
         is_precise = np.concatenate([np.full(box.shape, box.dtype.itemsize > 4).ravel() for box in self._boxes])
+        with np.errstate(over="ignore"):
+            dtypes = {box.dtype for box in self._boxes}
+            self._bounds_by_dtype = {dtype: (self._low.astype(dtype), self._high.astype(dtype)) for dtype in dtypes}
         self._is_unit = is_precise & ~_is_resolved(self._low, self._high)
         self.low = np.where(self._is_unit, -1.0, self._low).astype(np.float32)
         self.high = np.where(self._is_unit, 1.0, self._high).astype(np.float32)
 
-    def to_native(self, discrete: int, parameters: np.ndarray) -> Any:
-        """Return an action in the space's own format.
+    def to_native(self, discrete: np.ndarray, parameters: np.ndarray) -> list[Any]:
+        """Return actions in the space's own format.
 
         Args:
-            discrete: the discrete action, 0 to K - 1.
-            parameters: of all discrete actions, `[sum(parameter_dims)]`. Values outside their bounds are clipped; NaN
-                becomes the lower bound.
+            discrete: the discrete actions, 0 to K - 1, int64 `[M]`.
+            parameters: of all discrete actions, `[M, sum(parameter_dims)]`. Values outside their bounds are clipped;
+                NaN becomes the lower bound.
         """
         if self._is_unit.any():
             share = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
             parameters = np.where(self._is_unit, self._low + share * (self._high - self._low), parameters)
-        native_discrete = self._discrete.dtype.type(self._discrete.start + discrete)
-        values: Any
+        natives = list((self._discrete.start + discrete).astype(self._discrete.dtype))
+        # Clipped in the box's own precision: its bounds may differ from the float32 ones by rounding. fmax skips NaN.
+        with np.errstate(over="ignore"):  # parameters of other boxes, in float16
+            clipped = {
+                dtype: np.fmin(np.fmax(parameters.astype(dtype), low), high)
+                for dtype, (low, high) in self._bounds_by_dtype.items()
+            }
+        owned = zip(self._boxes, self._slices, strict=True)
+        parts = [_by_row(clipped[box.dtype][:, own], box.shape) for box, own in owned]
         if self._has_one_box:
-            index = discrete % len(self._boxes)  # 0 where the box is split: there is only one then
-            values = _fill(self._boxes[index], parameters[self._slices[index]])
+            # A split box is the only one.
+            values: list[Any] = [parts[index % len(parts)][row] for row, index in enumerate(discrete.tolist())]
         else:
-            values = tuple(_fill(box, parameters[own]) for box, own in zip(self._boxes, self._slices, strict=True))
+            values = list(zip(*parts, strict=True))
             if self._box_names is not None:
-                values = dict(zip(self._box_names, values, strict=True))
+                values = [dict(zip(self._box_names, boxes, strict=True)) for boxes in values]
         if self._is_one_of:
-            return native_discrete, values[discrete]
+            chosen = zip(values, discrete.tolist(), strict=True)
+            return list(zip(natives, [boxes[index] for boxes, index in chosen], strict=True))
         if self._part_names is not None:
-            return dict(zip(self._part_names, (native_discrete, values), strict=True))
-        return (native_discrete, *values) if self._is_flat else (native_discrete, values)
+            first, second = self._part_names
+            return [{first: native, second: boxes} for native, boxes in zip(natives, values, strict=True)]
+        if self._is_flat:
+            return [(native, *boxes) for native, boxes in zip(natives, values, strict=True)]
+        return list(zip(natives, values, strict=True))
 
     def _read_parts(self) -> tuple[spaces.Discrete, spaces.Space]:
         """Return the space of the discrete actions and that of the parameters, and note how the two are combined."""
@@ -242,11 +256,10 @@ def _in_order(names: list[str]) -> list[str]:
     return [name for _, name in sorted(zip(numbers, names, strict=True))]
 
 
-def _fill(box: spaces.Box, values: np.ndarray) -> np.ndarray:
-    """Return the values clipped to the box, in its shape and dtype; NaN becomes the lower bound."""
-    # Clipped in the box's own precision: its bounds may differ from the float32 ones by rounding. fmax skips NaN.
-    values = np.fmin(np.fmax(values.astype(box.dtype), box.low.ravel()), box.high.ravel())
-    return values.reshape(box.shape)
+def _by_row(values: np.ndarray, shape: tuple[int, ...]) -> list[np.ndarray]:
+    """Return the rows of values `[M, size]` as arrays of this shape."""
+    rows = values.reshape(len(values), *shape)
+    return list(rows) if shape else [rows[row, ...] for row in range(len(rows))]
 
 
 def _is_resolved(low: np.ndarray, high: np.ndarray) -> np.ndarray:

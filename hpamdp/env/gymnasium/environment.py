@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import copy
-import importlib
-import traceback
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from pydantic import PositiveInt, ValidationError
+from pydantic import PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
@@ -20,21 +16,15 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
-from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
-from hpamdp.env.gymnasium.contract import checked
-from hpamdp.env.gymnasium.four_value import FourValueEnv
+from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.leaves import OutOfBounds
-from hpamdp.env.gymnasium.masks import Masks, MaskSource
-from hpamdp.env.gymnasium.observation_spaces import ObservationSpace, Scaling
-from hpamdp.env.gymnasium.time_limit import with_limit
-from hpamdp.env.gymnasium.values import flag
+from hpamdp.env.gymnasium.making import Maker
+from hpamdp.env.gymnasium.masks import MaskSource
+from hpamdp.env.gymnasium.scaling import ObservationScaling, Scaling
 from hpamdp.env.registration import register
-from hpamdp.messages import one_line
 from hpamdp.settings import SettingError, Settings
 
 _SUCCESS = "success"
-# If an info has both entries, the first one counts.
-_SUCCESS_ENTRIES = ("is_success", "success")
 _SEED = "seed"
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
@@ -124,42 +114,42 @@ class GymnasiumEnv(PAMDPEnv):
         self.num_envs = num_envs
         self.first_env = first_env
         self._name = f"GymnasiumEnv: {options.entry_point or options.id}"
-        self.envs = [self._make() for _ in range(num_envs)]
+        make = Maker(self._name, options.id, options.entry_point, options.kwargs, options.max_steps)
+        self._copies = Copies(make, num_envs, self._reading(), self._name)
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
-        self._check_spaces()
+        self.max_steps = self._copies.max_steps
+        self.parameter_dims = self._copies.actions.parameter_dims
         try:
-            self.envs, limits = map(list, zip(*[with_limit(env, options.max_steps) for env in self.envs], strict=True))
-            self.max_steps = max(limits)
-            self._options = OptionSpace(self.envs[0].action_space, options.option_key)
-            self._actions = ActionSpace(self._options.rest, options.parameter_dims)
-            sizes = {
-                keys.ACTION_MASK: len(self._actions.parameter_dims),
-                keys.OPTION_MASK: self._options.num_options,
-            }
-            self._masks = Masks(self.envs[0], num_envs, sizes, options.action_mask)
-            observation_keys = options.observation_keys
-            if self._masks.in_observation and observation_keys is None:
-                space = self.envs[0].observation_space
-                observation_keys = [name for name in getattr(space, "spaces", {}) if name not in self._masks.rows]
-            self.observations = ObservationSpace(
-                self.envs[0].observation_space, options.observation_scaling, observation_keys, options.out_of_bounds
-            )
+            self.scaling = ObservationScaling(self._copies.observations, options.observation_scaling)
         except ValueError as error:
             raise SettingError(f"{self._name}: {error}") from error
-        self.parameter_dims = self._actions.parameter_dims
         self.option_names = self._names_of_options()
         self._make_specs()
-        self._observation = np.zeros((num_envs, self.observations.dim), np.float32)
-        self._terminated = np.zeros(num_envs, bool)
-        self._truncated = np.zeros(num_envs, bool)
-        self._success = np.zeros(num_envs, bool)
+        self._action_shapes = (self.batch_size, torch.Size((num_envs, sum(self.parameter_dims))))
+        self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
         self._reports_success = False
         self._set_seed(seed)
+
+    def _reading(self) -> Reading:
+        given = self.options
+        return Reading(
+            given.max_steps,
+            None if given.parameter_dims is None else tuple(given.parameter_dims),
+            given.option_key,
+            given.action_mask,
+            None if given.observation_keys is None else tuple(given.observation_keys),
+            given.out_of_bounds,
+        )
+
+    @property
+    def envs(self) -> list[gymnasium.Env]:
+        """The copies."""
+        return self._copies.envs
 
     @property
     def is_shardable(self) -> bool:
         """Whether no running statistics are kept, which all environments must share."""
-        return self.observations.statistics is None
+        return self.scaling.statistics is None
 
     @property
     def title(self) -> str:
@@ -186,7 +176,7 @@ class GymnasiumEnv(PAMDPEnv):
         Raises:
             ValueError: the two differ in their scaling or in the length of their observations.
         """
-        self.observations.share(other.observations)
+        self.scaling.share(other.scaling)
 
     @property
     def keeps_episodes(self) -> bool:
@@ -195,7 +185,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the running statistics, if there are any; the state of the episodes is unknown."""
-        statistics = self.observations.statistics
+        statistics = self.scaling.statistics
         return {} if statistics is None else statistics.columns()
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
@@ -204,8 +194,8 @@ class GymnasiumEnv(PAMDPEnv):
         Raises:
             ValueError: the statistics are of observations of another length.
         """
-        if self.observations.statistics is not None and columns:
-            self.observations.statistics.set_columns(columns)
+        if self.scaling.statistics is not None and columns:
+            self.scaling.statistics.set_columns(columns)
 
     def statistics(self) -> dict[str, Tensor]:
         """Return the running statistics: they are the whole `env_state`."""
@@ -218,56 +208,11 @@ class GymnasiumEnv(PAMDPEnv):
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""
         if not self.is_closed:
-            for env in self.envs:
-                env.close()
+            self._copies.close()
         super().close(raise_if_closed=raise_if_closed)
 
-    def _make(self) -> gymnasium.Env:
-        id, limit = self.options.id, self.options.max_steps
-        # The copies of the environment must not share what they may change.
-        kwargs = copy.deepcopy(self.options.kwargs or {})
-        try:
-            if self.options.entry_point is None:
-                assert id is not None  # checked by the settings
-                return checked(gymnasium.make(id, max_episode_steps=limit, disable_env_checker=True, **kwargs))
-            env = self._load(self.options.entry_point)(**kwargs)
-        except (gymnasium.error.Error, ImportError) as error:
-            raise SettingError(f"{self._name}: {one_line(error)}") from error
-        except (TypeError, ValueError) as error:
-            cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
-            if isinstance(cause, ValidationError):  # a class with Options refuses a setting
-                wrong = cause.errors()[0]
-                given = "".join(f"{name}={wrong['input']}: " for name in wrong["loc"][:1])
-                raise SettingError(f"{self._name}: {given}{wrong['msg']}") from error
-            # A constructor may pass unknown arguments on to another one, which then raises the error.
-            is_unknown = any(f"unexpected keyword argument '{name}'" in str(cause) for name in kwargs)
-            if not (is_unknown or _is_about_the_call(cause)):
-                raise
-            raise SettingError(f"{self._name}: {one_line(cause)}") from error
-        if not isinstance(env, gymnasium.Env):
-            env = FourValueEnv(env)
-        return checked(env)
-
-    def _check_spaces(self) -> None:
-        first = self.envs[0]
-        for row, env in enumerate(self.envs):
-            for name in ("action_space", "observation_space"):
-                if getattr(env, name) != getattr(first, name):
-                    given, wanted = written(getattr(env, name)), written(getattr(first, name))
-                    different = f"the {name} of copy {row} is {given}, but that of copy 0 {wanted}"
-                    raise SettingError(f"{self._name}: {different}")
-
-    def _load(self, entry_point: str) -> Any:
-        module_name, _, name = entry_point.partition(":")
-        if not all(part.isidentifier() for part in (*module_name.split("."), name)):
-            raise SettingError(f"{self._name}: must be a class or function, as package.module:name")
-        entry = getattr(importlib.import_module(module_name), name, None)
-        if not callable(entry):
-            raise SettingError(f"{self._name}: there is no class or function {name} in {module_name}")
-        return entry
-
     def _names_of_options(self) -> tuple[str, ...]:
-        num_options = self._options.num_options
+        num_options = self._copies.options.num_options
         given = getattr(self.envs[0].unwrapped, "option_names", ())
         try:
             names = checked_option_names(() if given is None else given)
@@ -280,17 +225,16 @@ class GymnasiumEnv(PAMDPEnv):
         device = self.device
         self.observation_spec = Composite(
             {
-                keys.OBSERVATION: Unbounded(shape=(n, self.observations.dim), device=device, dtype=torch.float32),
+                keys.OBSERVATION: Unbounded(shape=(n, self._copies.layout.dim), device=device, dtype=torch.float32),
                 _SUCCESS: Categorical(2, shape=(n,), dtype=torch.bool, device=device),
             },
             shape=(n,),
         )
-        for name, masks in self._masks.rows.items():
-            size = masks.shape[1]
+        for name, size in self._copies.layout.mask_sizes.items():
             self.observation_spec[name] = Binary(size, shape=(n, size), dtype=torch.bool, device=device)
-        low = torch.from_numpy(self._actions.low)
-        high = torch.from_numpy(self._actions.high)
-        self.action_spec = self.make_action_spec(low, high, has_option=self._options.num_options > 0)
+        low = torch.from_numpy(self._copies.actions.low)
+        high = torch.from_numpy(self._copies.actions.high)
+        self.action_spec = self.make_action_spec(low, high, has_option=self._copies.options.num_options > 0)
         self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=torch.float32)
         self.done_spec = self.make_done_spec()
 
@@ -305,108 +249,97 @@ class GymnasiumEnv(PAMDPEnv):
         given = None if tensordict is None else tensordict.get(_SEED, None)
         if given is not None and (given.shape != (self.num_envs,) or given.is_floating_point() or (given < 0).any()):
             raise ValueError(f"reset: {_SEED} must be integers of at least 0 in shape [{self.num_envs}]")
-        rows = list(range(self.num_envs)) if mask is None else _rows(mask)
-        observations = []
+        is_reset = np.ones(self.num_envs, bool) if mask is None else mask.reshape(-1).cpu().numpy()
+        seeds = self._next_seeds if given is None else given.tolist()
+        rows = np.flatnonzero(is_reset).tolist()
+        chosen = {row: seeds[row] for row in rows}
         for row in rows:
-            seed = self._next_seeds[row] if given is None else given[row].item()
             self._next_seeds[row] = None
-            with self._problem_of(row):
-                observation, info = self.envs[row].reset(seed=seed)
-                self._masks.check_attributes(self.envs[row])
-                observations.append(self.observations.flat(observation))
-                self._masks.keep(row, observation, info)
-        self._keep(rows, observations)
-        self._terminated[rows] = False
-        self._truncated[rows] = False
-        self._success[rows] = False
+        self._copies.reset(chosen)
+        self._scale(is_reset)
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self.check_action(tensordict)
-        check_action_values(tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS), self.parameter_dims)
-        discrete = tensordict.get(keys.DISCRETE).tolist()
-        parameters = tensordict.get(keys.PARAMETERS).detach().cpu().numpy()
-        options = self._read_options(tensordict)
-        is_running = ~(self._terminated | self._truncated)
+        chosen, values = self._read_action(tensordict)
+        option = self._read_option(tensordict)
+        results, is_stepped = self._copies.results, self._is_running()
         if "_step" in tensordict.keys():
-            is_running &= np.isin(np.arange(self.num_envs), _rows(tensordict.get("_step")))
-        rows = is_running.nonzero()[0].tolist()
-        observations = []
-        rewards = np.zeros((self.num_envs, 1))
-        for row in rows:
-            action = self._actions.to_native(discrete[row], parameters[row])
-            if options is not None:
-                action = self._options.with_option(action, options[row])
-            with self._problem_of(row):
-                observation, reward, terminated, truncated, info = self.envs[row].step(action)
-                observations.append(self.observations.flat(observation))
-                self._masks.keep(row, observation, info)
-                succeeded = self._read_success(info)
-            rewards[row] = reward
-            self._terminated[row] = terminated
-            self._truncated[row] = truncated and not terminated
-            self._success[row] = succeeded
-        self._keep(rows, observations)
-        return self._read().set(keys.REWARD, torch.from_numpy(rewards).to(self.device, torch.float32))
+            is_stepped &= tensordict.get("_step").reshape(-1).cpu().numpy()
+        self._copies.step(np.flatnonzero(is_stepped).tolist(), option, chosen, values)
+        self._reports_success |= bool(results.has_success.any())
+        self._scale(is_stepped)
+        return self._read(np.where(is_stepped, results.reward, 0.0).astype(np.float32))
 
-    def _read_success(self, info: Mapping[str, Any]) -> bool:
-        """Return whether the info of a step reports success; False if it has no such entry."""
-        for name in _SUCCESS_ENTRIES:
-            if name in info:
-                self._reports_success = True
-                return flag(f"info[{name!r}]", info[name])
-        return False
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        # `_read` returns every entry in its final shape. TorchRL takes a quarter of its own time to check that.
+        return next_tensordict_out
 
-    def _read_options(self, tensordict: TensorDictBase) -> list[int] | None:
-        """Return the options, checked; None where the environment itself has none."""
-        num_options = self._options.num_options
+    def _is_running(self) -> np.ndarray:
+        """Return which episodes go on, bool `[N]`."""
+        results = self._copies.results
+        return (results.terminated == 0.0) & (results.truncated == 0.0)
+
+    def _read_action(self, tensordict: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
+        """Return the discrete actions `[N]` and all parameters `[N, num_parameters]`, checked."""
+        discrete, parameters = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
+        # The quick way for what almost every step gets. Otherwise the full checks say what is wrong.
+        is_usual = (
+            not self.has_choice
+            and discrete is not None
+            and parameters is not None
+            and discrete.dtype == torch.int64
+            and (discrete.shape, parameters.shape) == self._action_shapes
+        )
+        if not is_usual:
+            self.check_action(tensordict)
+        chosen, values = discrete.cpu().numpy(), parameters.detach().cpu().numpy()
+        if not (np.isfinite(values).all() and chosen.min() >= 0 and chosen.max() < len(self.parameter_dims)):
+            check_action_values(discrete, parameters, self.parameter_dims)
+        return chosen, values
+
+    def _read_option(self, tensordict: TensorDictBase) -> np.ndarray | None:
+        """Return the options `[N]`, checked; None if the environment itself has none."""
+        num_options = self._copies.options.num_options
         if num_options == 0:
             return None
-        options = tensordict.get(keys.OPTION).tolist()
-        for row, option in enumerate(options):
-            if not 0 <= option < num_options:
-                raise invalid_action(row, {keys.OPTION: (option, f"allowed 0 to {num_options - 1}")})
-        return options
+        option = tensordict.get(keys.OPTION).cpu().numpy()
+        is_wrong = (option < 0) | (option >= num_options)
+        if is_wrong.any():
+            row = int(is_wrong.argmax())
+            raise invalid_action(row, {keys.OPTION: (int(option[row]), f"allowed 0 to {num_options - 1}")})
+        return option
 
-    @contextmanager
-    def _problem_of(self, row: int) -> Iterator[None]:
-        """Say which copy broke its contract."""
-        try:
-            yield
-        except ProblemError as error:
-            raise ProblemError(f"{self._name}: environment {row}: {error}") from error
+    def _scale(self, is_new: np.ndarray) -> None:
+        """Scale the observations of these rows, bool `[N]`, and keep them."""
+        vectors = self._copies.results.observation
+        if is_new.all():
+            self._observation = self.scaling.scaled(vectors)
+        elif is_new.any():
+            self._observation[is_new] = self.scaling.scaled(vectors[is_new])
 
-    def _keep(self, rows: list[int], observations: list[np.ndarray]) -> None:
-        """Scale the new observations of these rows and keep them."""
-        if observations:
-            self._observation[rows] = self.observations.scaled(np.stack(observations))
-
-    def _read(self) -> TensorDict:
+    def _read(self, reward: np.ndarray | None = None) -> TensorDict:
+        """Return the last results, with the rewards `[N]` if they are those of a step."""
+        results = self._copies.results
+        # A new array of flags, so that the next step does not change what was returned.
+        flags = results.flags != 0.0
+        np.logical_or(flags[0], flags[1], out=flags[3])
+        terminated, truncated, success, done = torch.from_numpy(flags[..., None]).unbind()
         leaves = {
-            keys.OBSERVATION: self._observation,
-            _SUCCESS: self._success,
-            **self._masks.rows,
-            keys.TERMINATED: self._terminated[:, None],
-            keys.TRUNCATED: self._truncated[:, None],
-            keys.DONE: (self._terminated | self._truncated)[:, None],
+            keys.OBSERVATION: torch.from_numpy(self._observation.copy()),
+            _SUCCESS: success.squeeze(-1),
+            keys.TERMINATED: terminated,
+            keys.TRUNCATED: truncated,
+            keys.DONE: done,
         }
-        # torch.tensor copies, so that the next step does not change what was returned.
-        tensors = {name: torch.tensor(leaf, device=self.device) for name, leaf in leaves.items()}
-        return self.check_masks(TensorDict(tensors, batch_size=self.batch_size, device=self.device))
+        for name, mask in results.masks.items():
+            leaves[name] = torch.from_numpy(mask != 0.0)
+        if reward is not None:
+            leaves[keys.REWARD] = torch.from_numpy(reward[:, None])
+        td = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        return self.check_masks(td) if results.masks else td
 
 
 def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:
     """Return 31-bit seeds, which every generator takes, for the `num` copies from number `first` on."""
     rows = range(first, first + num)
     return [int(np.random.SeedSequence((seed, row, stream)).generate_state(1)[0] >> 1) for row in rows]
-
-
-def _rows(mask: Tensor) -> list[int]:
-    """Return the rows of a mask `[N]` or `[N, 1]` that are True."""
-    return mask.reshape(-1).nonzero().squeeze(-1).tolist()
-
-
-def _is_about_the_call(error: BaseException) -> bool:
-    """Return whether an error is about a call's arguments or a registered time limit: raised here or in Gymnasium."""
-    frame, _ = list(traceback.walk_tb(error.__traceback__))[-1]
-    return frame.f_globals["__name__"] in (__name__, "gymnasium.envs.registration", "gymnasium.wrappers.common")

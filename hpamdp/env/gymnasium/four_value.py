@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.values import flag, shown
 from hpamdp.settings import SettingError
 

@@ -7,9 +7,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces.utils import flatten
+from gymnasium.spaces.utils import flatdim, flatten
 
-from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.values import as_numbers, shown
 from hpamdp.settings import SettingError
 
@@ -19,6 +19,9 @@ OutOfBounds = Literal["refuse", "clip", "allow"]
 _ROUNDING = 4.0
 # The dtype of the agent's observations.
 _OBSERVED = np.dtype(np.float32)
+# Types of a plain value of a Discrete.
+_INTEGERS = (int, np.int64, np.int32)
+_WHOLE = [np.dtype(name) for name in ("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32")]
 
 
 class Leaf:
@@ -38,6 +41,10 @@ class Leaf:
 
     Attributes:
         what: the leaf in words, such as `entry a.b`.
+        size: length of its vector.
+        lowest, highest: bounds `[size]` of what `write` leaves unchecked. Numbers within them need no `settled`.
+        clip_low, clip_high: bounds `[size]` that numbers are moved to; infinite if they are kept or refused.
+        rounding: dtype that the vector is rounded to; None if it needs no rounding.
     """
 
     def __init__(
@@ -52,8 +59,70 @@ class Leaf:
         self._lengths = lengths
         self._out_of_bounds = out_of_bounds
         self.what = f"entry {'.'.join(map(str, path))}" if path else "value"
+        self.size = flatdim(space)
+        self.lowest = np.zeros(self.size)
+        self.highest = np.ones(self.size)
+        self.clip_low = np.full(self.size, -np.inf)
+        self.clip_high = np.full(self.size, np.inf)
+        self.rounding: np.dtype | None = None
+        self._plain_dtypes: frozenset[np.dtype] = frozenset()
+        self._is_scalar = isinstance(space, spaces.Discrete)
+        self._first = int(space.start) if isinstance(space, spaces.Discrete) else 0
+        self._offsets: np.ndarray | None = None  # of a MultiDiscrete's one-hot vectors
         if isinstance(space, spaces.Box):
             self._read_bounds(space)
+        elif isinstance(space, spaces.MultiBinary):
+            self._plain_dtypes = frozenset(_WHOLE)
+        elif isinstance(space, spaces.MultiDiscrete):
+            self._plain_dtypes = frozenset(_WHOLE)
+            self._start, self._sizes = space.start, space.nvec
+            self._offsets = np.cumsum(space.nvec.ravel()) - space.nvec.ravel()
+
+    def write(self, observation: Any, vector: np.ndarray) -> bool:
+        """Write the leaf's part of an observation into a vector, float64 `[size]`, if it is of a plain kind.
+
+        Plain are arrays of the space's shape whose dtype the space can hold, and whole numbers of a `Discrete`. This
+        is the quick way: numbers are compared with their bounds later, for all environments at once.
+
+        Returns:
+            Whether the part is plain. Otherwise use `flat`, which also checks it.
+
+        Raises:
+            ProblemError: the part is missing.
+        """
+        value = self._find(observation) if self.path else observation
+        if self._is_scalar:
+            index = int(value) - self._first if type(value) in _INTEGERS else -1
+            if not 0 <= index < self.size:
+                return False
+            vector[:] = 0.0
+            vector[index] = 1.0
+            return True
+        if type(value) is not np.ndarray or value.dtype not in self._plain_dtypes or value.shape != self.space.shape:
+            return False
+        if self._offsets is None:
+            vector[:] = value if value.ndim == 1 else value.ravel()
+            return True
+        whole = value.astype(np.int64) - self._start
+        is_inside = bool(((whole >= 0) & (whole < self._sizes)).all())
+        if is_inside:
+            vector[:] = 0.0
+            vector[self._offsets + whole.ravel()] = 1.0
+        return is_inside
+
+    def settled(self, vector: np.ndarray, cure: str = "") -> np.ndarray:
+        """Return a vector that `write` wrote, after a full check.
+
+        Raises:
+            ProblemError: a number is not in the space.
+        """
+        shape = self.space.shape
+        assert shape is not None
+        if isinstance(self.space, spaces.Box):
+            return self._within_bounds(vector.reshape(shape), self._own).ravel()
+        if isinstance(self.space, spaces.MultiBinary):
+            return self._one_hot(vector.reshape(shape), cure)
+        return vector
 
     def flat(self, observation: Any, cure: str = "") -> np.ndarray:
         """Return the leaf's part of an observation as a vector, float64; discrete values are one-hot.
@@ -81,6 +150,9 @@ class Leaf:
         value = observation
         for entry, length in zip(self.path, self._lengths, strict=True):
             is_dict = length is None
+            if is_dict and type(value) is dict and entry in value:  # as a rule
+                value = value[entry]
+                continue
             if not isinstance(value, Mapping if is_dict else tuple | list | np.ndarray):
                 raise ProblemError(f"gave an observation without its {self.what}")
             if not is_dict and len(value) != length:
@@ -102,6 +174,16 @@ class Leaf:
         slack = self._slack(self._own) if self._is_float else 0.0
         self._lowest = np.maximum(self._low - slack, -largest)
         self._highest = np.minimum(self._high + slack, largest)
+        self.lowest, self.highest = self._lowest.ravel(), self._highest.ravel()
+        if self._out_of_bounds != "refuse":
+            self.lowest, self.highest = np.full(self.size, -largest), np.full(self.size, largest)
+        if self._out_of_bounds == "clip":
+            self.clip_low, self.clip_high = self._low.ravel(), self._high.ravel()
+        if self._is_float and self._own.itemsize < 8:
+            self.rounding = self._own
+        # Of the same precision as the space or a higher one: no other rounding is allowed for.
+        precise = {self._own, np.dtype(np.float64)} if self._is_float else set()
+        self._plain_dtypes = frozenset({*_WHOLE, *precise})
 
     def _slack(self, dtype: np.dtype) -> np.ndarray:
         """Return how far beyond its bounds a number of this dtype may be by rounding."""

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 
 from hpamdp import keys
-from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import ProblemError
 from hpamdp.env.gymnasium.leaves import leaves
 from hpamdp.env.gymnasium.values import as_numbers, shown
 from hpamdp.settings import SettingError
@@ -28,6 +28,8 @@ _MEANINGS = {
     keys.ACTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}actions?(?:masks?)?|actions?masks?|masks?actions?)",
     keys.OPTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}options?(?:masks?)?|options?masks?|masks?options?)",
 }
+# Types that need no search, which takes longer.
+_NO_MAPPINGS = frozenset((bool, int, float, str, tuple, list, np.ndarray, np.float32, np.float64, np.int64, type(None)))
 # These names may also mean something else, so the values decide.
 _VAGUE = ("mask", "masks")
 
@@ -85,7 +87,7 @@ class Masks:
             if mask is None or mask.shape != masks[row].shape or ((mask != 0) & (mask != 1)).any():
                 raise ProblemError(f"gave {shown(given)} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
             masks[row] = mask != 0
-        if self._unread:
+        if self._unread and not (_is_plain(info) and _is_plain(observation)):
             self._refuse([*_in_mapping("info", info), *_in_mapping("observation", observation)], ProblemError)
 
     def check_attributes(self, env: gymnasium.Env) -> None:
@@ -127,6 +129,18 @@ def _in_mapping(place: str, values: Any, depth: int = _DEPTH) -> Iterator[tuple[
         if isinstance(entry, str) and _meaning(entry) is not None and not _cannot_be_mask(value):
             yield f"{place}[{entry!r}]", entry, value
         yield from _in_mapping(f"{place}[{entry!r}]", value, depth - 1)
+
+
+def _is_plain(values: Any) -> bool:
+    """Return whether values are no dictionary, or one without nested dictionaries and names of masks."""
+    if type(values) in _NO_MAPPINGS or not isinstance(values, Mapping):
+        return True
+    for entry, value in values.items():
+        if type(value) not in _NO_MAPPINGS and isinstance(value, Mapping):
+            return False
+        if isinstance(entry, str) and _meaning(entry) is not None:
+            return False
+    return True
 
 
 def _in_attributes(env: Any, *, is_new: bool) -> Iterator[tuple[str, str, Any]]:

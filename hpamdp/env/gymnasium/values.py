@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import ProblemError
 from hpamdp.messages import one_line
 
 _LONGEST = 200
+_FLOATS = (float, np.float64, np.float32)
+_FLAGS = (bool, np.bool_)
 
 
 def as_numbers(value: Any) -> np.ndarray | None:
@@ -31,6 +33,8 @@ def number(name: str, value: Any) -> float:
     Raises:
         ProblemError: the value is no number.
     """
+    if type(value) in _FLOATS:  # as a rule, and 20 times as fast
+        return float(value)
     numbers = as_numbers(value)
     if numbers is None or numbers.size != 1:
         raise ProblemError(f"step returned {shown(value)} as {name}, which must be a number")
@@ -43,6 +47,8 @@ def flag(name: str, value: Any) -> bool:
     Raises:
         ProblemError: the value is something else.
     """
+    if type(value) in _FLAGS:
+        return bool(value)
     numbers = as_numbers(value)
     if numbers is None or numbers.size != 1 or numbers.item() not in (0, 1):
         raise ProblemError(f"step returned {shown(value)} as {name}, which must be True or False")

@@ -21,6 +21,7 @@ from torchrl.envs import TransformedEnv
 
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.messages import one_line
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run.assemble import acting, make_agent, make_env
@@ -90,12 +91,15 @@ class ShardCollector(Collector):
         Raises:
             ProblemError: the problem broke its contract.
             MemoryError: memory does not suffice.
+            EnvironmentFaultError: a third-party environment raised an error.
             RemoteError: the environment raised any other error.
         """
         try:
             return self.policy.receive(policy), self.next()
         except (ProblemError, MemoryError) as error:
             raise type(error)(str(error)) from None
+        except EnvironmentFaultError as error:
+            raise EnvironmentFaultError(error.line, error.frames) from None
         except Exception as error:  # the learner's process may not have its class
             summary = one_line(f"{type(error).__name__}: {error}")
             raise RemoteError(f"{summary}\n\nIn a worker:\n{traceback.format_exc()}") from None

@@ -18,6 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from hpamdp import keys
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state
 from hpamdp.run.collection.limits import limit_of
@@ -145,7 +146,7 @@ class WorkerCollection(Collection):
             WorkerDiedError: the worker died.
             CollectionError: the machine reached a limit.
         """
-        if isinstance(error, ProblemError | MemoryError | RemoteError):
+        if isinstance(error, ProblemError | EnvironmentFaultError | MemoryError | RemoteError):
             raise error
         limit = limit_of(error)
         if limit is not None:

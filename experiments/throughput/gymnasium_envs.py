@@ -1,0 +1,240 @@
+"""Compare `GymnasiumEnv` with Gymnasium's own loops over the same copies, and write gymnasium_envs.csv.
+
+Run: python experiments/throughput/gymnasium_envs.py [--seconds 10] [--copies 16]
+
+All ways are timed in one process with one thread, in turns of a few milliseconds. A figure is the fastest turn's.
+
+- `loop`: `reset` and `step` of each copy, in plain Python.
+- `SyncVectorEnv`: Gymnasium's vector environment over the same copies, which also resets them.
+- `GymnasiumEnv.step`: `env.step` and `step_mdp`, with a reset of the copies whose episode is over.
+- `GymnasiumEnv.rollout`: `env.rollout` with random actions.
+- `Collector`: a run's own collector, with tracked decisions and random actions.
+- `floor`: as `GymnasiumEnv.step`, but the environment returns constants. TorchRL itself takes this time.
+
+Actions come from a pool of eight samples, except where they are random.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import itertools
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+
+import hpamdp
+from hpamdp import keys
+from hpamdp.env.decisions import with_decisions
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+
+POOL = 8
+STEPS = 100
+BOXES = [spaces.Box(-1.0, 1.0, (1,)), spaces.Box(0.0, 1.0, (2,)), spaces.Box(0.0, 2.0, (1,))]
+
+
+class Trivial(gymnasium.Env):
+    """A point on a line. Its step takes a microsecond."""
+
+    action_space = spaces.Tuple([spaces.Discrete(3), spaces.Tuple(BOXES)])
+    observation_space = spaces.Box(-200.0, 200.0, (4,))
+
+    def reset(self, *, seed=None, options=None):
+        """Begin at 0."""
+        super().reset(seed=seed)
+        self.state = np.zeros(4, np.float32)
+        return self.state, {}
+
+    def step(self, action):
+        """Move by the chosen parameter."""
+        discrete, parameters = action
+        self.state = self.state.copy()
+        self.state[discrete] += parameters[discrete][0]
+        return self.state, 0.5, False, False, {}
+
+
+class Light(Trivial):
+    """A cart in the plane, in a few lines of NumPy. Its step takes some ten microseconds."""
+
+    def reset(self, *, seed=None, options=None):
+        """Begin somewhere, at rest."""
+        gymnasium.Env.reset(self, seed=seed)
+        self.position = self.np_random.uniform(-1.0, 1.0, 2)
+        self.speed = np.zeros(2)
+        return np.concatenate([self.position, self.speed]).astype(np.float32), {}
+
+    def step(self, action):
+        """Push in one of three directions, with friction and noise."""
+        discrete, parameters = action
+        angle = 2.0 * discrete
+        force = parameters[discrete][0] * np.array([np.cos(angle), np.sin(angle)])
+        self.speed = 0.9 * self.speed + 0.1 * force + 0.01 * self.np_random.normal(size=2)
+        self.position = np.clip(self.position + 0.1 * self.speed, -100.0, 100.0)
+        distance = float(np.linalg.norm(self.position))
+        observation = np.concatenate([self.position, self.speed]).astype(np.float32)
+        return observation, -distance, distance < 0.001, False, {}
+
+
+class Medium(Trivial):
+    """A chain of masses, observed as a `Dict` with numbers and a phase. Its step takes some fifty microseconds."""
+
+    observation_space = spaces.Dict(
+        position=spaces.Box(-1e3, 1e3, (8,), np.float64),
+        speed=spaces.Box(-1e3, 1e3, (8,), np.float64),
+        phase=spaces.Discrete(4),
+    )
+
+    def reset(self, *, seed=None, options=None):
+        """Begin with random displacements."""
+        super().reset(seed=seed)
+        self.position = self.np_random.normal(size=8)
+        self.speed = np.zeros(8)
+        self.ticks = 0
+        return self._observation(), {"energy": 0.0}
+
+    def step(self, action):
+        """Push the chosen mass, and move all of them by ten ticks."""
+        discrete, parameters = action
+        force = np.zeros(8)
+        force[discrete] = parameters[discrete][0]
+        for _ in range(10):
+            self.speed = 0.99 * self.speed + 0.02 * (force - self.position)
+            self.position = self.position + 0.02 * self.speed
+        self.ticks += 1
+        energy = float(self.speed @ self.speed)
+        return self._observation(), -energy, False, False, {"energy": energy}
+
+    def _observation(self):
+        return {"position": self.position, "speed": self.speed, "phase": self.ticks % 4}
+
+
+class Constant(GymnasiumEnv):
+    """Has the specs of the environment, and always returns the same tensors."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        self.same = super()._reset(tensordict)
+        self.after = self.same.clone().set(keys.REWARD, torch.zeros(self.num_envs, 1))
+        return self.same.copy()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.after.copy()
+
+
+def limited(cls: type[gymnasium.Env]) -> gymnasium.Env:
+    """Return a copy with a time limit."""
+    return TimeLimit(cls(), STEPS)
+
+
+def loop(cls: type[gymnasium.Env], copies: int) -> Callable[[], object]:
+    """Return a function that steps each copy once, in plain Python."""
+    envs = [limited(cls) for _ in range(copies)]
+    for env in envs:
+        env.reset(seed=0)
+    envs[0].action_space.seed(0)
+    pool = itertools.cycle([[envs[0].action_space.sample() for _ in envs] for _ in range(POOL)])
+
+    def step() -> None:
+        for env, action in zip(envs, next(pool), strict=True):
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    return step
+
+
+def vector(cls: type[gymnasium.Env], copies: int) -> Callable[[], object]:
+    """Return a function that makes a step of Gymnasium's vector environment."""
+    env = SyncVectorEnv([lambda: limited(cls)] * copies)
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    pool = itertools.cycle([env.action_space.sample() for _ in range(POOL)])
+    return lambda: env.step(next(pool))
+
+
+def adapter(cls: type[gymnasium.Env], copies: int, kind: type[GymnasiumEnv] = GymnasiumEnv) -> GymnasiumEnv:
+    """Return the TorchRL environment over the copies."""
+    return kind(copies, entry_point=f"{__name__}:{cls.__name__}", max_steps=STEPS)
+
+
+def stepper(env: GymnasiumEnv) -> Callable[[], object]:
+    """Return a function that makes a step, with resets."""
+    pool = itertools.cycle([env.rand_action(env.reset()).select(keys.ACTION) for _ in range(POOL)])
+    td = env.reset()
+
+    def step() -> None:
+        nonlocal td
+        _, td = env.step_and_maybe_reset(td.update(next(pool)))
+
+    return step
+
+
+def roller(env: GymnasiumEnv) -> Callable[[], object]:
+    """Return a function that makes a rollout of `STEPS` steps."""
+    return lambda: env.rollout(STEPS, break_when_any_done=False)
+
+
+def collecting(env: GymnasiumEnv) -> Callable[[], object]:
+    """Return a function that collects `STEPS` steps of each copy."""
+    frames = env.num_envs * STEPS
+    batches = iter(Collector(with_decisions(env), None, frames_per_batch=frames, total_frames=-1))
+    return lambda: next(batches)
+
+
+def rates(steppers: dict[str, tuple[Callable[[], object], int]], seconds: float) -> dict[str, float]:
+    """Return the most steps per second of CPU time of each way, from turns that alternate."""
+    best = dict.fromkeys(steppers, 0.0)
+    for step, _ in steppers.values():
+        for _ in range(3):
+            step()
+    ended = time.perf_counter() + seconds
+    while time.perf_counter() < ended:
+        for what, (step, steps_per_call) in steppers.items():
+            calls = max(1, 160 // steps_per_call)
+            started = time.process_time()
+            for _ in range(calls):
+                step()
+            best[what] = max(best[what], calls * steps_per_call / (time.process_time() - started))
+    return best
+
+
+def main() -> None:
+    """Measure all environments and write the csv file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0, help="for each environment")
+    parser.add_argument("--copies", type=int, default=16)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    copies = arguments.copies
+    print(f"hpamdp {hpamdp.__version__}, torch {torch.__version__}, gymnasium {gymnasium.__version__}, {copies} copies")
+    rows: list[dict[str, object]] = []
+    for cls in (Trivial, Light, Medium):
+        steppers = {
+            "loop": (loop(cls, copies), copies),
+            "SyncVectorEnv": (vector(cls, copies), copies),
+            "GymnasiumEnv.step": (stepper(adapter(cls, copies)), copies),
+            "GymnasiumEnv.rollout": (roller(adapter(cls, copies)), copies * STEPS),
+            "Collector": (collecting(adapter(cls, copies)), copies * STEPS),
+            "floor": (stepper(adapter(cls, copies, Constant)), copies),
+        }
+        best = rates(steppers, arguments.seconds)
+        for what, rate in best.items():
+            ratio = rate / best["SyncVectorEnv"]
+            rows.append({"env": cls.__name__, "what": what, "steps_per_s": round(rate), "ratio": f"{ratio:.2f}"})
+            print(f"{cls.__name__:<8} {what:<21} {rate:>10,.0f} steps/s  {ratio:5.2f} x SyncVectorEnv", flush=True)
+    with (Path(__file__).parent / "gymnasium_envs.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    main()

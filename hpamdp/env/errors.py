@@ -1,0 +1,62 @@
+"""Errors of problems, and whose fault they are: the problem's contract, or the code of a third-party environment."""
+
+from __future__ import annotations
+
+import os
+import sysconfig
+import traceback
+
+from hpamdp.messages import one_line
+
+# Frames of these packages are not the environment's own. NumPy's are, but say nothing about where it went wrong.
+_NOT_THEIRS = ("hpamdp", "gymnasium", "numpy", "torch", "torchrl", "tensordict", "multiprocessing")
+
+
+class ProblemError(ValueError):
+    """A problem breaks its own contract, such as with an observation outside its space; the message is one line."""
+
+
+class EnvironmentFaultError(RuntimeError):
+    """A third-party environment raised an error. The message is one line that says where; the error is the cause.
+
+    Args:
+        line: the message.
+        frames: the environment's own lines of the traceback, as Python prints them.
+    """
+
+    def __init__(self, line: str, frames: str = "") -> None:
+        super().__init__(line, frames)  # both, so that pickling keeps both
+        self.line = line
+        self.frames = frames
+
+    def __str__(self) -> str:
+        """Return the line."""
+        return self.line
+
+
+def fault_of(error: Exception, what: str) -> EnvironmentFaultError | None:
+    """Return the fault that an error is, or None if no third-party code was running.
+
+    Args:
+        error: raised while an environment was called.
+        what: who raised it, such as `my_module:Env: step`.
+    """
+    modules = [str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    theirs = [
+        summary
+        for module, summary in zip(modules, traceback.extract_tb(error.__traceback__), strict=True)
+        if module.partition(".")[0] not in _NOT_THEIRS
+    ]
+    if not theirs:
+        return None
+    # An installed environment has frames of installed packages alone.
+    theirs = [summary for summary in theirs if not _is_installed(summary.filename)] or theirs
+    raised = one_line(f"{type(error).__name__}: {error}")
+    where = f"{theirs[-1].filename}, line {theirs[-1].lineno}"
+    return EnvironmentFaultError(one_line(f"{what} raised {raised} ({where})"), "".join(traceback.format_list(theirs)))
+
+
+def _is_installed(file: str) -> bool:
+    """Return whether a file belongs to Python or to an installed package."""
+    folders = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+    return file.startswith("<frozen") or any(file.startswith(folder + os.sep) for folder in folders)

@@ -1,0 +1,257 @@
+"""Copies of a Gymnasium environment, stepped one after another, and what they return in one table of numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from hpamdp import keys
+from hpamdp.env.errors import EnvironmentFaultError, ProblemError, fault_of
+from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
+from hpamdp.env.gymnasium.leaves import OutOfBounds
+from hpamdp.env.gymnasium.masks import Masks, MaskSource
+from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.time_limit import with_limit
+from hpamdp.env.gymnasium.values import flag
+from hpamdp.settings import SettingError
+
+# If an info has both entries, the first one counts.
+_SUCCESS_ENTRIES = ("is_success", "success")
+# Columns of a table of results after the observation, before the masks.
+_NUM_AFTER = len(("reward", "terminated", "truncated", "success", "has_success"))
+_ALL = slice(None)  # rows
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How an environment's spaces are read.
+
+    Attributes:
+        max_steps, parameter_dims, option_key, action_mask, observation_keys, out_of_bounds: see the settings.
+    """
+
+    max_steps: int | None = None
+    parameter_dims: tuple[int, ...] | None = None
+    option_key: int | str | None = None
+    action_mask: MaskSource | None = None
+    observation_keys: tuple[int | str, ...] | None = None
+    out_of_bounds: OutOfBounds = "refuse"
+
+
+@dataclass(frozen=True)
+class Results:
+    """What the copies have last returned, float64, a row for each copy.
+
+    Attributes:
+        observation: `[N, dim]`, flattened but not scaled.
+        reward, terminated, truncated, success, has_success: `[N]`. `has_success` is 1 if the last info had a success.
+        flags: the four of these that are flags, one after another, `[4, N]`.
+        masks: by name, `[N, K]`.
+    """
+
+    observation: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    success: np.ndarray
+    has_success: np.ndarray
+    flags: np.ndarray
+    masks: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where things are in a table of results, which has a row for each copy.
+
+    Attributes:
+        dim: length of the observation.
+        mask_sizes: lengths of the masks, by name.
+    """
+
+    dim: int
+    mask_sizes: dict[str, int]
+
+    @property
+    def num_result_columns(self) -> int:
+        """Number of columns of a table of results."""
+        return self.dim + _NUM_AFTER + sum(self.mask_sizes.values())
+
+    def results(self, table: np.ndarray) -> Results:
+        """Return views into a table of results."""
+        masks, start = {}, self.dim + _NUM_AFTER
+        for name, size in self.mask_sizes.items():
+            masks[name] = table[:, start : start + size]
+            start += size
+        reward, terminated, truncated, success, has_success = after = table[:, self.dim : self.dim + _NUM_AFTER].T
+        return Results(table[:, : self.dim], reward, terminated, truncated, success, has_success, after[1:], masks)
+
+
+class Copies:
+    """Copies of one environment.
+
+    Args:
+        make: makes a copy.
+        num: number of copies.
+        reading: how its spaces are read.
+        name: what errors call the environment.
+        first: number of the first copy in errors.
+
+    Attributes:
+        envs: the copies.
+        max_steps: of the longest episode.
+        results: what they have last returned.
+
+    Raises:
+        SettingError: the spaces are not accepted, or differ between copies.
+        EnvironmentFaultError: a constructor raised an error.
+    """
+
+    def __init__(
+        self, make: Callable[[], gymnasium.Env], num: int, reading: Reading, name: str, first: int = 0
+    ) -> None:
+        self._name = name
+        self._first = first
+        self.envs = [make() for _ in range(num)]
+        self._check_spaces()
+        try:
+            self.envs, limits = map(list, zip(*[with_limit(env, reading.max_steps) for env in self.envs], strict=True))
+            self.max_steps = max(limits)
+            space = self.envs[0].observation_space
+            self.options = OptionSpace(self.envs[0].action_space, reading.option_key)
+            self.actions = ActionSpace(self.options.rest, reading.parameter_dims)
+            sizes = {
+                keys.ACTION_MASK: len(self.actions.parameter_dims),
+                keys.OPTION_MASK: self.options.num_options,
+            }
+            self._masks = Masks(self.envs[0], num, sizes, reading.action_mask)
+            entries: Sequence[int | str] | None = reading.observation_keys
+            if self._masks.in_observation and entries is None:
+                entries = [entry for entry in getattr(space, "spaces", {}) if entry not in self._masks.rows]
+            self.observations = ObservationSpace(space, entries, reading.out_of_bounds)
+        except ValueError as error:
+            raise SettingError(f"{name}: {error}") from error
+        mask_sizes = {mask: rows.shape[1] for mask, rows in self._masks.rows.items()}
+        self.layout = Layout(self.observations.dim, mask_sizes)
+        self.table = np.zeros((num, self.layout.num_result_columns))
+        self.results = self.layout.results(self.table)
+        # What each step needs, looked up once.
+        self._vectors = [self.observations.parts(row) for row in self.results.observation]
+        self._after = self.table[:, self.layout.dim : self.layout.dim + _NUM_AFTER]
+        self._write = self.observations.write
+        self._has_masks = bool(mask_sizes)
+
+    def _check_spaces(self) -> None:
+        first = self.envs[0]
+        for row, env in enumerate(self.envs):
+            for name in ("action_space", "observation_space"):
+                if getattr(env, name) != getattr(first, name):
+                    given, wanted = written(getattr(env, name)), written(getattr(first, name))
+                    different = f"the {name} of copy {row} is {given}, but that of copy 0 {wanted}"
+                    raise SettingError(f"{self._name}: {different}")
+
+    def reset(self, seeds: Mapping[int, int | None]) -> None:
+        """Begin episodes.
+
+        Args:
+            seeds: for the number of each copy to reset its seed, or None.
+
+        Raises:
+            ProblemError: a copy broke its contract.
+            EnvironmentFaultError: its `reset` raised an error.
+        """
+        rows = np.array([*seeds], np.int64)
+        with self._explained("reset"):
+            to_check = []
+            for self._row, seed in seeds.items():
+                env = self.envs[self._row]
+                observation, info = env.reset(seed=seed)
+                self._masks.check_attributes(env)
+                to_check.append(self._write(observation, self._vectors[self._row]))
+                self._masks.keep(self._row, observation, info)
+            self._settle(rows, to_check)
+        self._after[rows] = 0.0
+
+    def step(self, rows: list[int], option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> None:
+        """Take a step with some copies.
+
+        Args:
+            rows: numbers of these copies.
+            option: of all copies, `[N]`; None if the environment has no options.
+            discrete: of all copies, `[N]`.
+            parameters: of all copies, `[N, num_parameters]`.
+
+        Raises:
+            ProblemError: a copy broke its contract.
+            EnvironmentFaultError: its `step` raised an error.
+        """
+        index: Any = _ALL if len(rows) == len(self.envs) else rows
+        natives = self.actions.to_native(discrete[index], parameters[index])
+        if option is not None:
+            chosen = zip(natives, option[index].tolist(), strict=True)
+            natives = [self.options.with_option(native, number) for native, number in chosen]
+        returned, to_check = [], []
+        with self._explained("step"):
+            for row, action in zip(rows, natives, strict=True):
+                self._row = row
+                observation, reward, terminated, truncated, info = self.envs[row].step(action)
+                to_check.append(self._write(observation, self._vectors[row]))
+                is_success = has_success = False
+                if info or self._has_masks or type(observation) is not np.ndarray:
+                    self._masks.keep(row, observation, info)
+                    success = _success_in(info)
+                    is_success, has_success = bool(success), success is not None
+                returned.append((reward, terminated, truncated and not terminated, is_success, has_success))
+            if rows:
+                self._settle(index, to_check)
+        if rows:
+            self._after[index] = returned
+
+    def _settle(self, rows: Any, to_check: list[bool]) -> None:
+        """Check the observations that these copies have written, and keep their masks.
+
+        Args:
+            rows: index of the copies' rows.
+            to_check: for each of them whether its numbers are still to be checked.
+        """
+        observations = self.results.observation
+        vectors = observations[rows]
+        for number in self.observations.unsettled(vectors):
+            if to_check[number]:
+                self._row = number if rows is _ALL else int(rows[number])
+                vectors[number] = self.observations.settled(vectors[number])
+        observations[rows] = self.observations.rounded(vectors)
+        for name, masks in self._masks.rows.items():
+            self.results.masks[name][:] = masks
+
+    @contextmanager
+    def _explained(self, method: str) -> Iterator[None]:
+        """Say which copy broke its contract or raised an error."""
+        try:
+            yield
+        except ProblemError as error:
+            raise ProblemError(f"{self._name}: environment {self._first + self._row}: {error}") from error
+        except (EnvironmentFaultError, MemoryError):
+            raise
+        except Exception as error:
+            fault = fault_of(error, f"{self._name}: environment {self._first + self._row}: its {method}")
+            if fault is None:
+                raise
+            raise fault from error
+
+    def close(self) -> None:
+        """Close the copies."""
+        for env in self.envs:
+            env.close()
+
+
+def _success_in(info: Mapping[str, Any]) -> bool | None:
+    """Return the success that the info of a step reports; None if it has no such entry."""
+    for name in _SUCCESS_ENTRIES:
+        if name in info:
+            return flag(f"info[{name!r}]", info[name])
+    return None

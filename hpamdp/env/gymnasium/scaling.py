@@ -1,0 +1,118 @@
+"""How observations are scaled: by their bounds, by running statistics or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from gymnasium.wrappers.utils import RunningMeanStd
+from torch import Tensor
+
+from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.settings import SettingError
+
+Scaling = Literal["bounds", "running", "none"]
+
+# Bounds further apart than this count as none: some environments write 1e10 or the largest float.
+_WIDEST = 1e6
+_CLIP = 10.0
+
+
+class ObservationScaling:
+    """The scaling of the observations of one space.
+
+    Args:
+        space: the space.
+        scaling: `bounds` maps entries with finite bounds at most a million apart to [-1, 1] and leaves the others as
+            they are. `running` normalises to mean 0 and standard deviation 1 over all observations so far, and clips to
+            [-10, 10]. `none` changes nothing.
+
+    Attributes:
+        statistics: of all observations so far, with `running`; else None.
+
+    Raises:
+        ValueError: there is no such scaling.
+    """
+
+    def __init__(self, space: ObservationSpace, scaling: Scaling) -> None:
+        if scaling not in get_args(Scaling):
+            raise SettingError(f"observation_scaling={scaling!r}, but must be one of {', '.join(get_args(Scaling))}")
+        self.dim = space.dim
+        self.statistics = RunningStatistics(self.dim) if scaling == "running" else None
+        self._is_frozen = False
+        self._centre = np.zeros(self.dim)
+        self._half_width = np.ones(self.dim)
+        if scaling == "bounds":
+            self._read_bounds(*space.bounds())
+
+    def _read_bounds(self, low: np.ndarray, high: np.ndarray) -> None:
+        has_both = np.isfinite(low) & np.isfinite(high)
+        half_width = 0.5 * np.where(has_both, high, 0.0) - 0.5 * np.where(has_both, low, 0.0)
+        is_bounded = (half_width > 0.0) & (half_width <= 0.5 * _WIDEST)
+        self._centre = np.where(is_bounded, 0.5 * low + 0.5 * np.where(is_bounded, high, 0.0), 0.0)
+        self._half_width = np.where(is_bounded, half_width, 1.0)
+
+    def scaled(self, vectors: np.ndarray) -> np.ndarray:
+        """Return new observations `[M, dim]` scaled, float32; with `running`, they update the statistics first."""
+        if self.statistics is None:
+            return ((vectors - self._centre) / self._half_width).astype(np.float32)
+        if not self._is_frozen:
+            self.statistics.update(vectors)
+        return self.statistics.normalised(vectors).clip(-_CLIP, _CLIP).astype(np.float32)
+
+    def share(self, other: ObservationScaling) -> None:
+        """Scale by the statistics of `other`, now and later, without updating them.
+
+        Raises:
+            ValueError: only one of the two has statistics, or their vectors differ in length.
+        """
+        if (self.statistics is None) != (other.statistics is None) or self.dim != other.dim:
+            raise ValueError(
+                "scaling can be shared only by environments with the same observations and observation_scaling"
+            )
+        self.statistics = other.statistics
+        self._is_frozen = True
+
+
+class RunningStatistics(RunningMeanStd):
+    """Gymnasium's mean and variance of all vectors so far, float64 `[dim]`, that can be saved.
+
+    Differs from the source: no prior observation of mean 0 and variance 1 is mixed in (`epsilon` is 0).
+
+    Args:
+        dim: length of the vectors.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__(epsilon=0.0, shape=(dim,))
+
+    def normalised(self, vectors: np.ndarray) -> np.ndarray:
+        """Return vectors `[M, dim]` minus the mean, in standard deviations; constant entries keep their unit."""
+        deviation = np.sqrt(self.var)
+        return (vectors - self.mean) / np.where(deviation > 1e-6, deviation, 1.0)
+
+    def columns(self) -> dict[str, Tensor]:
+        """Return a copy of the statistics, for a checkpoint."""
+        return {
+            "observation_count": torch.tensor(self.count, dtype=torch.float64),
+            "observation_mean": torch.tensor(self.mean, dtype=torch.float64),
+            "observation_variance": torch.tensor(self.var, dtype=torch.float64),
+        }
+
+    def set_columns(self, columns: Mapping[str, Tensor]) -> None:
+        """Continue from saved `columns`.
+
+        Raises:
+            ValueError: they are of vectors of another length, or hold invalid numbers.
+        """
+        for name, column in self.columns().items():
+            if name not in columns or columns[name].shape != column.shape:
+                raise ValueError(f"running statistics: {name} must have shape {list(column.shape)}")
+            is_mean = name == "observation_mean"
+            if not (columns[name].isfinite() & (is_mean | (columns[name] >= 0.0))).all():
+                raise ValueError(f"running statistics: {name} must be finite{'' if is_mean else ' and at least 0'}")
+        self.count = columns["observation_count"].item()
+        self.mean = columns["observation_mean"].to("cpu", torch.float64, copy=True).numpy()
+        self.var = columns["observation_variance"].to("cpu", torch.float64, copy=True).numpy()
