@@ -15,7 +15,7 @@ except ModuleNotFoundError:  # Python 3.10
     import tomli as tomllib
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", ROOT / "agents/README.md"]
 PAGES += [file for folder in ("docs", "experiments", "examples") for file in sorted((ROOT / folder).rglob("*.md"))]
 
 
@@ -38,9 +38,22 @@ def broken_links(page: Path) -> list[str]:
     return broken
 
 
+def commands(page: Path) -> list[str]:
+    """Return the lines of a page's code blocks that are not Python, yaml or output."""
+    fences = re.findall(r"^```(\w*)\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    return [line for language, block in fences if language in ("", "shell") for line in block.splitlines()]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_no_link_of_a_page_leads_nowhere(page):
     assert not broken_links(page)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_command_of_a_page_has_a_line_of_its_own(page):
+    for line in commands(page):
+        _, _, comment = line.partition(" # ")
+        assert not re.search(r"(^| )(python|hpamdp) [-\w]", comment), line
 
 
 def test_a_broken_link_is_found(tmp_path):

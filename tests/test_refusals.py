@@ -109,11 +109,17 @@ REFUSED = [
         "controller=incongruent: must be one of choose, congruent, incongruent1, random",
     ),
     ("env.boats=[congruent,incongruent1] env.motor_noise=[0,0,1]", "motor_noise=[0.0, 0.0, 1.0]: must be one "),
-    ("env.boats=[congruent,incongruent1] high=human", "boats, so what they chose says nothing here; leave it out"),
+    (
+        "env.boats=[congruent,incongruent1] high=human",
+        "controllers, so what they chose says nothing here; leave it out",
+    ),
     ("env.switch_cost=7", "env.switch_cost=7: must be less than or equal to 6"),
-    ("env.switch_cost=0.2 env.controller=random high=none", "switch_cost=0.2: controller=random never changes boats"),
+    ("env.switch_cost=0.2 env.controller=random high=none", "switch_cost=0.2: controller=random never changes"),
     ("env.switch_cost=0.2 high=oracle low=planner", "low=planner: its plans on env=boatdock change options, but"),
-    ("env.switch_cost=0.2 high=human", "switch_cost=0.2: people kept one of their two boats, so what they chose "),
+    (
+        "env.switch_cost=0.2 high=human",
+        "switch_cost=0.2: people kept one of their two controllers, so what they chose ",
+    ),
     ("env.switch_cost=0.2 agent.termination=steps agent.option_length=1", "high=ucb is a bandit, which counts what "),
     (
         "high=meta_critic agent.termination=steps agent.option_length=1",

@@ -132,7 +132,7 @@ class TensorRows:
         return Results(
             observations=to_numpy(td[keys.OBSERVATION])[None],
             outcomes=to_numpy(td[keys.OUTCOME])[None],
-            entries=np.empty((1, 0, len(flags[0])), np.float32),  # which no adapter reads
+            extras=np.empty((1, 0, len(flags[0])), np.float32),  # which no adapter reads
             flags=flags[None],
             rewards=np.zeros(len(flags[0]), np.float32) if reward is None else to_numpy(reward)[:, 0],
         )

@@ -31,7 +31,7 @@ from hpamdp.env.kernel_rows import Advance, KernelRows, Results, invalid_choice
 from hpamdp.env.state_columns import Columns, check_range, cloned, from_arrays, overwrite, replaced, restored, where
 from hpamdp.settings import SettingError, Settings
 
-# If a tensordict has only these keys and the problem's entries, its next root has no others either.
+# If a tensordict has only these keys and the problem's extra ones, its next root has no others either.
 _PLAIN_KEYS = {keys.OBSERVATION, keys.OUTCOME, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.OPTION, keys.ACTION}
 # The first two of a problem's outcomes; the last one is the time limit.
 GOING_ON, SUCCESS = 0, 1
@@ -107,8 +107,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     options: Any  # of the class Options
     outcomes: ClassVar[tuple[str, ...]]  # names: going on, success, ..., time limit
     observation_names: tuple[str, ...]
-    entry_names: tuple[str, ...] = ()  # of entries `[N, 1]` in [0, 1] beside the observation and the outcome
-    start_keys: frozenset[str] = frozenset()  # entries of a tensordict that `reset` takes, to start from
+    extra_names: tuple[str, ...] = ()  # of values `[N, 1]` in [0, 1] beside the observation and the outcome
+    start_keys: frozenset[str] = frozenset()  # keys of a tensordict that `reset` takes, to start from
     action_names: ClassVar[tuple[str, str]] = ("discrete", "parameters")  # what errors call an action
     # Bounds of the parameters of all discrete actions, side by side.
     parameter_low: Sequence[float]
@@ -199,7 +199,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             self.row_kernel,
             self.num_envs,
             num_columns=(len(state._fields) - num_integers, num_integers),
-            reading_dims=(len(self.observation_names), len(self.entry_names)),
+            reading_dims=(len(self.observation_names), len(self.extra_names)),
             parameter_dims=self.parameter_dims,
             bounds=torch.stack([bounds.low.reshape(-1), bounds.high.reshape(-1)]).numpy(),
             settings=[self.max_steps, len(self.option_names) if self._chooses else 0, *self.kernel_settings()],
@@ -251,15 +251,15 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
     def observe(self, state: EpisodeState) -> Tensor:
         """Return the observations `[N, observation_dim]`."""
 
-    def entries(self, state: EpisodeState) -> Sequence[Tensor]:
-        """Return the further entries that the environment writes, `[N]` each, in the order of `entry_names`."""
+    def extras(self, state: EpisodeState) -> Sequence[Tensor]:
+        """Return the values `extra_names` that the environment writes beside the observation, `[N]` each."""
         return ()
 
     def start_columns(self, given: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Check what `reset` was given to start from, and return the columns `[N]` of the state that it sets.
 
         Args:
-            given: entries among `start_keys`.
+            given: the values of some of the `start_keys`.
 
         Raises:
             ValueError: an entry is missing, or has another shape or a value that is not allowed.
@@ -348,16 +348,16 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
 
     def _make_specs(self, low: Tensor, high: Tensor) -> None:
         n, device = self.num_envs, self.device
-        entries = {
-            name: Bounded(0.0, 1.0, shape=(n, 1), device=device, dtype=torch.float32) for name in self.entry_names
+        extras = {
+            name: Bounded(0.0, 1.0, shape=(n, 1), device=device, dtype=torch.float32) for name in self.extra_names
         }
         observation = Unbounded(shape=(n, len(self.observation_names)), device=device, dtype=self.float_type)
         outcome = Categorical(len(self.outcomes), shape=(n,), device=device)
         knowledge = self._knowledge_specs()
         self._has_knowledge = bool(knowledge)
-        self._plain_keys = _PLAIN_KEYS.union(self.entry_names)
+        self._plain_keys = _PLAIN_KEYS.union(self.extra_names)
         self.observation_spec = Composite(
-            {keys.OBSERVATION: observation, keys.OUTCOME: outcome, **entries, **knowledge}, shape=(n,), device=device
+            {keys.OBSERVATION: observation, keys.OUTCOME: outcome, **extras, **knowledge}, shape=(n,), device=device
         )
         self.action_spec = self.make_action_spec(low, high, has_option=self._chooses)
         self.reward_spec = Unbounded(shape=(n, 1), device=device, dtype=self.float_type)
@@ -558,7 +558,7 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
         leaves = {
             keys.OBSERVATION: self._pure_observe(state),
             keys.OUTCOME: outcome,
-            **{name: entry.unsqueeze(-1) for name, entry in zip(self.entry_names, self.entries(state), strict=True)},
+            **{name: extra.unsqueeze(-1) for name, extra in zip(self.extra_names, self.extras(state), strict=True)},
             **self._flags(done, done & ~truncated, truncated),
         }
         return self._with_knowledge(TensorDict(leaves, batch_size=self.batch_size, device=self.device))
@@ -574,8 +574,8 @@ class BatchedEnv(PAMDPEnv, Generic[EpisodeState]):
             keys.OUTCOME: torch.from_numpy(results.outcomes[number]),
             **self._flags(*flags.unbind(0)),
         }
-        for place, name in enumerate(self.entry_names):
-            leaves[name] = torch.from_numpy(results.entries[number, place]).unsqueeze(-1)
+        for place, name in enumerate(self.extra_names):
+            leaves[name] = torch.from_numpy(results.extras[number, place]).unsqueeze(-1)
         if has_reward:
             leaves[keys.REWARD] = torch.from_numpy(results.rewards).unsqueeze(-1)
         # The checks of the constructor would take longer than a hundred rows.

@@ -22,14 +22,14 @@ class Results(NamedTuple):
     Attributes:
         observations: float32 `[R, N, D]`.
         outcomes: int64 `[R, N]`.
-        entries: further entries that a problem reports, float32 `[R, E, N]`.
+        extras: values that a problem reports beside the observation, float32 `[R, E, N]`.
         flags: done, terminated and truncated, bool `[R, 3, N]`.
         rewards: float32 `[N]`.
     """
 
     observations: np.ndarray
     outcomes: np.ndarray
-    entries: np.ndarray
+    extras: np.ndarray
     flags: np.ndarray
     rewards: np.ndarray
 
@@ -65,7 +65,7 @@ class KernelRows:
         self.integers[kernels.EPISODE_ROW] = -1
         self._advance = advance
         self._num_rows = num_rows
-        self._observation_dim, self._num_entries = reading_dims
+        self._observation_dim, self._num_extras = reading_dims
         self._places = np.concatenate([[0], np.cumsum(parameter_dims)]).astype(np.int64)
         self._bounds = np.ascontiguousarray(bounds, np.float32)
         self._settings = np.array([0.0, 0.0, 0.0, first_env, *settings])
@@ -147,7 +147,7 @@ class KernelRows:
         results = Results(
             np.empty((num_readings, n, self._observation_dim), np.float32),
             np.empty((num_readings, n), np.int64),
-            np.empty((num_readings, self._num_entries, n), np.float32),
+            np.empty((num_readings, self._num_extras, n), np.float32),
             np.empty((num_readings, 3, n), np.bool_),
             np.zeros(n, np.float32),
         )

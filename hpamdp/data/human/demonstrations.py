@@ -105,7 +105,7 @@ def _boats(env: object) -> BoatDockEnv:
         raise SettingError("people docked boats; use env=boatdock or data=none")
     if not env.rules.are_peoples:
         raise SettingError(
-            "people kept one of their two boats; use data=none, or leave out env.boats and env.switch_cost"
+            "people kept one of their two controllers; use data=none, or leave out env.boats and env.switch_cost"
         )
     return env
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from hpamdp.env.boatdock.play.boat_page import BoatPage
 
 _PLAN = "plan_"  # before the names of the oracle's columns in an `env_state`
-_MOST_SWAPPED = 4  # boats; of more, symmetries swap none
+_MOST_SWAPPED = 4  # controllers; if there are more, symmetries swap none
 
 _CONTROLLER_ENTRY = task.OBSERVATION_NAMES.index("controller")
 
@@ -72,7 +72,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     `controller` and `keymap` int `[N]`.
 
     Raises:
-        ValueError: an argument, action or layout that is out of range; the boats are left as they were.
+        ValueError: an argument, action or layout that is out of range; no environment has changed.
         RuntimeError: a step before the first reset, or before the one after `set_seed`.
     """
 
@@ -84,7 +84,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     parameter_high = (task.MAX_DURATION,) * task.NUM_KEYS
     max_steps = task.MAX_PRESSES
     outcomes = task.OUTCOMES
-    entry_names = (task.FUEL,)
+    extra_names = (task.FUEL,)
     result_keys = (keys.OUTCOME, task.FUEL)
     start_keys = frozenset({"start", "goal", "controller", "keymap"})
     action_names = ("key", "durations")
@@ -133,8 +133,8 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         options = self.options
         if self._has_human and not options.are_peoples:
             raise SettingError(
-                f"{options.unlike_peoples()}: people kept one of their two boats, so what they chose says nothing "
-                "here; leave it out"
+                f"{options.unlike_peoples()}: people kept one of their two controllers, so what they chose says "
+                "nothing here; leave it out"
             )
         self.rules = options.rules
         self.observation_names = task.observation_names(self.rules.observation)
@@ -146,11 +146,11 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         return kernel.settings_of(self.rules)
 
     def start(self, episode: Tensor, rng: RngKey) -> BoatState:
-        """Return boats in new layouts."""
+        """Return the states of environments with new layouts."""
         return episode_rules.start(episode, rng, self.rules)
 
     def act(self, state: BoatState, action: Action, rng: RngKey, is_idle: Tensor) -> tuple[BoatState, Tensor]:
-        """Return the boats after one press, and the rewards `[N]`."""
+        """Return the states after one press, and the rewards `[N]`."""
         duration = action.parameters.squeeze(-1)
         return episode_rules.act(state, action.option, action.discrete, duration, rng, self.rules)
 
@@ -159,7 +159,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         rng = self._noise_rng(state) if self.rules.sensor_noise > 0.0 else None
         return episode_rules.observe(state, rng, self.rules)
 
-    def entries(self, state: BoatState) -> Sequence[Tensor]:
+    def extras(self, state: BoatState) -> Sequence[Tensor]:
         """Return the fraction of fuel that is left."""
         return (state.fuel / task.TANK,)
 
@@ -169,16 +169,16 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
     @property
     def position(self) -> Tensor:
-        """Where the boats are, px from the harbour's centre, `[N, 2]`."""
+        """Positions of the boats, px from the harbour's centre, `[N, 2]`."""
         return torch.stack([self._state.x, self._state.y], -1)
 
     @property
     def symmetries(self) -> Symmetries:
-        """The turns and mirrors of the plane that permute a boat's directions or swap boats that occur.
+        """The turns and mirrors of the plane that permute the directions of a controller or swap controllers.
 
-        Six maps keep each of people's two boats. Six more swap it for the other one, whose directions are opposite. A
+        Six maps keep each of the two controllers. Six more swap it for the other one, whose directions are opposite. A
         random key map is not observed, so only maps remain that permute the keys of both key maps alike. If motor noise
-        differs between boats, only maps remain that keep the boats.
+        differs between controllers, only maps remain that keep the controllers.
         """
         tables = self._directions()
         found = []  # (map, permutation of the controllers, permutation of the keys)
@@ -203,12 +203,12 @@ class BoatDockEnv(BatchedEnv[BoatState]):
             num_parameters=harbour.NUM_KEYS,
         )
 
-    def _orders(self, num_boats: int) -> list[tuple[int, ...]]:
-        """Return which boats the boats may become under a map: those of equal noise, and only themselves if many."""
-        orders = itertools.permutations(range(num_boats)) if num_boats <= _MOST_SWAPPED else [range(num_boats)]
+    def _orders(self, num_controllers: int) -> list[tuple[int, ...]]:
+        """Return which controllers the controllers may become under a map: only those of equal noise, none if many."""
+        same = tuple(range(num_controllers))
+        orders = list(itertools.permutations(same)) if num_controllers <= _MOST_SWAPPED else [same]
         noise = self.rules.motor_noise
-        allowed = [tuple(order) for order in orders]
-        return [order for order in allowed if num_boats == 1 or [noise[boat] for boat in order] == list(noise)]
+        return [order for order in orders if num_controllers == 1 or [noise[number] for number in order] == list(noise)]
 
     @property
     def geometry(self) -> PlaneGeometry:
@@ -235,12 +235,12 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         )
 
     def _directions(self) -> list[list[Tensor]]:
-        """Return for each boat that occurs the possible tables of its keys' directions, float64 `[3, 2]`."""
+        """Return the possible tables of the keys' directions for each controller, float64 `[3, 2]`."""
         boats = self.rules.boats
         if boats is not None:
-            each_boat = [[table] for table in torch.tensor(boats.directions, dtype=torch.float64)]
+            of_each = [[table] for table in torch.tensor(boats.directions, dtype=torch.float64)]
             is_fixed = self.rules.controller in boats.names
-            return [each_boat[boats.names.index(self.rules.controller)]] if is_fixed else each_boat
+            return [of_each[boats.names.index(self.rules.controller)]] if is_fixed else of_each
         maps = (1, 2) if self.rules.keymap == "random" else (self.rules.keymap,)
         table = torch.tensor(harbour.DIRECTIONS, dtype=torch.float64)
         both = [[table[number - 1] for number in maps], [table[2]]]
@@ -256,7 +256,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         return (*places, (10, 11), (14, 15)), ()
 
     def fixed_episodes(self, seed: int) -> TensorDict:
-        """Return layouts to `reset` with, one for each boat. No training episode has them, whatever its seed."""
+        """Return layouts to `reset` with, one for each environment. No training episode has them, whatever its seed."""
         layout = harbour.fixed_layouts(self.num_envs, seed)
         centre = torch.tensor(harbour.CENTRE, dtype=torch.float32)
         points = {"start": torch.stack(layout[:2], -1) + centre, "goal": torch.stack(layout[2:], -1) + centre}
@@ -269,11 +269,11 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         return {"outcome": outcome, "fuel": fuel, "score": score, "success": outcome == task.SUCCESS}
 
     def describe(self) -> dict[str, Tensor]:
-        """Return the boats' layouts for evaluation, px from the harbour's centre.
+        """Return the layouts of an evaluation, px from the harbour's centre.
 
-        `start`, `goal` `[N, 2]`, `bearing_offset` `[N]` (degrees) and `optimum` `[N, num_boats]`: the best possible
-        score with each boat from a full tank, with a `switch_cost` of beginning with it; `controller` `[N]` where it is
-        not chosen.
+        `start` and `goal` `[N, 2]`, `bearing_offset` `[N]` in degrees, and `optimum` `[N, num_controllers]`: the best
+        possible score from a full tank with each controller; with a `switch_cost`, the best that begins with it. If the
+        agent does not choose, also `controller` `[N]`.
         """
         state = self.state
         layout = harbour.Layout(state.start_x, state.start_y, state.goal_x, state.goal_y)
@@ -295,7 +295,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         return "chosen" if self.has_choice else self.rules.controller
 
     def references(self, measured: Mapping[str, float]) -> dict[str, dict[str, float]]:
-        """Return the figures of the ceiling and, with people's two boats, of people and the best, or of a recording."""
+        """Return the figures of the ceiling and, with the two standard controllers, of people or of a recording."""
         ceiling = {**super().references(measured)["ceiling"], "success": measured.get("ceiling_success", 1.0)}
         if self.has_choice:
             ceiling["oracle_agreement"] = 1.0
@@ -307,13 +307,13 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         return {**human_references(self._controller_of_run), "ceiling": ceiling}
 
     def summary_entries(self) -> dict[str, Any]:
-        """Return which `controller` the boats have, `chosen` where the agent chooses, and the `boats`, if set."""
-        entries = {"controller": self._controller_of_run}
-        return entries if self.rules.boats is None else {**entries, "boats": list(self.rules.names)}
+        """Return the `controller`, `chosen` if the agent chooses, and the setting `boats`, if given."""
+        values = {"controller": self._controller_of_run}
+        return values if self.rules.boats is None else {**values, "boats": list(self.rules.names)}
 
     @classmethod
     def curves(cls, summary: Mapping[str, Any]) -> tuple[Metric, ...]:
-        """Return the panels of the learning curves; with `boats`, also how often each is chosen."""
+        """Return the panels of the learning curves; with `boats`, also how often each controller is chosen."""
         if not summary.get("boats"):
             return cls.curve_metrics
         shares = (Metric(f"option_{name}", f"{name} chosen", "share") for name in summary["boats"])
@@ -321,7 +321,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
 
     @classmethod
     def draw_figures(cls, evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
-        """Return `trajectories.png` and, where the agent chose its boat, `choices.png`."""
+        """Return `trajectories.png` and, if the agent chose its controller, `choices.png`."""
         from hpamdp.env.boatdock import figures  # matplotlib takes long to import
 
         return figures.draw(evaluation, summary)
@@ -336,14 +336,14 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         """Return the page on which people dock boats.
 
         Raises:
-            ValueError: the settings are not those of the page, which has people's two boats without noise.
+            ValueError: the settings are not those of the page, which has the two standard controllers without noise.
         """
         from hpamdp.env.boatdock.play.boat_page import BoatPage
 
         return BoatPage(seed, self.rules)
 
     def env_state(self) -> dict[str, Tensor]:
-        """Return the boats' columns and, with `oracle`, its plans, first dimension `N`."""
+        """Return the columns of the state and, with `oracle`, its plans, first dimension `N`."""
         plans = {} if self._oracle is None else {_PLAN + name: plan for name, plan in self._oracle.plans().items()}
         return {**self.state._asdict(), **plans}
 
@@ -360,7 +360,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         """Continue from an `env_state`.
 
         Raises:
-            ValueError: it is not the state of this many boats.
+            ValueError: it is not the state of this many environments.
         """
         super().set_env_state({name: column for name, column in columns.items() if not name.startswith(_PLAN)})
         plans = {name.removeprefix(_PLAN): plan for name, plan in columns.items() if name.startswith(_PLAN)}
@@ -380,7 +380,7 @@ class BoatDockEnv(BatchedEnv[BoatState]):
         return specs
 
     def _knowledge(self) -> dict[str, Any]:
-        """Return how often people choose each boat, and what the planner knows."""
+        """Return how often people choose each controller, and what the planner knows."""
         known: dict[str, Any] = {}
         if self._has_human:
             known["human"] = {"option": choice_probabilities(self._state)}

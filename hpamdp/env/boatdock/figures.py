@@ -1,4 +1,4 @@
-"""Figures of an evaluation on boats: the trajectories, and the choice of the boat."""
+"""Figures of an evaluation on boats: the trajectories, and the choice of the controller."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ _SHEET = (4, 6)  # rows and columns of the sheet of trajectories
 
 
 def draw(evaluation: Mapping[str, np.ndarray], summary: Mapping[str, Any]) -> dict[str, Figure]:
-    """Return `trajectories.png` and, if the agent chose its boat, `choices.png`.
+    """Return `trajectories.png` and, if the agent chose its controller, `choices.png`.
 
     Args:
         evaluation: arrays from `BoatDockEnv.describe` and an evaluation. A figure is left out if one of its arrays is
             missing.
-        summary: summary of the run. `references` has people's figures, `boats` the names of other boats than theirs.
+        summary: summary of the run. `references` has people's figures, `boats` the names of controllers other than
+            theirs.
     """
     evaluation = dict(evaluation)
     if "option" in evaluation:
@@ -111,13 +112,13 @@ def _draw_episode(axes: Axes, evaluation: Mapping[str, np.ndarray], episode: int
 
 
 def episode_title(evaluation: Mapping[str, np.ndarray], episode: int, names: tuple[str, ...] = ()) -> str:
-    """Return a title: the score, the highest possible score if it is known, and the initial of the boat."""
+    """Return a title: the score, the highest possible score if it is known, and the initial of the controller."""
     title = f"{evaluation['score'][episode]:.2f}"
     boat = int(evaluation["controller"][episode]) if "controller" in evaluation else NOT_CHOSEN
     if "optimum" in evaluation:
         best = evaluation["optimum"][episode]
         is_chosen = "option" in evaluation and evaluation["option"][episode] != NOT_CHOSEN
-        # If the agent does not choose, its ceiling is the best score with its own boat.
+        # If the agent does not choose, its ceiling is the best score with its own controller.
         best = best if is_chosen or boat == NOT_CHOSEN else best[boat : boat + 1]
         if np.isfinite(best).any():
             title += f" / {np.nanmax(best):.2f}"
@@ -203,9 +204,9 @@ def _draw_choices(axes: Axes, evaluation: Mapping[str, np.ndarray], has_people: 
 
 
 def _draw_boats(axes: Axes, evaluation: Mapping[str, np.ndarray], names: Sequence[str]) -> None:
-    """Draw the fraction of choices of each boat by the goal's bearing, for the agent and the planner.
+    """Draw the fraction of choices of each controller by the goal's bearing, for the agent and the planner.
 
-    If several boats are equally good, the planner's choice is split evenly between them.
+    If several controllers are equally good, the planner's choice is split evenly between them.
     """
     to_goal = evaluation["goal"] - evaluation["start"]
     bearing = np.degrees(np.arctan2(to_goal[:, 1], to_goal[:, 0])) % 360.0

@@ -22,7 +22,7 @@ from hpamdp.env.gymnasium_adapter import GymnasiumAdapter, GymnasiumVectorAdapte
 
 
 class BoatDock(GymnasiumAdapter):
-    """One boat to dock.
+    """One environment, with a boat to dock.
 
     Args:
         options: the settings; None for the defaults.
@@ -34,7 +34,7 @@ class BoatDock(GymnasiumAdapter):
     torch, NumPy and Python are neither read nor moved.
 
     Raises:
-        ValueError: an argument, an action or a reset option is invalid; the boat is unchanged.
+        ValueError: an argument, an action or a reset option is invalid; the environment is unchanged.
     """
 
     def __init__(
@@ -68,23 +68,24 @@ class BoatDock(GymnasiumAdapter):
 
 
 class BoatDockVector(GymnasiumVectorAdapter):
-    """`num_envs` boats to dock.
+    """`num_envs` environments, each with a boat to dock.
 
     Args:
-        num_envs: number of boats.
+        num_envs: number of environments.
         options: the settings; None for the defaults.
         action_format: `dict` or `tuple`; see `hpamdp.env.boatdock.numpy_boats`.
-        autoreset_mode: when finished boats start again: in the next step (which ignores their actions), in the same
-            step (the last observations and infos are `infos["final_obs"]` and `infos["final_info"]`), or only by
+        autoreset_mode: when finished environments start again: in the next step (which ignores their actions), in the
+            same step (the last observations and infos are `infos["final_obs"]` and `infos["final_info"]`), or only by
             `reset`.
         device: as in BoatDockEnv.
         settings: single settings by name, in place of those in `options`.
 
-    `reset` takes one integer seed for all boats; the layouts of boat i depend only on the seed and i, not on
-    `num_envs`. The options of `reset` have one row for each boat; `reset_mask` (bool `[N]`) resets only these boats.
+    `reset` takes one integer seed for all environments. The layouts of environment i depend only on the seed and i,
+    not on `num_envs`. The options of `reset` have one row for each environment. `reset_mask` (bool `[N]`) resets only
+    some.
 
     Raises:
-        ValueError: an argument, an action or a reset option is invalid; the boats are unchanged.
+        ValueError: an argument, an action or a reset option is invalid; the environments are unchanged.
     """
 
     def __init__(

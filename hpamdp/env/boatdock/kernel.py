@@ -464,7 +464,7 @@ def advance(
     mode: Any,
     observations: Any,
     outcomes: Any,
-    entries: Any,
+    extras: Any,
     flags: Any,
     rewards: Any,
 ) -> int:
@@ -497,7 +497,7 @@ def advance(
             if reading == 1 or mode in (RESTART, ACT_OR_RESTART):
                 _restart(first, count, scratch, numbers, settings)
             _observe(first, count, scratch, numbers, settings, observations[reading])
-            _report(first, count, scratch, numbers, outcomes[reading], entries[reading, 0], flags[reading])
+            _report(first, count, scratch, numbers, outcomes[reading], extras[reading, 0], flags[reading])
         _store(floats, integers, first, count, scratch, numbers)
     return -1
 

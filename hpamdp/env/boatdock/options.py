@@ -30,7 +30,7 @@ class BoatDockOptions(Settings):
     """Settings of `BoatDockEnv`."""
 
     controller: str = "choose"
-    """Which boat: `choose` lets the agent choose, `random` draws one for each episode, or the name of a boat.
+    """Which controller: `choose` lets the agent choose, `random` draws one for each episode, or a controller's name.
 
     All but `choose` need high=none.
     """
@@ -41,20 +41,20 @@ class BoatDockOptions(Settings):
     observation: ObservationForm = "scaled"
     """`scaled` to about [-1, 1] with goal - boat appended, `[N, 16]`, or `pixels` as in the paper, `[N, 14]`."""
     motor_noise: float | Annotated[tuple[float, ...], FromList] = 0.0
-    """Standard deviation of the log of the executed duration; [a, b]: a for the first boat, b for the second."""
+    """Standard deviation of the log of the executed duration; [a, b]: a for the first controller, b for the second."""
     sensor_noise: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
     """Standard deviation of the observed positions, in pixels."""
     slip: Fraction = 0.0
     """Probability that a uniformly random key is pressed instead."""
     boats: Annotated[tuple[str, ...], Field(min_length=1), FromList] | None = None
-    """Names of the boats, from `controllers`. If None, people's two: incongruent (with its key map) and congruent."""
+    """Controllers to choose from, named as in `controllers`. If None, incongruent (with `keymap`) and congruent."""
     controllers: dict[str, Degrees] = CONTROLLER_DEGREES
     """For each controller the directions in which its three keys push, in degrees: 0 to the right, 90 down.
 
     Add one with +env.controllers.NAME=[0,120,240], and name it in `boats`.
     """
     switch_cost: Annotated[float, Field(ge=0.0, le=TANK)] | None = None
-    """Seconds of fuel for changing the boat at a press. If None, a boat is kept for the episode.
+    """Seconds of fuel for changing the controller at a press. If None, it is kept for the episode.
 
     It goes with agent.termination=steps or learned.
     """
@@ -65,12 +65,12 @@ class BoatDockOptions(Settings):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the boats, in the order of their numbers."""
+        """The names of the controllers to choose from, in the order of their numbers."""
         return CONTROLLERS if self.boats is None else self.boats
 
     @property
     def are_peoples(self) -> bool:
-        """Whether the boats are people's two, of which one is kept for the episode."""
+        """Whether the task is that of the recording: its two controllers, of which one is kept for the episode."""
         return self.boats is None and self.switch_cost is None
 
     @property
@@ -107,7 +107,7 @@ class BoatDockOptions(Settings):
         )
 
     def unlike_peoples(self) -> str:
-        """Return the setting with which the boats are not people's."""
+        """Return the setting with which the task differs from that of the recording."""
         return f"boats={list(self.names)}" if self.boats is not None else f"switch_cost={self.switch_cost}"
 
     @model_validator(mode="after")
@@ -141,12 +141,12 @@ class BoatDockOptions(Settings):
             raise ValueError(f"boats={names}: nothing to choose; name more, or use controller={names[0]}")
         if self.switch_cost is not None and self.controller != "choose":
             raise ValueError(
-                f"switch_cost={self.switch_cost}: controller={self.controller} never changes boats; "
+                f"switch_cost={self.switch_cost}: controller={self.controller} never changes; "
                 "use controller=choose or leave switch_cost out"
             )
         if self.recording is not None and not self.are_peoples:
             raise ValueError(
-                f"{self.unlike_peoples()}: people kept one of their two boats, "
+                f"{self.unlike_peoples()}: people kept one of their two controllers, "
                 f"so recording={self.recording} does not fit; leave it out"
             )
         return self
@@ -156,7 +156,7 @@ class BoatDockOptions(Settings):
         given, num = self.motor_noise, len(self.names)
         noises = given if isinstance(given, tuple) else (given,)
         if isinstance(given, tuple) and len(given) != num:
-            allowed = "one number or two" if num == 2 else f"one number or {num}, one for each boat"
+            allowed = "one number or two" if num == 2 else f"one number or {num}, one for each controller"
             raise ValueError(f"motor_noise={list(given)}: must be {allowed}")
         for noise in noises:
             if not 0.0 <= noise <= _MOST_MOTOR_NOISE:

@@ -35,7 +35,7 @@ class BoatDockOracle:
     With noise or a `switch_cost`, the plans are made again before every press.
 
     Args:
-        num_envs: number of boats.
+        num_envs: number of environments.
         rules: rules of the environment.
         device: device of the tensors.
 
@@ -61,7 +61,7 @@ class BoatDockOracle:
             getattr(self, name).copy_(plan)
 
     def plan(self, state: BoatState, rows: Tensor) -> None:
-        """Plan for the boats of `rows`, bool `[N]`, from their current positions."""
+        """Plan for the environments of `rows`, bool `[N]`, from their current positions."""
         boats = BoatState(*(column[rows] for column in state))
         plans = planner.plans_of_options(self.rules, boats)
         self.option[rows] = planner.better_option(plans)
@@ -71,7 +71,8 @@ class BoatDockOracle:
     def read(self, state: BoatState) -> TensorDict:
         """Return `option` `[N]` and the next press of each plan, `discrete` and `parameters` `[N, num_plans]`."""
         num_presses = state.presses.long()  # since the plan was made
-        # Plan again if noise has moved the boat, or if changing boats takes fuel, which alters the other boats' plans.
+        # Plan again if noise may have moved the boat, or if a change of controllers takes fuel, which alters the other
+        # controllers' plans.
         if max(self.rules.motor_noise) > 0.0 or self.rules.slip > 0.0 or self.rules.switch_cost is not None:
             self.plan(state, (state.presses > 0) & (state.outcome == physics.SAILING))
             num_presses = torch.zeros_like(num_presses)

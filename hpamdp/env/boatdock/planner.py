@@ -13,8 +13,8 @@ Shrinking grids around the best of them find the optimum.
 Because of the concavity, most optima of three presses lie on the border of the feasible region: a leg ends just short
 of harbour or dock. So the grid includes the borders and is denser there.
 
-The same search serves other boats, and agents that may change boats before a press for some fuel. It then covers the
-sequences of boats and keys, and adds the costs of the changes.
+The same search serves other controllers, and agents that may change the controller before a press for some fuel. It
+then covers the sequences of controllers and keys, and adds the costs of the changes.
 """
 
 from __future__ import annotations
@@ -265,7 +265,7 @@ def best_plan(
 
 
 def best_plans(layout: Layout, keymap: Tensor) -> Plan:
-    """Return the best plans with the incongruent and the congruent boat, from the start with a full tank, `[N, 2]`.
+    """Return the best plans with either controller, incongruent first, from the start with a full tank, `[N, 2]`.
 
     Args:
         layout: layouts with fields `[N]`.
@@ -282,11 +282,11 @@ def best_plans(layout: Layout, keymap: Tensor) -> Plan:
 class OptionPlans(NamedTuple):
     """The best plan of each option, with the fields of `Plan` `[N, num_options, ...]`.
 
-    A plan may begin with a press of 0 s: the option then does nothing with its own boat. This happens with a
-    `switch_cost`, and with `boats` of which one cannot reach the dock.
+    A plan may begin with a press of 0 s: the option then does nothing with its own controller. This happens with a
+    `switch_cost`, and if one of the `boats` cannot reach the dock.
     """
 
-    boats: Tensor  # [N, num_options, 3] int64, the boat of each press
+    boats: Tensor  # [N, num_options, 3] int64, the controller of each press
     keys: Tensor
     durations: Tensor
     num_presses: Tensor
@@ -296,8 +296,8 @@ class OptionPlans(NamedTuple):
 def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
     """Return the best plan of each option from the boats' current places of rest.
 
-    If the agent does not choose, the only option is the boat that each row has. With a `switch_cost`, the plan of an
-    option begins with that option's boat, and may change boats before each later press.
+    If the agent does not choose, the only option is the controller that each row has. With a `switch_cost`, the plan of
+    an option begins with that option's controller, and may change it before each later press.
     """
     position = state.x, state.y, state.goal_x, state.goal_y, state.fuel
     has_choice = rules.controller == "choose"
@@ -318,9 +318,9 @@ def plans_of_options(rules: Rules, state: BoatState) -> OptionPlans:
 
 
 def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
-    """Return the best score with each boat, from the start with a full tank, `[N, num_boats]`.
+    """Return the best score with each controller, from the start with a full tank, `[N, num_controllers]`.
 
-    With a `switch_cost`, it is the best score of a plan that begins with that boat.
+    With a `switch_cost`, it is the best score of a plan that begins with that controller.
     """
     if rules.are_peoples:
         return best_plans(layout, keymap).score
@@ -331,16 +331,16 @@ def best_scores(rules: Rules, layout: Layout, keymap: Tensor) -> Tensor:
 def better_option(plans: Plan | OptionPlans) -> Tensor:
     """Return the option with the highest score, int64 `[N]`, given plans `[N, num_options]`.
 
-    The first of equally good options wins. An option that begins with a press of 0 s, to change boats afterwards, is as
-    good as the option to change at once. It loses the tie, because an agent that asks again at every press would idle
-    forever.
+    The first of equally good options wins. An option that begins with a press of 0 s, to change the controller
+    afterwards, is as good as the option to change at once. It loses the tie, because an agent that asks again at every
+    press would idle forever.
     """
     return (plans.score - _IDLE * (plans.durations[..., 0] == 0.0).float()).argmax(1)
 
 
 _IDLE = 1e-3  # subtracted from the score to break ties
 _Direction = tuple[float, float]
-_Press = tuple[int, int]  # the number of a kind of boat, and the number of one of its directions
+_Press = tuple[int, int]  # the number of a kind of controller, and the number of one of its directions
 
 _PARALLEL = 1e-3  # two directions with a smaller cross product count as parallel, so one leg replaces two
 _CANDIDATES = 24  # local minima that are refined, over all sequences of presses
@@ -350,9 +350,9 @@ _FEWER = 1e-4  # seconds by which a plan with more presses must be better
 def _plans_with_boats(
     rules: Rules, x: Tensor, y: Tensor, goal_x: Tensor, goal_y: Tensor, fuel: Tensor, held: Tensor, keymap: Tensor
 ) -> OptionPlans:
-    """Return the best plan that begins with each boat, for any number of boats and with changes at a cost.
+    """Return the best plan that begins with each controller, for any number of controllers and with changes at a cost.
 
-    Boats that push in the same directions with other keys are of one kind and share a search.
+    Controllers that push in the same directions with other keys are of one kind and share a search.
 
     Args:
         rules: rules of the environment.
@@ -367,7 +367,7 @@ def _plans_with_boats(
     position = tuple(column.to(torch.float32) for column in (x, y, goal_x, goal_y))
     found = [_plans_of_kind(kinds, kind, rules.switch_cost, position) for kind in range(len(kinds))]
 
-    # The key of each direction of a kind, for each boat.
+    # The key of each direction of a kind, for each controller.
     key_of = torch.tensor(
         [[keys.index(each) for each in kinds[kind]] for keys, kind in zip(directions, kind_of, strict=True)],
         device=x.device,
@@ -375,7 +375,7 @@ def _plans_with_boats(
     plans = []
     for boat, kind in enumerate(kind_of):
         legs, durations, num_presses, seconds = found[kind]
-        # A plan names kinds. Its own kind stands for this boat, any other kind for the first boat of that kind.
+        # A plan names kinds. Its own kind stands for this controller, any other kind for the first one of that kind.
         members = [boat if other == kind else kind_of.index(other) for other in range(len(kinds))]
         boats = torch.tensor(members, device=x.device)[legs[..., 0]]
         keys = key_of[boats, legs[..., 1]]
@@ -402,12 +402,12 @@ def _plans_with_boats(
 def _plans_of_kind(
     kinds: Sequence[Sequence[_Direction]], kind: int, switch_cost: float | None, position: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return the best plan that begins with a boat of this kind.
+    """Return the best plan that begins with a controller of this kind.
 
     Returns:
         The presses (kind and direction) int64 `[N, 3, 2]`, their seconds `[N, 3]`, their number `[N]`, and the fuel of
-        the plan in seconds `[N]`. The fuel includes changes of boats after the first press. It is `inf` if no plan
-        docks.
+        the plan in seconds `[N]`. The fuel includes changes of the controller after the first press. It is `inf` if no
+        plan docks.
     """
     device = position[0].device
     legs = torch.zeros(len(position[0]), MAX_PRESSES, 2, dtype=torch.long, device=device)

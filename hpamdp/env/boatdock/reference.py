@@ -2,21 +2,21 @@
 
 Source: `BDtrajectory40.mat`, the human data released with *A Benchmark for Hierarchical Parameterized Action Markov
 Decision Process* (MIT licence): 40 people, 360 episodes each. A score is 5 x the fuel left (the file's `tank`, as a
-fraction of 360 ticks) on success and -1 otherwise. People chose their boat in every episode. So their figures with one
-boat cover the episodes in which they had chosen it.
+fraction of 360 ticks) on success and -1 otherwise. People chose a controller in every episode. So their figures with
+one controller cover the episodes in which they had chosen it.
 
 The figures have the names of `metrics.csv`:
 - `score` and `steps` are means.
 - `success`, `too_fast`, `out_of_bounds`, `out_of_fuel` and `time_limit` are fractions of episodes with that outcome.
-- `option_congruent` is the fraction of episodes with the congruent boat.
-- `oracle_agreement` is the fraction of episodes with the better boat.
+- `option_congruent` is the fraction of episodes with the congruent controller.
+- `oracle_agreement` is the fraction of episodes with the better controller.
 """
 
 from __future__ import annotations
 
 Figures = dict[str, float]
 
-# The first entry is the whole task, in which people choose the boat.
+# The first entry is the whole task, in which people choose the controller.
 HUMAN: dict[str, Figures] = {
     "chosen": {
         "score": 1.970,
@@ -32,7 +32,7 @@ HUMAN: dict[str, Figures] = {
     "congruent": {"score": 2.012, "success": 0.864},
     "incongruent": {"score": 1.912, "success": 0.854},
 }
-# Uniformly random keys and durations with either boat, over 200,000 random layouts (standard error 0.0013).
+# Uniformly random keys and durations with either controller, over 200,000 random layouts (standard error 0.0013).
 RANDOM: Figures = {"score": -0.925, "success": 0.017}
 HUMAN_LAST_60: Figures = {"score": 2.241, "success": 0.900}  # of each person's 360 episodes
 BEST_PERSON: Figures = {"score": 3.021, "success": 0.989}

@@ -33,7 +33,7 @@ def measure_boats(played: Mapping[str, np.ndarray], controller: str, rules: Rule
 
     Args:
         played: arrays of an evaluation, whose first dimension is the episode.
-        controller: `chosen`, the name of a boat, or `random`.
+        controller: `chosen`, the name of a controller, or `random`.
         rules: rules of the environment.
     """
     outcome, optimum, chosen = played["outcome"], played["optimum"], played.get("option")

@@ -4,7 +4,7 @@ Source: the code released with *A Benchmark for Hierarchical Parameterized Actio
 to put the paper's table in context. `experiments/released` shows why returns here do not measure skill. It shares no
 rules with `BoatDockEnv`.
 Differs from the source:
-- It simulates many boats at once.
+- It simulates many environments at once.
 - Layouts come from counters instead of NumPy's global generator.
 - Observations may be `scaled`, and each episode may have a new layout.
 """
@@ -35,7 +35,7 @@ class ReleasedBoatDockOptions(Settings):
     """Settings of `ReleasedBoatDockEnv`."""
 
     controller: Literal["congruent", "incongruent"] = "congruent"
-    """The boat. The agent cannot choose it, so use high=none."""
+    """The controller. The agent cannot choose it, so use high=none."""
     keymap: Literal[0, 1] = 0
     """Key map of the incongruent controller. If 0, it is sampled from {0, 1} at every reset until it is 1.
 
@@ -58,7 +58,7 @@ class ReleasedBoatDockOptions(Settings):
 
 
 class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
-    """A batch of boats under the rules of the released code.
+    """A batch of environments under the rules of the released code.
 
     Action leaves:
     - `("action", "discrete")`: the key, in {0, 1, 2}, int64 `[N]`.
@@ -78,12 +78,12 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
     An environment always keeps its controller, so no selector can be used with it.
 
     Args:
-        num_envs: number of boats.
+        num_envs: number of environments.
         options: the settings; None for the defaults.
         dtype: `float32` or `float64`, of the computation and its results. Durations are always rounded in float32.
         device: device of the tensors.
         seed: seed of layouts and key maps. The global generators are not used.
-        first_env: number of the first boat. It is above 0 if other processes hold earlier boats.
+        first_env: number of the first environment. It is above 0 if other processes hold earlier ones.
         settings: single settings by name, which replace those in `options`.
 
     `reset` also takes layouts, which the environments keep: a tensordict with `start` and `goal` `[N, 2]` in screen px
@@ -130,7 +130,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
         PAMDPEnv.seed_evaluation(self, seed)
 
     def fixed_episodes(self, seed: int) -> TensorDict:
-        """Return evaluation layouts for `reset`, one per boat. Their random stream is not that of training."""
+        """Return evaluation layouts for `reset`, one per environment. Their random stream is not that of training."""
         episode = torch.zeros_like(self._environment)
         seed_tensor = counter_rng.seed_tensor(seed, self.device)
         rng = counter_rng.rng_key(seed_tensor, counter_rng.EVALUATION, self._environment, episode)
@@ -149,7 +149,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
         return {"outcome": outcome, "success": outcome == released.SUCCESS}
 
     def summary_entries(self) -> dict[str, str]:
-        """Return the `controller` of the boats."""
+        """Return the `controller`."""
         return {"controller": self.options.controller}
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
@@ -172,7 +172,7 @@ class ReleasedBoatDockEnv(BatchedEnv[ReleasedState]):
         check_range(columns, {"keymap": (released.NO_KEYMAP, 2)})
 
     def start(self, episode: Tensor, rng: RngKey) -> ReleasedState:
-        """Return the states of boats that have no layout yet."""
+        """Return the states of environments that have no layout yet."""
         integer_zeros = torch.zeros_like(episode)
         zeros = integer_zeros.to(self.float_type)
         keymap = released.NO_KEYMAP if self._is_congruent else self.options.keymap

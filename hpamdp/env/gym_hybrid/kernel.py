@@ -206,7 +206,7 @@ def advance(
     mode: Any,
     observations: Any,
     outcomes: Any,
-    entries: Any,
+    extras: Any,
     flags: Any,
     rewards: Any,
 ) -> int:
