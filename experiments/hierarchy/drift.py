@@ -32,11 +32,11 @@ EVERY = 200  # decisions between two rows
 # Motor noise of the incongruent and the congruent controller in each phase. The congruent one is better in the first.
 NOISE = ((0.15, 0.0), (0.0, 0.15))
 BETTER = (1, 0)  # option, in each phase
-RECOVERED = 0.8  # share of the better boat among the last EVERY decisions
+RECOVERED = 0.8  # share of the better controller among the last EVERY decisions
 
 
 def play(run: str, high: str, memory: str, seed: int) -> Iterator[dict[str, float | str]]:
-    """Yield a row every `EVERY` decisions: the frequency of the better boat, and the mean reward of each boat."""
+    """Yield a row every `EVERY` decisions: the frequency of the better controller, and the mean reward of each boat."""
     overrides = [
         f"high={high}",
         f"high.memory={memory}",
@@ -88,7 +88,7 @@ def _mean_reward(rewards: torch.Tensor) -> float | str:
 
 
 def recovery(rows: Rows) -> float:
-    """Return the decisions of the second phase until a run chooses the better boat again; infinity if never."""
+    """Return the decisions of the second phase until a run chooses the better controller again; infinity if never."""
     shares = [row["better"] for row in rows if row["phase"] == 1]
     for number, share in enumerate(shares, start=1):
         if share >= RECOVERED:
@@ -97,9 +97,9 @@ def recovery(rows: Rows) -> float:
 
 
 def table(rows: Rows) -> str:
-    """Return a line for each form: frequency of the better boat at the end of each phase, and recovery by seed."""
+    """Return a line for each form: how often it ends a phase with the better controller, and recovery by seed."""
     lines = [
-        "| selector | memory | better boat before the change | at the end | decisions to recover, by seed |",
+        "| selector | memory | better controller before the change | at the end | decisions to recover, by seed |",
         "|---|---|---|---|---|",
     ]
     for (high, memory), of_form in groups(rows, "high", "memory").items():
@@ -113,12 +113,12 @@ def table(rows: Rows) -> str:
 
 
 def _last_shares(rows: Rows, phase: int) -> list[float]:
-    """Return the shares of the better boat in the last five rows of a run's phase."""
+    """Return the shares of the better controller in the last five rows of a run's phase."""
     return [row["better"] for row in rows if row["phase"] == phase][-5:]
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """Draw the share of the better boat over decisions, a panel for each selector."""
+    """Draw the share of the better controller over decisions, a panel for each selector."""
     figure = Figure(figsize=(13.0, 3.4), layout="constrained")
     for axes, high in zip(figure.subplots(1, len(SELECTORS), sharey=True), SELECTORS, strict=True):
         for memory, colour in MEMORIES.items():

@@ -199,7 +199,7 @@ def draw_learning(axes: Axes) -> None:
 
 
 def draw_gaps(axes: Axes) -> None:
-    """Draw each person's loss of score through the keys and through the choice of the boat."""
+    """Draw each person's loss of score through the keys and through the choice of the controller."""
     rows = load("persons")
     order = np.argsort(rows["gap"])
     x = np.arange(len(order))
@@ -238,7 +238,7 @@ def draw_choices(axes: Axes) -> None:
 
 
 def draw_better_boat(axes: Axes) -> None:
-    """Draw each person's score against the share of episodes with the better boat."""
+    """Draw each person's score against the share of episodes with the better controller."""
     rows = load("persons")
     axes.scatter(rows["better_boat"], rows["score"], color=HUMAN, s=18)
     axes.set(xlabel="episodes with the better boat", ylabel="score", title="Choosing well and scoring well, 40 people")

@@ -131,7 +131,7 @@ def _mean(rows: Rows, column: str) -> float:
 
 
 def draw(curves: Rows, results: Rows, reward: str, x: str, path: Path) -> None:
-    """Draw the learning curves of one reward, a panel for each boat: mean over seeds and one standard deviation."""
+    """Draw the learning curves of one reward by controller: mean over seeds and one standard deviation."""
     shown = [row for row in curves if row["reward"] == reward and row["problem"] in BOATS]
     boats = sorted({row["problem"] for row in shown})
     figure = Figure(figsize=(6.4 * len(boats), 4.2), layout="constrained")

@@ -69,7 +69,7 @@ def table(rows: Rows) -> str:
 
 
 def draw(curves: Rows, path: Path) -> None:
-    """Draw return and success against presses, a row for each boat: each seed, and the mean over seeds."""
+    """Draw return and success against presses, a row for each controller: each seed, and the mean over seeds."""
     figure = Figure(figsize=(11.5, 7.2), layout="constrained")
     for boat, (left, right) in zip(BOATS, figure.subplots(2, 2, sharex=True), strict=True):
         of_boat = [row for row in curves if row["boat"] == boat]

@@ -282,7 +282,7 @@ def _range(rows: Sequence[dict[str, Any] | None], column: str) -> str:
 
 
 def draw_curves(curves: Rows, results: Rows, path: Path) -> None:
-    """Draw score and success against presses, a row for each boat: mean over seeds and one standard deviation."""
+    """Draw score and success against presses, a row for each controller: mean over seeds and one standard deviation."""
     figure = Figure(figsize=(11.5, 7.6), layout="constrained")
     ceiling = ceilings(results)
     for boat, row in zip(BOATS, figure.subplots(2, 2, sharex=True), strict=True):
