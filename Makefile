@@ -26,6 +26,8 @@ run: $(VENV)/.installed
 
 # Each process of the tests has one core, and the threads of NumPy's matrix products would wait for one another.
 test coverage slow-tests ray-launcher lowest: export OMP_NUM_THREADS = 1
+# Bytecode is kept, since each process of the tests, and each that a test starts, would compile all modules anew.
+test coverage slow-tests ray-launcher lowest: export PYTHONDONTWRITEBYTECODE =
 
 # The gate: what every change has to pass.
 test: $(VENV)/.installed-dev
