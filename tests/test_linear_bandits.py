@@ -192,8 +192,8 @@ def test_bandits_that_forget_follow_a_swap_of_the_better_options_and_others_lag(
     for memory in MEMORIES:
         torch.manual_seed(0)
         bandit = make(name, memory=memory, degree=1)
-        play(bandit, by_sign, 3000, 16, noise=0.5)
-        regret = play(bandit, against_sign, 2000, 16, noise=0.5)[1]
+        play(bandit, by_sign, 3000, 40, noise=0.5)
+        regret = play(bandit, against_sign, 2000, 40, noise=0.5)[1]
         after[memory] = regret.mean().item()
         assert memory == "all" or regret[-500:].mean() < 0.2
     assert after["all"] > 0.3 + max(after["discounted"], after["sliding_window"])
@@ -206,7 +206,7 @@ def test_regret_on_a_linear_problem_grows_far_more_slowly_than_time(name):
     curves = []
     for seed in range(3):
         torch.manual_seed(seed)
-        curves.append(play(make(name, degree=1), lambda x: x @ weights.T, 4 * horizon, 16, noise=0.5)[1].cumsum(0))
+        curves.append(play(make(name, degree=1), lambda x: x @ weights.T, 4 * horizon, 40, noise=0.5)[1].cumsum(0))
     regret = torch.stack(curves).mean(0)
     assert regret[horizon - 1] < 0.02 * horizon
     assert regret[-1] / regret[horizon - 1] < 2.4  # sqrt(T) log(T) grows by 2.4

@@ -137,7 +137,7 @@ def train(selector, num_batches: int) -> HierarchicalAgent:
 
 @pytest.mark.parametrize("make", [make_critic, make_meta_critic], ids=["option_critic", "meta_critic"])
 def test_options_end_where_another_one_is_better(make):
-    agent = train(make(), 25)
+    agent = train(make(), 18)
     assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
     place = torch.eye(SPECS.observation_dim)[[2, 20]]  # on land, in water
     with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -149,7 +149,7 @@ def test_options_end_where_another_one_is_better(make):
 
 
 def test_a_deliberation_cost_makes_options_last():
-    agent = train(make_critic(deliberation_cost=0.02, termination_lr=1e-2), 25)
+    agent = train(make_critic(deliberation_cost=0.02, termination_lr=1e-2), 18)
     assert earned(agent, GAMMA, math.inf) >= 0.95 * best_value(GAMMA, 1)
     place = torch.eye(SPECS.observation_dim)[[4, 20]]
     beta = agent.selector.beta(place, torch.tensor([0, 1]), None)

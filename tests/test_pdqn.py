@@ -41,7 +41,7 @@ OTHER_FORMS = [PUBLISHED, {"bounding": "inverting_gradients", "double_q": True}]
 def test_the_learner_finds_the_best_discrete_action_and_its_parameters(changes):
     torch.manual_seed(0)
     learner = make(**changes)
-    learn(learner, 40)
+    learn(learner, 30)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         rows = one_step_rows(learner, 1000)
     assert (rows[keys.DISCRETE] == 1).float().mean() > 0.98
@@ -219,7 +219,7 @@ def test_variations_of_greedy_parameters_change_neither_exploration_nor_training
     assert all(torch.equal(value, ends[1][name]) for name, value in ends[0].items())
 
 
-def test_discrete_actions_without_parameters_work():
+def test_discrete_actions_without_parameters_are_learned_too():
     learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_steps=100, greedy_samples=3)
     td = learner.policy(states(200))
     assert td[keys.PARAMETERS].shape == (200, 0)
