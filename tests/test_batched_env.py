@@ -43,7 +43,7 @@ each_problem = pytest.mark.parametrize("problem", PROBLEMS, ids=lambda problem: 
 
 
 @pytest.mark.parametrize("problem", POINTS)
-def test_specs_hold(problem):
+def test_all_tensors_are_as_the_specs_say(problem):
     check_env_specs(problem(3, max_steps=4, oracle=True), return_contiguous=True)
 
 

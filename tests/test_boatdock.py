@@ -78,7 +78,7 @@ def play(env: BoatDockEnv, num_presses: int, longest: float = 1.0) -> list[Tenso
 
 
 @pytest.mark.parametrize(("controller", "keymap", "reward", "observation"), MODES)
-def test_specs_hold_in_every_mode(controller, keymap, reward, observation):
+def test_all_tensors_are_as_the_specs_say_in_every_mode(controller, keymap, reward, observation):
     noise = NOISE if keymap == "random" else {}
     env = BoatDockEnv(2, controller=controller, keymap=keymap, reward=reward, observation=observation, **noise)
     check_env_specs(env, return_contiguous=True)

@@ -32,7 +32,7 @@ from hpamdp.env.boatdock_released.rules import OUT_OF_FUEL, SUCCESS, TIME_LIMIT,
 @pytest.mark.parametrize("observation", ["pixels", "scaled"])
 @pytest.mark.parametrize("controller", ["congruent", "incongruent"])
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_specs_hold(controller, observation, dtype):
+def test_all_tensors_are_as_the_specs_say(controller, observation, dtype):
     check_env_specs(ReleasedBoatDockEnv(5, controller=controller, observation=observation, dtype=dtype))
 
 

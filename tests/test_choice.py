@@ -38,7 +38,7 @@ def make(num_envs: int) -> OptionChoiceEnv:
     return OptionChoiceEnv(Presser(), BoatDockEnv(num_envs, seed=3))
 
 
-def test_specs_hold():
+def test_all_tensors_are_as_the_specs_say():
     env = BoatDockEnv(4)
     check_env_specs(OptionChoiceEnv(RandomPolicy(PAMDPSpecs.from_env(env)), env))
     check_env_specs(with_decisions(OptionChoiceEnv(WholeStep(), Crossing(4, start=6.0))))

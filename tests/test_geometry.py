@@ -167,7 +167,7 @@ def test_each_slip_of_goal_breaks_its_mirror(slip):
     assert worst_error(env, goal_columns, maps) > 0.01
 
 
-def test_platform_declares_nothing():
+def test_platform_declares_neither_symmetries_nor_a_geometry():
     specs = PAMDPSpecs.from_env(PlatformEnv(1))
     assert specs.symmetries is None and specs.geometry is None
 

@@ -32,7 +32,7 @@ NAN = math.nan
 
 @BOTH
 @pytest.mark.parametrize("num", [1, 3])
-def test_specs_hold(domain, num):
+def test_all_tensors_are_as_the_specs_say(domain, num):
     check_env_specs(domain(num), return_contiguous=True)
 
 

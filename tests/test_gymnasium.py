@@ -55,7 +55,7 @@ def test_the_environment_receives_the_chosen_action(form):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_specs_hold(form):
+def test_all_tensors_are_as_the_specs_say(form):
     # Toy refuses actions outside its space, and samples of the specs have rounded bounds.
     check_env_specs(make(3, form=form, max_steps=2), return_contiguous=True)
 

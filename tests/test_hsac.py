@@ -152,7 +152,7 @@ def test_the_greedy_policy_samples_nothing_and_the_exploring_one_is_uniform_in_t
     assert (sampled - SPECS.to_unit(greedy[keys.PARAMETERS])).std() < 0.02
 
 
-def test_discrete_actions_without_parameters_work():
+def test_discrete_actions_without_parameters_are_learned_too():
     learner = make(PAMDPSpecs(4, (), (0, 0), (), ()), warmup_steps=100)
     td = learner.policy(states(200))
     assert td[keys.PARAMETERS].shape == (200, 0)

@@ -34,7 +34,7 @@ def is_unchanged(env: PlatformEnv, before: dict[str, Tensor], rows=slice(None)) 
 
 
 @pytest.mark.parametrize("num", [1, 3])
-def test_specs_hold(num):
+def test_all_tensors_are_as_the_specs_say(num):
     check_env_specs(PlatformEnv(num), return_contiguous=True)
 
 

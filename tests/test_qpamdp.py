@@ -393,7 +393,7 @@ def test_sigma_is_the_standard_deviation_of_the_parameters():
 
 
 @pytest.mark.parametrize("dims", [(0, 0), (0, 2, 1)])
-def test_discrete_actions_with_any_number_of_parameters_work(dims):
+def test_discrete_actions_with_any_number_of_parameters_are_learned(dims):
     torch.manual_seed(0)
     specs = PAMDPSpecs(2, (), dims, (0.0,) * sum(dims), (1.0,) * sum(dims))
     learner = make(specs, step_size=0.5)

@@ -44,7 +44,7 @@ def test_a_move_goes_as_far_as_the_option_the_floor_and_the_walls_let_it(before,
     assert moved(*before) == after
 
 
-def test_the_specs_hold():
+def test_all_tensors_are_as_the_specs_say():
     check_env_specs(with_decisions(RoomsEnv(3), 0.9, 2))
 
 
