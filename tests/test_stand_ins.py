@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from class_descriptions import described
 from conftest import CONF, choices
-from told_by_classes import told
 
 from hpamdp.config.components import GROUPS, load_class
 
@@ -29,7 +29,7 @@ def python(*words: str, cwd: Path | None = None) -> subprocess.CompletedProcess[
 def quick():
     """What all classes tell in a process with stand-ins, and which modules it has left."""
     targets = [(target_of(group, name), group) for group, name in FILES]
-    script = str(Path(__file__).with_name("told_by_classes.py"))
+    script = str(Path(__file__).with_name("class_descriptions.py"))
     done = python(script, json.dumps([each for each in targets if each[0] is not None]))
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
@@ -39,7 +39,7 @@ def quick():
 def test_a_class_read_with_stand_ins_has_the_settings_and_facts_of_the_real_one(group, name, quick):
     target = target_of(group, name)
     if target is not None:
-        assert quick["told"][target] == json.loads(json.dumps(told(load_class(target), group)))
+        assert quick["described"][target] == json.loads(json.dumps(described(load_class(target), group)))
 
 
 def test_modules_with_stand_ins_are_not_seen_afterwards(quick):

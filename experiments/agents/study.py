@@ -15,7 +15,7 @@ import yaml
 
 AGENTS = Path(__file__).resolve().parents[2] / "agents"
 # Settings of problems in which agents differ.
-TOLD = ("controller", "n")
+SHOWN_SETTINGS = ("controller", "n")
 HEAD = ("agent", "problem", "selector", "learner", "score", "ceiling", "success", "length", "trained for", "CPU, s")
 
 
@@ -23,11 +23,11 @@ def row(folder: Path) -> list[str]:
     """Return an agent's cells."""
     summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
     env = yaml.safe_load((folder / "config.yaml").read_text())["env"]
-    told = [f"{name}={env[name]}" for name in TOLD if name in env and env[name] != "choose"]
+    shown = [f"{name}={env[name]}" for name in SHOWN_SETTINGS if name in env and env[name] != "choose"]
     ceiling = summary.get("ceiling")
     return [
         f"`{folder.name}`",
-        ", ".join([summary["env"], *told]),
+        ", ".join([summary["env"], *shown]),
         summary["high"],
         summary["low"],
         f"{summary['score']:.3f}",

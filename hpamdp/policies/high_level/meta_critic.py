@@ -9,7 +9,7 @@ first source).
 Differs from the sources:
 - values do not bootstrap past the end of an episode, also if a time limit ended it;
 - while exploring, options are also interrupted at random, with the probability of a random option;
-- which decisions a member of the ensemble learns from is drawn anew at every update, not once for each decision;
+- which decisions a member of the ensemble learns from is drawn again at every update, not once for each decision;
 - all members share one target, the mean of the target members.
 """
 

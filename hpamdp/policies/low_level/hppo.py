@@ -155,7 +155,7 @@ class HPPO(OnPolicy, Learner):
         rows["advantage"] = normalised(rows["advantage"])
         for group in self.optimizer.param_groups:
             group["lr"] = options.lr + progress * (options.lr_final - options.lr)
-        # A tensor, since compiled code would be made anew for another number.
+        # A tensor, since code would be compiled again for another number.
         left = 1.0 + progress * (options.entropy_final - 1.0)
         entropy_weight = torch.tensor(left, device=rows.device, dtype=torch.float32)
         steps = [self.gradient_step(self.loss, minibatch, entropy_weight) for minibatch in self.minibatches(rows)]

@@ -120,9 +120,9 @@ class HyAROptions(TargetRateOptions, SearchingActorOptions):
     latent_coverage: PositiveFraction = 0.96
     """Central fraction of the encoded z that the actor can reach: the latent-space constraint of the paper."""
     correction_factor: PositiveFloat = 5.0
-    """Encode a stored z anew if the error of its predicted change is this many times the codec's recent mean."""
+    """Encode a stored z again if the error of its predicted change is this many times the codec's recent mean."""
     parameter_tolerance: NonNegativeFloat | None = None
-    """Instead, encode a stored z anew if it decodes to parameters that differ from the executed ones by more than this.
+    """Instead, encode a stored z again if its decoded parameters differ from the executed ones by more than this.
 
     If null, the predicted change decides. Where the next state is hard to predict, the parameters are the surer sign.
     """
@@ -176,7 +176,7 @@ class HybridCodec(nn.Module):
 
         Args:
             e: `[B, embedding_dim]`.
-            allowed: the discrete actions to choose from, bool `[B, num_discrete]`; None: all.
+            allowed: the discrete actions to choose from, bool `[B, num_discrete]`. If None, all.
         """
         return masked_values(-torch.cdist(e, self.embeddings), allowed).argmax(-1)
 
@@ -270,7 +270,7 @@ class LatentCritics(nn.Module):
         Args:
             state: `[B, observation_dim]`.
             latent: `[B, N, embedding_dim + latent_dim]`.
-            num_members: how many of the networks to ask, from the first on; None: all, E.
+            num_members: how many of the networks to ask, from the first on. If None, all, E.
         """
         batch_size, num_latents, _ = latent.shape
         rows = torch.cat([state.unsqueeze(1).expand(-1, num_latents, -1), latent], -1)
@@ -364,7 +364,7 @@ class HyARPolicy(TensorDictModuleBase):
         Args:
             state: `[B, observation_dim]`.
             latent: `[B, embedding_dim + latent_dim]`.
-            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`. If None, all.
         """
         e, z = latent.split([self.codec.table.shape[-1], self.codec.latent_dim], -1)
         discrete = self.codec.nearest_discrete(e, allowed)
@@ -478,7 +478,7 @@ class HyAR(ReplayLearner):
             state: `[B, observation_dim]`.
             raw: what the actor gives there before tanh, `[B, P, num_given]`.
             proposals: made of it, `[B, P, embedding_dim + latent_dim]`.
-            allowed: bool `[B, num_discrete]`; None: all.
+            allowed: bool `[B, num_discrete]`. If None, all.
 
         Returns:
             By how much the best one is better than each proposal, at least 0, and the squared distance to it,
@@ -504,7 +504,7 @@ class HyAR(ReplayLearner):
         """Return latents that the codec still decodes to the executed actions, and which of them were corrected, `[B]`.
 
         This is the representation-shift correction: e is replaced by the discrete action's embedding where it no longer
-        decodes to that action; z is encoded anew where the predicted change of the state is off by more than
+        decodes to that action; z is encoded again if the predicted change of the state is off by more than
         `correction_factor` times the codec's mean error or, if `parameter_tolerance` is given, where the decoded
         parameters are off by more than that. With `relabelling="sample"` the new e carries noise, and the new z is a
         sample of the encoder's distribution instead of its mean.
@@ -590,7 +590,7 @@ class HyAR(ReplayLearner):
         return super().transitions(batch).set(LATENT, batch[LATENT])
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
-        """Return a sample mapped by random symmetries; the latent actions are to be encoded anew."""
+        """Return a sample mapped by random symmetries; the latent actions are encoded again later."""
         if self.symmetry is None:
             return sample
         mapped = self.symmetry(sample)

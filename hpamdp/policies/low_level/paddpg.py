@@ -68,7 +68,7 @@ class PADDPGOptions(ActorCriticOptions, TargetRateOptions, TwinCriticOptions, Ep
     actor_lr: LearningRate = 1e-4
     """Learning rate of the actor."""
     max_grad_norm: PositiveFloat | None = 10.0
-    """Largest gradient norm; null: no limit."""
+    """Largest gradient norm. If null, no limit."""
     parameter_noise: NonNegativeFloat = 0.1
     """Standard deviation of the exploring noise on scores and parameters."""
     augment: Literal[False] = False

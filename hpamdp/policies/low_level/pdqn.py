@@ -296,7 +296,7 @@ class PDQN(ReplayLearner):
             state: `[B, observation_dim]`.
             raw: the actor's parameters there, before they are bounded, `[B, num_parameters]`.
             q: their values, `[B, num_discrete]`.
-            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; None: all.
+            allowed: the discrete actions that may be taken, bool `[B, num_discrete]`. If None, all.
 
         Returns:
             For each parameter, by how much the best of its discrete action is better than the actor's, at least 0, and

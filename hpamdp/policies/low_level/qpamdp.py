@@ -18,7 +18,7 @@ Differs from the source:
   option that follows. Sarsa, eNAC and windows then treat the option as the source treats an episode.
 - The Fourier basis couples at most `max_coupled` entries of the observation. Each entry is scaled to `feature_range`,
   or to its range in the warm-up.
-- By default all weights of the values have the same step size. Dabney and Barto's bound limits it anew at each step,
+- By default all weights of the values have the same step size. Dabney and Barto's bound limits it again at each step,
   whatever the sign of the change. The temperature is constant, also in the parameter phases, and sigma decays.
   The published settings: step_scaling=true, step_bound=non_increasing, temperature=1, temperature_decay=0.995,
   samples_in_parameter_phase=false, sigma_decay=1.
@@ -63,12 +63,12 @@ class QPAMDPOptions(Settings):
     """Settings of `QPAMDP`. Means and standard deviations are in units where the parameters' bounds are [-1, 1]."""
 
     features: Annotated[tuple[NonNegativeInt, ...], FromList] | None = None
-    """Entries of the observation that the features see, as in [8, 9]; null: all entries that vary in the warm-up.
+    """Entries of the observation that the features see, as in [8, 9]. If null, all entries that vary in the warm-up.
 
     With `agent.sharing=shared` add the entries of the one-hot option, which come last.
     """
     feature_range: Annotated[tuple[float, float], FromList] | None = None
-    """Range to which these entries are clipped and scaled, as in [-1, 1]; null: the range seen in the warm-up.
+    """Range to which these entries are clipped and scaled, as in [-1, 1]. If null, the range seen in the warm-up.
 
     Give it if random actions do not lead everywhere: states beyond the warm-up's range all look the same.
     """
@@ -100,7 +100,7 @@ class QPAMDPOptions(Settings):
     `non_increasing` is the published one; `each_step` allows a large step if traces and next features nearly cancel.
     """
     envs_per_update: PositiveInt | None = None
-    """Environments whose mean an update of the values is; null: all of them. Published: 1.
+    """Environments over which an update of the values is averaged. If null, all of them. Published: 1.
 
     Small groups learn more from the same steps, because each group makes updates of its own, but take longer.
     """

@@ -101,7 +101,7 @@ def discounted_return(
         steps: what is predicted of them.
         gamma: discount of a step.
         end_value: maps the last step's `next_state`, whatever its shape, to what follows it, `[B]` or `[E, B]`, which
-            is weighted in the same way; None: nothing.
+            is weighted in the same way. If None, nothing.
     """
     total: Tensor | float = 0.0
     survival: Tensor | float = 1.0
@@ -236,9 +236,9 @@ class SequenceSearch:
             returns: maps the steps of Q sequences to their returns `[N, Q, S]`.
             num_states: N.
             device: where to search.
-            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
+            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`. If None, all.
             first_returns: the same as `returns`, but rougher and faster, for the first iteration, which only chooses
-                what is refined; None: `returns`.
+                what is refined. If None, `returns`.
             is_greedy: whether to try `greedy_samples` of the parameters.
         """
         num_samples = self.samples_of_a_sequence(is_greedy)

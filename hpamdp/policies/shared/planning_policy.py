@@ -89,6 +89,6 @@ class PlanningPolicy(TensorDictModuleBase):
             td: the step, `[*B]`.
             observation: its observations, one after another, `[prod(B), observation_dim]`.
             is_planned: which of them to plan from, N in all, bool `[prod(B)]`.
-            mask: what the environment allows there, bool `[N, num_discrete]`; None: everything.
+            mask: what the environment allows there, bool `[N, num_discrete]`. If None, everything.
         """
         raise NotImplementedError

@@ -280,7 +280,7 @@ class ReplayLearner(Learner):
         return value
 
     def allowed(self, sample: TensorDictBase) -> Tensor | None:
-        """Return which discrete actions may be taken in a sample's states, bool `[B, num_discrete]`; None: all."""
+        """Return which discrete actions may be taken in a sample's states, bool `[B, num_discrete]`. If None, all."""
         return self.specs.allowed(sample["state"], sample.get("action_mask", None))
 
 

@@ -54,7 +54,7 @@ class Planner:
         model: maps states, discrete actions and parameters in [-1, 1] to a `Prediction`.
         specs: of the problem.
         options: the settings; single ones may be given by their names.
-        end_value: maps the last state of a plan `[B, observation_dim]` to its value, `[B]`; None: nothing.
+        end_value: maps the last state of a plan `[B, observation_dim]` to its value, `[B]`. If None, the value is 0.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class Planner:
 
         Args:
             state: where the plans begin.
-            action_mask: what the environment allows there, bool `[N, num_discrete]`; None: everything. What it will
+            action_mask: what the environment allows there, bool `[N, num_discrete]`. If None, everything. What it will
                 allow in predicted states is unknown, and taken to be everything.
         """
         size = max(1, _CHUNK_ROWS // self.options.num_samples)

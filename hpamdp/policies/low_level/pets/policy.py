@@ -132,12 +132,12 @@ class PETSPolicy(PlanningPolicy):
         return self.samples_posterior and not is_greedy()
 
     def plan(self, state: Tensor, member: Tensor | None = None, allowed: Tensor | None = None) -> PlannedAction:
-        """Plan from states `[N, observation_dim]`, each with its own member `[N]`; None: with the mean of all.
+        """Plan from states `[N, observation_dim]`, each with its own member `[N]`. If None, with the mean of all.
 
         Args:
             state: where the plans begin.
             member: of each of them.
-            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`; None: all.
+            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`. If None, all.
         """
         num_members = self.model.num_members
         if member is None:
@@ -157,7 +157,7 @@ class PETSPolicy(PlanningPolicy):
         return PlannedAction(*(part[row] for part in planned))
 
     def _allowed(self, observation: Tensor, action_mask: Tensor | None) -> Tensor | None:
-        """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`; None: all.
+        """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`. If None, all.
 
         What the environment will allow in predicted states is unknown, and taken to be everything.
         """

@@ -1,4 +1,4 @@
-"""What a class tells of its settings and of itself; run in a process of its own, it reads classes with stand-ins."""
+"""Describe classes by their settings and facts; run as a script, it reads the classes with stand-ins for torch."""
 
 import json
 import sys
@@ -10,7 +10,7 @@ from hpamdp.config.stand_ins import quick_imports
 FACTS = ("modes", "needs", "is_bandit", "ends_options", "asks_learners", "value_setting", "guarded_settings")
 
 
-def told(cls: type, group: str) -> dict:
+def described(cls: type, group: str) -> dict:
     """Return the settings' defaults and the facts of a class as JSON values."""
     facts = {name: list(value) if isinstance(value := getattr(cls, name, None), tuple) else value for name in FACTS}
     return {"defaults": defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group])), "facts": facts}
@@ -22,4 +22,4 @@ if __name__ == "__main__":
         classes = {target: (load_class(target), group) for target, group in json.loads(sys.argv[1])}
     rooms = ("hpamdp.env", "hpamdp.policies", "hpamdp.run", "torch", "tensordict")
     left = sorted(name for name in set(sys.modules) - before if name.startswith(rooms))
-    print(json.dumps({"told": {target: told(*each) for target, each in classes.items()}, "left": left}))
+    print(json.dumps({"described": {target: described(*each) for target, each in classes.items()}, "left": left}))
