@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pickle
 
-import numpy as np
 import pytest
 from gymnasium_players import step
 from toy_environments import Toy
@@ -13,30 +12,6 @@ from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
-
-
-class Faulty(Toy):
-    """Raises an error of its own somewhere, two calls deep."""
-
-    def __init__(self, where: str):
-        super().__init__()
-        self.where = where
-        self.perhaps("constructor")
-
-    def perhaps(self, where: str) -> None:
-        if self.where == where:
-            self.fail()
-
-    def fail(self) -> None:
-        np.zeros(2).reshape(3)
-
-    def reset(self, **arguments):
-        self.perhaps("reset")
-        return super().reset(**arguments)
-
-    def step(self, action):
-        self.perhaps("step")
-        return super().step(action)
 
 
 def play(entry_point: str, **kwargs) -> None:
@@ -48,13 +23,15 @@ def play(entry_point: str, **kwargs) -> None:
 @pytest.mark.parametrize("where", ["constructor", "reset", "step"])
 def test_a_fault_is_told_in_one_line_that_says_whose_it_is_and_where(where):
     with pytest.raises(EnvironmentFaultError) as raised:
-        play(f"{__name__}:Faulty", where=where)
+        play("toy_environments:Faulty", where=where)
     line, frames = str(raised.value), raised.value.frames
     copy = "" if where == "constructor" else "environment 0: "
-    assert line.startswith(f"GymnasiumEnv: {__name__}:Faulty: {copy}its {where} raised ValueError: cannot reshape")
-    assert line.endswith(")") and "test_gymnasium_faults.py, line " in line and "\n" not in line
+    assert line.startswith(
+        f"GymnasiumEnv: toy_environments:Faulty: {copy}its {where} raised ValueError: cannot reshape"
+    )
+    assert line.endswith(")") and "toy_environments.py, line " in line and "\n" not in line
     assert isinstance(raised.value.__cause__, ValueError)
-    assert frames.count("File ") == 3 and frames.count("test_gymnasium_faults.py") == 3
+    assert frames.count("File ") == 3 and frames.count("toy_environments.py") == 3
     assert frames.splitlines()[-1].strip().startswith(("np.zeros", "^"))
 
 
@@ -80,7 +57,12 @@ def test_a_method_that_does_not_take_its_arguments_is_a_breach_of_contract(name,
 
 @pytest.mark.parametrize("where", ["constructor", "step"])
 def test_the_command_line_prints_the_line_and_the_environments_own_frames(where, command):
-    words = ["env=gymnasium", f"env.entry_point={__name__}:Faulty", "env.max_steps=3", f"env.kwargs={{where:{where}}}"]
+    words = [
+        "env=gymnasium",
+        "env.entry_point=toy_environments:Faulty",
+        "env.max_steps=3",
+        f"env.kwargs={{where:{where}}}",
+    ]
     code, _, err = command("high=none", "low=random", "num_envs=2", "steps_per_batch=4", "total_frames=64", *words)
     lines = [line for line in err.splitlines() if "steps" not in line]
     assert code == 1 and f"its {where} raised ValueError" in err

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections import OrderedDict
 from types import SimpleNamespace
 from typing import Any
@@ -120,6 +122,39 @@ class Wrong(Toy):
 
     def _observation(self):
         return np.full(self.size, self.value)
+
+
+class Faulty(Toy):
+    """Raises an error of its own somewhere, two calls deep."""
+
+    def __init__(self, where: str):
+        super().__init__()
+        self.where = where
+        self.perhaps("constructor")
+
+    def perhaps(self, where: str) -> None:
+        if self.where == where:
+            self.fail()
+
+    def fail(self) -> None:
+        np.zeros(2).reshape(3)
+
+    def reset(self, **arguments):
+        self.perhaps("reset")
+        return super().reset(**arguments)
+
+    def step(self, action):
+        self.perhaps("step")
+        return super().step(action)
+
+
+class Killed(Toy):
+    """Is killed in its second step."""
+
+    def step(self, action):
+        if self.steps == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
 
 
 def old_space(space: spaces.Space) -> Any:

@@ -104,6 +104,7 @@ class Copies:
     Attributes:
         envs: the copies.
         max_steps: of the longest episode.
+        option_names: what the environment calls its options, unchecked.
         results: what they have last returned.
 
     Raises:
@@ -135,6 +136,7 @@ class Copies:
             self.observations = ObservationSpace(space, entries, reading.out_of_bounds)
         except ValueError as error:
             raise SettingError(f"{name}: {error}") from error
+        self.option_names = getattr(self.envs[0].unwrapped, "option_names", ())
         mask_sizes = {mask: rows.shape[1] for mask, rows in self._masks.rows.items()}
         self.layout = Layout(self.observations.dim, mask_sizes)
         self.table = np.zeros((num, self.layout.num_result_columns))

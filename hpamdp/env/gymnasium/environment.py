@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from pydantic import PositiveInt
+from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
@@ -20,6 +21,7 @@ from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import MaskSource
+from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, Scaling
 from hpamdp.env.registration import register
 from hpamdp.settings import SettingError, Settings
@@ -61,10 +63,12 @@ class GymnasiumOptions(Settings):
     """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not."""
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
+    num_workers: NonNegativeInt = 0
+    """Processes that step the copies at the same time, for slow environments. If 0, this process steps them."""
 
 
 class GymnasiumEnv(PAMDPEnv):
-    """`num_envs` copies of a Gymnasium environment, stepped one after another in this process.
+    """`num_envs` copies of a Gymnasium environment, stepped one after another, or at the same time in processes.
 
     `hpamdp.env.gymnasium.action_spaces` and `hpamdp.env.gymnasium.observation_spaces` tell which spaces are accepted
     and how they are converted. Parameters outside their bounds are clipped; those of the chosen action must be finite.
@@ -115,7 +119,7 @@ class GymnasiumEnv(PAMDPEnv):
         self.first_env = first_env
         self._name = f"GymnasiumEnv: {options.entry_point or options.id}"
         make = Maker(self._name, options.id, options.entry_point, options.kwargs, options.max_steps)
-        self._copies = Copies(make, num_envs, self._reading(), self._name)
+        self._copies = self._make_copies(make)
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         self.max_steps = self._copies.max_steps
         self.parameter_dims = self._copies.actions.parameter_dims
@@ -130,6 +134,14 @@ class GymnasiumEnv(PAMDPEnv):
         self._reports_success = False
         self._set_seed(seed)
 
+    def _make_copies(self, make: Maker) -> Copies | ProcessCopies:
+        num_workers = self.options.num_workers
+        if num_workers == 0:
+            return Copies(make, self.num_envs, self._reading(), self._name)
+        if multiprocessing.current_process().daemon:
+            raise SettingError(f"{self._name}: {num_workers=}: a worker process cannot start others; use 0")
+        return ProcessCopies(make, self.num_envs, self._reading(), self._name, num_workers)
+
     def _reading(self) -> Reading:
         given = self.options
         return Reading(
@@ -143,13 +155,13 @@ class GymnasiumEnv(PAMDPEnv):
 
     @property
     def envs(self) -> list[gymnasium.Env]:
-        """The copies."""
+        """The copies; none if other processes have them."""
         return self._copies.envs
 
     @property
     def is_shardable(self) -> bool:
-        """Whether no running statistics are kept, which all environments must share."""
-        return self.scaling.statistics is None
+        """Whether no running statistics are kept, which all environments must share, and no processes are started."""
+        return self.scaling.statistics is None and self.options.num_workers == 0
 
     @property
     def title(self) -> str:
@@ -213,7 +225,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def _names_of_options(self) -> tuple[str, ...]:
         num_options = self._copies.options.num_options
-        given = getattr(self.envs[0].unwrapped, "option_names", ())
+        given = self._copies.option_names
         try:
             names = checked_option_names(() if given is None else given)
         except ProblemError as error:

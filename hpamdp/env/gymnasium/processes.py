@@ -1,0 +1,215 @@
+"""Copies of a Gymnasium environment in worker processes of Gymnasium's AsyncVectorEnv, for slow environments.
+
+To Gymnasium, each worker is one environment. Its action is a table of actions, and its observation the table of results
+of all copies in it. So a step sends one message to each worker, and the copies of a worker rest between their episodes.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import logger, spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
+
+from hpamdp.env.errors import EnvironmentFaultError, ProblemError
+from hpamdp.env.gymnasium.copies import Copies, Reading
+from hpamdp.env.registration import register
+from hpamdp.search_path import protect_children, unprotect_children
+from hpamdp.settings import SettingError
+
+_PATIENCE_S = 2.0  # until a dead process has an exit code
+_SILENT = 100  # a level of Gymnasium's logger
+# A terminal sends Ctrl-C to every process, and only the run's own process may act on it.
+_SIGNALS_OF_THE_RUN = (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
+# Columns of a table of actions before the parameters.
+_IS_STEPPED, _OPTION, _DISCRETE, _NUM_BEFORE = 0, 1, 2, 3
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Some of the copies, which one worker steps. Calling it makes the worker's environment.
+
+    Attributes:
+        make, reading, name: as for `Copies`.
+        first: number of the first copy.
+        num: number of copies.
+        num_rows: number of rows of the tables, the same in all workers.
+        num_columns: of the tables of actions and of results.
+    """
+
+    make: Callable[[], gymnasium.Env]
+    reading: Reading
+    name: str
+    first: int
+    num: int
+    num_rows: int
+    num_columns: tuple[int, int]
+
+    def __call__(self) -> gymnasium.Env:
+        return _BlockEnv(self)
+
+
+class _BlockEnv(gymnasium.Env):
+    """The copies of one worker as an environment, which are made at the first reset."""
+
+    def __init__(self, block: _Block) -> None:
+        self._block = block
+        self._copies: Copies | None = None
+        of_actions, of_results = block.num_columns
+        self.action_space = spaces.Box(-np.inf, np.inf, (block.num_rows, of_actions), np.float64)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (block.num_rows, of_results), np.float64)
+        self._table = np.zeros((block.num_rows, of_results))
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """Begin episodes of the copies whose `seeds` are in the options."""
+        block = self._block
+        if self._copies is None:
+            unprotect_children()
+            register()
+            self._copies = Copies(block.make, block.num, block.reading, block.name, block.first)
+        seeds = {row - block.first: seed for row, seed in (options or {})["seeds"].items()}
+        self._copies.reset({row: seed for row, seed in seeds.items() if 0 <= row < block.num})
+        return self._results(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Take the steps of a table of actions."""
+        assert self._copies is not None
+        actions = action[: self._block.num]
+        rows = np.flatnonzero(actions[:, _IS_STEPPED]).tolist()
+        option, discrete = (actions[:, column].astype(np.int64) for column in (_OPTION, _DISCRETE))
+        has_options = self._copies.options.num_options > 0
+        self._copies.step(rows, option if has_options else None, discrete, actions[:, _NUM_BEFORE:])
+        return self._results(), 0.0, False, False, {}
+
+    def close(self) -> None:
+        """Close the copies."""
+        if self._copies is not None:
+            self._copies.close()
+
+    def _results(self) -> np.ndarray:
+        assert self._copies is not None
+        self._table[: self._block.num] = self._copies.table
+        return self._table
+
+
+class ProcessCopies:
+    """As `Copies`, except that `num_workers` processes each step a part of the copies.
+
+    One more copy is made in this process, to read its spaces.
+
+    Args:
+        make: makes a copy; can be pickled.
+        num: number of copies.
+        reading: how the spaces are read.
+        name: what errors call the environment.
+        num_workers: largest number of processes.
+
+    Attributes:
+        max_steps, option_names, options, actions, observations, layout, table, results: as those of `Copies`.
+        envs: empty, since the copies live elsewhere.
+
+    Raises:
+        SettingError: the spaces are not accepted, or this process may not start others.
+        EnvironmentFaultError: a constructor raised an error.
+    """
+
+    def __init__(
+        self, make: Callable[[], gymnasium.Env], num: int, reading: Reading, name: str, num_workers: int
+    ) -> None:
+        self._name = name
+        self._is_broken = False
+        self.envs: list[gymnasium.Env] = []
+        probe = Copies(make, 1, reading, name)
+        probe.close()
+        self.max_steps, self.option_names, self.layout = probe.max_steps, probe.option_names, probe.layout
+        self.options, self.actions, self.observations = probe.options, probe.actions, probe.observations
+        self.table = np.zeros((num, self.layout.num_result_columns))
+        self.results = self.layout.results(self.table)
+        rows = -(-num // num_workers)
+        columns = (_NUM_BEFORE + sum(self.actions.parameter_dims), self.layout.num_result_columns)
+        blocks = [
+            _Block(make, reading, name, first, min(rows, num - first), rows, columns) for first in range(0, num, rows)
+        ]
+        self._table_of_actions = np.zeros((len(blocks) * rows, columns[0]))
+        self._shape_of_actions = (len(blocks), rows, columns[0])
+        with _starting():
+            self._vector = AsyncVectorEnv(blocks, copy=False, context="spawn", autoreset_mode=AutoresetMode.DISABLED)
+        self.reset({})  # makes the copies, so that a fault of a constructor is raised here
+
+    def reset(self, seeds: Mapping[int, int | None]) -> None:
+        """Begin episodes; see `Copies.reset`."""
+        with self._explained():
+            table, _ = self._vector.reset(options={"seeds": dict(seeds)})
+        self._keep(table)
+
+    def step(self, rows: list[int], option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> None:
+        """Take a step with some copies; see `Copies.step`."""
+        num = len(discrete)
+        actions = self._table_of_actions
+        actions[:, _IS_STEPPED] = 0.0
+        actions[rows, _IS_STEPPED] = 1.0
+        if option is not None:
+            actions[:num, _OPTION] = option
+        actions[:num, _DISCRETE] = discrete
+        actions[:num, _NUM_BEFORE:] = parameters
+        with self._explained():
+            table = self._vector.step(actions.reshape(self._shape_of_actions))[0]
+        self._keep(table)
+
+    def _keep(self, table: np.ndarray) -> None:
+        self.table[:] = table.reshape(-1, table.shape[-1])[: len(self.table)]
+
+    @contextmanager
+    def _explained(self) -> Iterator[None]:
+        """Raise an error of a worker as it was raised there, and say which worker died."""
+        # Otherwise Gymnasium also warns, with the worker's whole traceback.
+        level, logger.min_level = logger.min_level, _SILENT
+        try:
+            yield
+        except (ProblemError, EnvironmentFaultError, SettingError) as error:
+            self._is_broken = True
+            # Gymnasium makes another error of the same class, whose argument is the worker's.
+            raise (error.args[0] if isinstance(error.args[0], type(error)) else error) from None
+        except (EOFError, OSError) as error:
+            self._is_broken = True
+            raise ProblemError(f"{self._name}: {self._death()}") from error
+        finally:
+            logger.min_level = level
+
+    def _death(self) -> str:
+        workers = self._vector.processes
+        for number, worker in enumerate(workers):
+            worker.join(_PATIENCE_S / len(workers))
+            code = worker.exitcode
+            if code is not None:
+                how = f"exit code {code}" if code >= 0 else f"signal {-code}, {signal.Signals(-code).name}"
+                return f"worker {number} of {len(workers)} died ({how})"
+        return "a worker no longer answers"
+
+    def close(self) -> None:
+        """Close the copies and end the workers."""
+        if self._is_broken:
+            for worker in self._vector.processes:
+                worker.kill()
+                worker.join()
+            self._vector.closed = True  # it would wait for the dead ones
+        else:
+            self._vector.close()
+
+
+@contextmanager
+def _starting() -> Iterator[None]:
+    """Let processes that are started inside the block leave signals and modules to the run's process."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS_OF_THE_RUN)
+    protect_children()
+    try:
+        yield
+    finally:
+        unprotect_children()
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

@@ -1,0 +1,91 @@
+"""Worker processes give what a single process gives, tell faults in one line, and end with the environment."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from gymnasium_players import action, make, step
+
+from hpamdp import keys
+from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import EnvironmentFaultError
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+
+
+def masked(num_workers: int) -> GymnasiumEnv:
+    return GymnasiumEnv(
+        3,
+        entry_point="toy_masked_gymnasium:Masked",
+        kwargs={"form": "dict", "source": "observation"},
+        max_steps=4,
+        seed=5,
+        num_workers=num_workers,
+    )
+
+
+def toys(num_workers: int) -> GymnasiumEnv:
+    return make(3, max_steps=4, seed=5, kwargs={"length": 3, "success": True}, num_workers=num_workers)
+
+
+@pytest.mark.parametrize("maker", [toys, pytest.param(masked, marks=pytest.mark.slow)])
+def test_processes_give_the_same_steps_as_one_process(maker):
+    one, other = maker(0), maker(2)
+    generator = torch.Generator().manual_seed(0)
+    try:
+        for seen, same in ((one.reset(), other.reset()), (one.reset(), other.reset())):
+            assert (seen == same).all()
+        for number in range(9):
+            discrete = torch.randint(2, (3,), generator=generator)
+            parameters = torch.rand(3, sum(one.parameter_dims), generator=generator)
+            td = action(one, discrete, parameters)
+            if one.has_choice:
+                td[keys.OPTION] = torch.randint(3, (3,), generator=generator)
+                td[keys.DISCRETE] = torch.zeros(3, dtype=torch.int64)
+            if number % 3 == 1:
+                td["_step"] = torch.tensor([[True], [False], [True]])
+            after, same = one.step(td.clone())["next"], other.step(td.clone())["next"]
+            assert (after == same).all() and after.keys() == same.keys()
+            if after["done"].any():
+                assert (one.maybe_reset(after) == other.maybe_reset(same)).all()
+    finally:
+        other.close()
+
+
+@pytest.mark.parametrize("where", ["constructor", "step"])
+def test_a_fault_in_a_worker_is_told_as_in_one_process(where, recwarn):
+    if where == "constructor":  # which fails in this process first, where the spaces are read
+        with pytest.raises(EnvironmentFaultError, match="its constructor raised ValueError"):
+            faulty(where)
+        return
+    env = faulty(where)
+    env.reset()
+    with pytest.raises(
+        EnvironmentFaultError, match=r"Faulty: environment [02]: its step raised ValueError: .*line"
+    ) as e:
+        step(env)
+    assert "in fail" in e.value.frames and "\n" not in str(e.value)
+    assert not [warning for warning in recwarn if "Worker" in str(warning.message)]
+    env.close()
+
+
+def faulty(where: str) -> GymnasiumEnv:
+    return GymnasiumEnv(3, entry_point="toy_environments:Faulty", kwargs={"where": where}, max_steps=3, num_workers=2)
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_told_in_one_line():
+    env = GymnasiumEnv(2, entry_point="toy_environments:Killed", max_steps=3, num_workers=2)
+    env.reset()
+    step(env)
+    with pytest.raises(ProblemError, match=r"Killed: worker [01] of 2 died \(signal 9, SIGKILL\)$"):
+        step(env)
+    env.close()
+
+
+@pytest.mark.slow
+def test_there_are_no_more_workers_than_copies_and_they_end_with_the_environment():
+    env = make(2, num_workers=9)
+    workers = env._copies._vector.processes
+    assert len(workers) == 2
+    env.close()
+    assert not any(worker.is_alive() for worker in workers)
