@@ -28,7 +28,7 @@ from hpamdp.config.compose import conf_dir, job_overrides, read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO
-from hpamdp.config.stand_ins import quick_imports
+from hpamdp.config.stand_ins import RealImportsNeededError, quick_imports
 from hpamdp.env.errors import EnvironmentFaultError
 from hpamdp.limits import limit_in
 from hpamdp.messages import (
@@ -291,8 +291,11 @@ def _refuse_early(cfg: DictConfig) -> None:
     """
     if cfg.resume is not None or cfg.mode == "eval":  # the saved run has the config
         return
-    with quick_imports():
-        config = read(cfg)
+    try:
+        with quick_imports():
+            config = read(cfg)
+    except RealImportsNeededError:
+        return
     problem = compatibility.facts_of(config)
     if problem is not None:
         config = compatibility.with_selector(config, problem, job_overrides())

@@ -15,6 +15,7 @@ from hpamdp.files import read_regular
 # Files of a run that others read.
 CHECKPOINT_NAME = "checkpoint.zip"
 POLICY_NAME = "policy.pt"
+BEST_NAME = "best.pt"
 SUMMARY_NAME = "summary.json"
 CONFIG_NAME = "config.yaml"
 METRICS_NAME = "metrics.csv"

@@ -8,12 +8,13 @@ from hpamdp.config.stand_ins import quick_imports
 
 # Facts of classes that the rules of `hpamdp.run.compatibility` read.
 FACTS = ("modes", "needs", "is_bandit", "ends_options", "asks_learners", "value_setting", "guarded_settings")
+FACTS += ("needs_evaluations",)
 
 
 def described(cls: type, group: str) -> dict:
     """Return the settings' defaults and the facts of a class as JSON values."""
     facts = {name: list(value) if isinstance(value := getattr(cls, name, None), tuple) else value for name in FACTS}
-    return {"defaults": defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group])), "facts": facts}
+    return {"defaults": defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS.get(group, ()))), "facts": facts}
 
 
 if __name__ == "__main__":

@@ -10,7 +10,15 @@ from omegaconf import OmegaConf
 from pydantic import Field, PositiveInt
 
 from hpamdp.config import schema
-from hpamdp.config.components import GROUPS, SUPPLIED_ARGUMENTS, component, defaults_of, load_class, settings_model
+from hpamdp.config.components import (
+    CALLBACK,
+    GROUPS,
+    SUPPLIED_ARGUMENTS,
+    component,
+    defaults_of,
+    load_class,
+    settings_model,
+)
 from hpamdp.config.compose import plain, read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import read_saved
@@ -320,16 +328,17 @@ def test_a_yaml_holds_only_what_differs_from_its_class(group, name):
         assert not [setting for setting, value in given.items() if value == defaults[setting]]
 
 
-@pytest.mark.parametrize(("group", "name"), FILES)
+@pytest.mark.parametrize(("group", "name"), [*FILES, *((CALLBACK, name) for name in choices(CALLBACK))])
 def test_every_setting_has_its_meaning_in_the_model(group, name):
     target = yaml.safe_load((CONF / group / f"{name}.yaml").read_text())["_target_"]
     if target is not None:
-        fields = settings_model(load_class(target), SUPPLIED_ARGUMENTS[group]).model_fields
+        fields = settings_model(load_class(target), SUPPLIED_ARGUMENTS.get(group, ())).model_fields
         assert not [setting for setting, field in fields.items() if not field.description]
 
 
 def test_every_group_has_a_folder():
-    assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, "experiment", "search", "recipe"}
+    others = {CALLBACK, "experiment", "search", "recipe"}
+    assert {folder.name for folder in CONF.iterdir() if folder.is_dir()} == {*GROUPS, *others}
 
 
 def test_a_learner_gets_what_it_needs_on_a_problem_and_the_command_line_has_the_last_word():

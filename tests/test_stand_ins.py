@@ -11,9 +11,9 @@ import yaml
 from class_descriptions import described
 from conftest import CONF, choices
 
-from hpamdp.config.components import GROUPS, load_class
+from hpamdp.config.components import CALLBACK, GROUPS, load_class
 
-FILES = [(group, name) for group in GROUPS for name in choices(group)]
+FILES = [(group, name) for group in (*GROUPS, CALLBACK) for name in choices(group)]
 
 
 def target_of(group: str, name: str) -> str | None:

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp import __version__
-from hpamdp.config.components import GROUPS
+from hpamdp.config.components import CALLBACK, GROUPS
 from hpamdp.config.compose import beginning_of, choosing
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO, RunConfig
@@ -168,6 +168,8 @@ def _check_groups(line: CommandLine, conf: Path) -> None:
         is_text = override.is_sweep_override() or isinstance(override.value(), str | QuotedString | None)
         if override.key_or_group in _SAVED_RUNS and not override.is_delete() and not is_text:
             raise ConfigError(f"{override.input_line}: must be a folder; write {as_text(override.input_line or '')}")
+        if override.key_or_group == CALLBACK:
+            raise ConfigError(f"{override.input_line}: a run has a list of callbacks; write callbacks=[NAME, ...]")
         folder = conf / override.key_or_group
         if not os.path.isdir(folder) or override.is_delete():  # unlike `Path.is_dir` for any text
             continue

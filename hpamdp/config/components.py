@@ -14,6 +14,7 @@ from typing import Any, get_type_hints
 from pydantic import BaseModel, ConfigDict, PydanticUserError, create_model
 
 from hpamdp.config.errors import ConfigError, as_json, validated
+from hpamdp.config.stand_ins import check_readable
 from hpamdp.memory import is_about_memory
 from hpamdp.messages import first_line
 from hpamdp.settings import SettingError, Settings
@@ -29,11 +30,14 @@ SUPPLIED_ARGUMENTS: dict[str, tuple[str, ...]] = {
 }
 # The groups of conf/ in which a class is chosen.
 GROUPS = tuple(SUPPLIED_ARGUMENTS)
+# The group of conf/ whose classes are listed in a value of the run, `callbacks`.
+CALLBACK = "callback"
 TARGET = "_target_"
 # Values of a group that the run reads itself. The group's class does not get them.
 RUN_VALUES: dict[str, tuple[str, ...]] = {
     "low": ("budget", "checkpoint", "freeze", "per_option"),
     "env": ("grouping",),
+    CALLBACK: ("name",),
 }
 # The base class that a group's classes must have. If it is a protocol, a class only needs its methods.
 _BASE_CLASSES = {
@@ -43,6 +47,7 @@ _BASE_CLASSES = {
     "data": "hpamdp.data.demonstrations.Demonstrations",
     "logger": "hpamdp.run.loggers.Logger",
     "collector": "hpamdp.run.collection.base.Collection",
+    CALLBACK: "hpamdp.run.callbacks.Callback",
 }
 _CAN_BE_NONE = ("high", "data")
 _STRICT = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False, protected_namespaces=())
@@ -136,7 +141,7 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
         validated(model, settings, f"{group}.", f"setting of none ({file})", f"none, {file}")
         return Component(group, name, None, {})
     cls = _load_target(group, target, file)
-    model = settings_model(cls, SUPPLIED_ARGUMENTS[group])
+    model = settings_model(cls, SUPPLIED_ARGUMENTS.get(group, ()))
     taken = [value for value in (TARGET, *of_run) if value in model.model_fields]
     if taken:
         raise ConfigError(
@@ -178,10 +183,12 @@ def load_class(dotted: str) -> type:
 
     Raises:
         ConfigError: there is no such class.
+        RealImportsNeededError: see `check_readable`.
     """
     module_name, _, name = dotted.rpartition(".")
     if not module_name or not all(part.isidentifier() for part in dotted.split(".")):
         raise ConfigError(f"{dotted}: must be a class, as package.module.Class")
+    check_readable(dotted)
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from hpamdp.config.components import GROUPS, TARGET, file_of
+from hpamdp.config.components import CALLBACK, GROUPS, TARGET, file_of
 from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json, no_such
 from hpamdp.config.schema import Config, RunConfig, check_run, checked_config
 from hpamdp.config.yaml_files import complete_yaml_files
@@ -23,9 +23,10 @@ NESTED = "a yaml file names itself among its defaults, or a value nests too deep
 RECIPE = "recipe"
 _LONGEST_NAME = 200  # letters of a yaml file's name
 _SHOWN = 200  # letters of a command line in an error
+_NAMED_BY_YAML = "a yaml file names the class; give the name of the file"
 # Entries that the learner of a single option cannot have, and the advice in the error.
 _NOT_PER_OPTION = {
-    TARGET: "a yaml file names the class; give the name of the file",
+    TARGET: _NAMED_BY_YAML,
     "budget": "a run has one budget; set total_frames, num_envs, steps_per_batch or eval.every",
     "checkpoint": "a checkpoint fills all learners; set low.checkpoint",
     "freeze": "all learners are frozen or none; set low.freeze",
@@ -115,7 +116,8 @@ def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
         ConfigError: a value is wrong.
     """
     run = check_run(given, names)
-    return checked_config(run, given, names, _learners_of_options(run, names["env"]))
+    learners = _learners_of_options(run, names["env"])
+    return checked_config(run, given, names, learners, listed_callbacks(run.callbacks, run.model_dump()))
 
 
 def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[str, Any]]]:
@@ -136,6 +138,35 @@ def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[
             raise ConfigError(f"{where}={name}: there is no {file_of('low', name)}") from error
         learners[option] = name, {**plain_groups(cfg, run.model_dump(), ["low"])["low"], **given}
     return learners
+
+
+def listed_callbacks(choices: Sequence[Any], run: Mapping[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Return each callback of a list: its name, and its yaml file with the given settings.
+
+    Args:
+        choices: the value `callbacks` of the run.
+        run: values of the run, to which the yaml files may refer.
+
+    Raises:
+        ConfigError: an entry names no yaml file of the searched folders.
+    """
+    callbacks = []
+    for i, choice in enumerate(choices):
+        given = dict(choice) if isinstance(choice, Mapping) else {"name": choice}
+        where = f"callbacks.{i}"
+        name = given.pop("name", None)
+        if not is_name(name):
+            raise ConfigError(f"{where}={as_json(choice)}: must be the name of a callback, or its name and settings")
+        if TARGET in given:
+            raise ConfigError(f"{where}.{TARGET}: {_NAMED_BY_YAML}")
+        try:
+            cfg = compose([f"+{choosing(CALLBACK, name)}"])
+        except MissingChoiceError as error:
+            raise ConfigError(f"{where}={name}: {no_such(f'file in conf/{CALLBACK}', name, error.known)}") from error
+        if TARGET not in (cfg.get(CALLBACK) or {}):
+            raise ConfigError(f"{where}={name}: {file_of(CALLBACK, name)} names no class as {TARGET}")
+        callbacks.append((name, {**plain_groups(cfg, run, [CALLBACK])[CALLBACK], **given}))
+    return callbacks
 
 
 def compose(overrides: list[str]) -> DictConfig:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from hpamdp.config.command_line import CommandLine, choices_in
-from hpamdp.config.components import GROUPS, component
-from hpamdp.config.compose import compose_words, plain
+from hpamdp.config.components import CALLBACK, GROUPS, component
+from hpamdp.config.compose import compose_words, listed_callbacks, plain
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RunConfig
 from hpamdp.config.stand_ins import quick_imports
@@ -78,21 +78,26 @@ def help_page(line: CommandLine, conf: Path) -> str:
 def _explained_choices(line: CommandLine) -> Iterator[str]:
     """Yield the settings of each choice on the command line."""
     groups = [group for group in line.given() if group in GROUPS]
-    if groups:
+    has_callbacks = "callbacks" in line.given()
+    if groups or has_callbacks:
         cfg = compose_words([*(word for word in line.words if not word.startswith("hydra.")), *line.search_path])
-        yield from (_explained_choice(cfg, group) for group in groups)
+        for group in groups:
+            name = str(cfg.hydra.runtime.choices[group])
+            yield _explained_choice(group, name, plain(cfg[group], group), f"{group}.")
+        if has_callbacks:
+            for name, given in listed_callbacks(plain(OmegaConf.masked_copy(cfg, "callbacks"))["callbacks"], {}):
+                yield _explained_choice(CALLBACK, name, given, "")
 
 
-def _explained_choice(cfg: DictConfig, group: str) -> str:
-    name = str(cfg.hydra.runtime.choices[group])
+def _explained_choice(group: str, name: str, given: Mapping[str, Any], prefix: str) -> str:
     try:
         with quick_imports():
-            chosen = component(group, name, plain(cfg[group], group))
+            chosen = component(group, name, given)
     except ConfigError:
         return ""
     if chosen.as_model is None:
         return f"{group}={name} has the settings {', '.join(chosen.settings) or 'of its class alone: none'}\n\n"
-    lines = _explained(type(chosen.as_model), f"{group}.", dict(chosen.settings))
+    lines = _explained(type(chosen.as_model), prefix, dict(chosen.settings))
     return "\n".join([f"Settings of {group}={name}", *lines, "", ""])
 
 

@@ -17,7 +17,7 @@ from hpamdp.settings import Settings
 
 _CHOICES = "choices"
 # Values of the run that earlier versions did not save, with the defaults of the time.
-_BEFORE = {"film": True, "compile_updates": False, "update_precision": "float32"}
+_BEFORE = {"film": True, "callbacks": [], "save_best": False, "compile_updates": False, "update_precision": "float32"}
 _RUN_GROUPS: dict[str, type[Settings]] = {"agent": AgentConfig, "env": EnvConfig}
 
 
@@ -91,7 +91,10 @@ def _with_new_names(choice: Any) -> Any:
 
 def needs_trust(config: Config) -> bool:
     """Return whether continuing a run of this config may need `trust=true`, because a guarded setting is not null."""
-    parts = [getattr(config, group) for group in GROUPS if group != "data"] + [*config.low_of.values()]
+    parts = [getattr(config, group) for group in GROUPS if group != "data"] + [
+        *config.low_of.values(),
+        *config.callbacks,
+    ]
     settings = [(part, name, value) for part in parts for name, value in part.settings.items()]
     return any(value is not None and part.is_guarded(name, value) for part, name, value in settings)
 
@@ -111,6 +114,12 @@ def _guarded(
         for name, value in choice.items() if isinstance(choice, Mapping) else ():
             if low.is_guarded(name, value):
                 found[f"low.per_option.{option}.{name}"] = value
+    if "callbacks" not in given and any(
+        callback.is_guarded(name, value)
+        for callback, choice in zip(config.callbacks, saved["callbacks"], strict=True)
+        for name, value in (choice.items() if isinstance(choice, Mapping) else ())
+    ):
+        found["callbacks"] = saved["callbacks"]
     return found
 
 

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
 from pydantic import AfterValidator, Field, NonNegativeInt, PositiveInt
 
-from hpamdp.config.components import GROUPS, TARGET, Component, check_base_class, component, file_of
+from hpamdp.config.components import CALLBACK, GROUPS, TARGET, Component, check_base_class, component, file_of
 from hpamdp.config.errors import ConfigError, as_json, validated
-from hpamdp.settings import Settings
+from hpamdp.settings import FromList, Settings
 
 if TYPE_CHECKING:
     import torch  # takes seconds
@@ -144,6 +144,10 @@ class RunConfig(Settings):
     """
     overwrite: bool = False
     """Delete another run in the output folder, right before this one writes its first file."""
+    callbacks: Annotated[tuple[str | dict[str, Any], ...], FromList] = ()
+    """Callbacks of training, in their order: `[NAME, {name: NAME, SETTING: VALUE, ...}, ...]`."""
+    save_best: bool = False
+    """Keep the agent of the best evaluation in best.pt."""
     film: bool = True
     """Write episodes.gif, which shows three episodes of the agent's last evaluation."""
 
@@ -187,6 +191,7 @@ class Config:
     logger: Component
     collector: Component
     low_of: Mapping[str, Component] = field(default_factory=dict)
+    callbacks: tuple[Component, ...] = ()
 
     @property
     def learners(self) -> list[Component]:
@@ -236,7 +241,11 @@ def check_run(given: Mapping[str, Any], names: Mapping[str, str]) -> RunConfig:
 
 
 def checked_config(
-    run: RunConfig, given: Mapping[str, Any], names: Mapping[str, str], learners: Mapping[str, tuple[str, Any]]
+    run: RunConfig,
+    given: Mapping[str, Any],
+    names: Mapping[str, str],
+    learners: Mapping[str, tuple[str, Any]],
+    callbacks: Sequence[tuple[str, Any]],
 ) -> Config:
     """Check the classes and the settings of all groups.
 
@@ -245,6 +254,7 @@ def checked_config(
         given: a mapping of `_target_` and the settings for each group. Text in it is not resolved.
         names: the name that was chosen for each group.
         learners: for single options, by the option's name: the learner's name, and a mapping as for a group.
+        callbacks: the name of each callback, and a mapping as for a group.
 
     Raises:
         ConfigError: a wrong value.
@@ -256,8 +266,15 @@ def checked_config(
     for option, (name, low) in learners.items():
         check_base_class("low", name, low.get(TARGET))
         low_of[option] = component("low", name, low, f"low.per_option.{option}.")
+    called = []
+    for i, (name, callback) in enumerate(callbacks):
+        check_base_class(CALLBACK, name, callback.get(TARGET))
+        called.append(component(CALLBACK, name, callback, f"callbacks.{i}."))
+    # With all their settings, so that a saved run keeps them if their yaml files change.
+    if called:
+        in_full_list = tuple({"name": each.name, **each.settings} for each in called)
+        run = run.model_copy(update={"callbacks": in_full_list})
     if low_of:
-        # With all their settings, so that a saved run keeps them if their yaml files change.
         in_full = {option: {**low.settings, "name": low.name} for option, low in low_of.items()}
         run = run.model_copy(update={"low": run.low.model_copy(update={"per_option": in_full})})
-    return Config(run, **components, low_of=low_of)
+    return Config(run, **components, low_of=low_of, callbacks=tuple(called))

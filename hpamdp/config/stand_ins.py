@@ -41,9 +41,23 @@ _PACKAGE = __name__.partition(".")[0]
 _modules: dict[str, ModuleType] = {}
 
 
+class RealImportsNeededError(Exception):
+    """Raised if a class of another package is needed where stand-ins replace the slow libraries."""
+
+
 def is_readable(dotted: str) -> bool:
     """Return whether a class may be imported with stand-ins: only this package is written for them."""
     return dotted.partition(".")[0] == _PACKAGE
+
+
+def check_readable(dotted: str) -> None:
+    """Refuse to import another package's class with stand-ins.
+
+    Raises:
+        RealImportsNeededError: the class needs the real libraries.
+    """
+    if not is_readable(dotted) and any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        raise RealImportsNeededError(dotted)
 
 
 @contextmanager

@@ -12,7 +12,15 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import DictConfig, Node, OmegaConf
 
-from hpamdp.config.components import GROUPS, SUPPLIED_ARGUMENTS, TARGET, defaults_of, load_class, settings_model
+from hpamdp.config.components import (
+    CALLBACK,
+    GROUPS,
+    SUPPLIED_ARGUMENTS,
+    TARGET,
+    defaults_of,
+    load_class,
+    settings_model,
+)
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RunConfig
 from hpamdp.config.stand_ins import is_readable, quick_imports
@@ -48,12 +56,12 @@ def _defaults(config_path: str, cfg: DictConfig) -> dict[str, Any]:
     if config_path.removesuffix(".yaml") == "config":
         return defaults_of(RunConfig)
     group = config_path.partition("/")[0]
-    target = cfg._get_node(TARGET) if group in GROUPS else None  # as it is written, not resolved
+    target = cfg._get_node(TARGET) if group in (*GROUPS, CALLBACK) else None  # as it is written, not resolved
     if not isinstance(target, Node) or not isinstance(target._value(), str):
         return {}
     try:
         with quick_imports() if is_readable(target._value()) else nullcontext():
-            return defaults_of(settings_model(load_class(target._value()), SUPPLIED_ARGUMENTS[group]))
+            return defaults_of(settings_model(load_class(target._value()), SUPPLIED_ARGUMENTS.get(group, ())))
     except ConfigError:  # which the check of the config raises again, with the name of the file
         return {}
 

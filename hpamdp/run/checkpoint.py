@@ -68,6 +68,8 @@ _CUDA_STATE_BYTES = 16
 _RENAMED = {"optimiser": "optimizer"}
 # Parts of a run that a checkpoint holds beside the agent.
 STATES = ("collection", "recorder")
+# The same, missing in checkpoints of earlier versions.
+_NEWER_STATES = ("callbacks",)
 # Errors that damaged bytes of a file can raise.
 _DAMAGE = (
     zipfile.BadZipFile,
@@ -264,7 +266,7 @@ def load(
             for name in opened.names & {*buffers}:
                 replays[name] = opened.replay(name, buffers[name], agent, steps)
         with _explained(f"{file}: damaged, or not a checkpoint of this program"):
-            for name in STATES if with_training else STATES[:1]:
+            for name in (*STATES, *_NEWER_STATES) if with_training else STATES[:1]:
                 if name in opened.names:
                     states[name] = _strings(opened.filled(name, device))
             generators = Generators.of(opened.filled("rng")) if with_training else None

@@ -132,6 +132,16 @@ def stop_score_needs_evaluations(config: Config) -> str | None:
     return f"eval.stop_score={run.eval.stop_score}: needs evaluations during training; set {every} above 0"
 
 
+def callbacks_have_evaluations(config: Config) -> str | None:
+    """Require evaluations during training if a callback counts them."""
+    run = config.run
+    if run.mode == "eval" or run.eval_every > 0:
+        return None
+    every = "offline.eval_every" if run.mode == "offline" else "eval.every"
+    counting = [str(each) for each in config.callbacks if getattr(each.cls, "needs_evaluations", False)]
+    return f"{counting[0]}: needs evaluations during training; set {every} above 0" if counting else None
+
+
 # Rules about the data that the agent learns from.
 
 
@@ -332,6 +342,7 @@ RULES: tuple[Rule, ...] = (
     option_length_goes_with_steps,
     saved_runs_are_named,
     stop_score_needs_evaluations,
+    callbacks_have_evaluations,
     offline_runs_have_data,
     levels_support_the_mode,
     n_step_fits_a_batch,

@@ -21,6 +21,7 @@ _BOOKKEEPING = (
     "trust",
     "overwrite",
     "film",
+    "save_best",
     "logger",
     "checkpoint_every",
     "checkpoint_minutes",

@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 from hpamdp.config.errors import ConfigError
 from hpamdp.files import read_regular, remove_link, replacing
 from hpamdp.run_files import (
+    BEST_NAME,
     CHECKPOINT_NAME,
     CONFIG_NAME,
     DIVERGED_NAME,
@@ -34,7 +35,7 @@ from hpamdp.run_files import (
 from hpamdp.shell import path_setting
 
 # Each of these files marks the folder of a run.
-_MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME)
+_MARKS = (SUMMARY_NAME, CHECKPOINT_NAME, POLICY_NAME, BEST_NAME)
 _OTHERS = (
     METRICS_NAME,
     f"{METRICS_NAME}.previous",
@@ -113,7 +114,7 @@ def check_no_training(folder: Path) -> None:
     Raises:
         ConfigError: the folder holds a training run.
     """
-    names = (CHECKPOINT_NAME, POLICY_NAME, METRICS_NAME)
+    names = (CHECKPOINT_NAME, POLICY_NAME, BEST_NAME, METRICS_NAME)
     if any((folder / name).exists() for name in names) or saved_config(folder).get("mode", "eval") != "eval":
         raise ConfigError(
             f"{folder}: holds the record of a training, which an evaluation never changes; take another hydra.run.dir"

@@ -62,6 +62,7 @@ class Recorder:
         self._scalars: dict[str, float] = {}
         # The last evaluation; None once the agent has learned since.
         self._played: dict[str, np.ndarray] | None = None
+        self._own: Mapping[str, float] = {}  # the last metrics of callbacks
         self._held: dict[str, float] = {}  # scores with each option held, at the last evaluation
         random = random_agent(parts.agent.specs, parts.device)
         self._random = parts.evaluation.measure(parts.evaluation.run(random.policy))
@@ -137,12 +138,24 @@ class Recorder:
         """Drop the last evaluation, because the agent may have changed."""
         self._played = None
 
-    def log(self, frames: int, wall_s: float, is_evaluated: bool, *, is_stopped: bool = False) -> dict[str, float]:
+    def log(
+        self,
+        frames: int,
+        wall_s: float,
+        is_evaluated: bool,
+        *,
+        own: Mapping[str, float] | None = None,
+        is_stopped: bool = False,
+    ) -> dict[str, float]:
         """Write a row of metrics, with an evaluation if `is_evaluated`, and return it.
 
-        A row with `is_stopped` is the last row of a stopped run. The run that continues it leaves the row out.
+        `own` are the metrics of callbacks; the summary repeats the last ones. A row with `is_stopped` is the last row
+        of a stopped run. The run that continues it leaves the row out.
         """
         row = {FRAMES: float(frames), WALL_SECONDS: wall_s, **self._training_scores(), **self._scalars}
+        if own is not None:
+            row |= own
+            self._own = own
         if is_stopped:
             row[STOPPED] = 1.0
         if is_evaluated:
@@ -175,6 +188,7 @@ class Recorder:
         effort = {"frames": frames, "wall_s": wall_s, "cpu_s": cpu_s}
         env = self.parts.evaluation.problem
         summary = summarise(self.config, env, measured, self._random, effort, is_finished=is_finished)
+        summary |= self._own
         if self.config.run.mode != "eval":
             summary[WITHOUT_UPDATE] = self.parts.agent.without_update()
             summary[SHORT_SIGHT] = short_sight(self.config.learners, measured["steps"])

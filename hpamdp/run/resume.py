@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.config.components import GROUPS
 from hpamdp.config.compose import RECIPE, chosen_names, plain, read
@@ -27,6 +27,8 @@ _AGENT = ("high", "low", "agent", "experiment", "search", RECIPE)
 _BEGIN = ("mode", "resume", "checkpoint", "overwrite", "trust")
 # Groups that an evaluation does not take from the saved run: it collects no steps and logs where the command line says.
 _NOT_EVALUATED = ("data", "logger", "collector")
+# Values that matter in training only, likewise.
+_OF_TRAINING = ("callbacks", "save_best")
 
 
 def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | None]:
@@ -56,7 +58,7 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
         )
     values = {name: cfg[name] for name in _BEGIN}
     if config.run.mode == "eval":
-        values |= {group: _plain_value(cfg, group) for group in _NOT_EVALUATED}
+        values |= {name: _plain_value(cfg, name) for name in (*_NOT_EVALUATED, *_OF_TRAINING)}
     changed = map(_name, _changes(overrides, saved, file, where))
     values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
@@ -65,6 +67,8 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
 
 def _plain_value(cfg: DictConfig, name: str) -> Any:
     value = OmegaConf.select(cfg, name)
+    if isinstance(value, ListConfig):
+        return OmegaConf.to_container(value, resolve=True)
     return plain(value, name) if isinstance(value, DictConfig) else value
 
 

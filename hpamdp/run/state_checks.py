@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
 
@@ -167,6 +168,22 @@ def check_like(where: str, saved: Any, own: Any) -> None:
             check_like(f"{where}.{name}", value, own[name])
     elif type(saved) is not type(own):
         raise ValueError(f"{where} is {type(saved).__name__}, but must be {type(own).__name__}")
+
+
+def check_numbers(where: str, saved: Any, own: Any) -> None:
+    """Refuse nested tensors and numbers whose names or types differ from `own`, and NaN. Sizes of tensors may differ.
+
+    Raises:
+        ValueError: the values are refused; the message names the first one.
+    """
+    if isinstance(own, Mapping):
+        for name, value in check_names(saved, own).items():
+            check_numbers(f"{where}.{name}", value, own[name])
+    elif isinstance(own, Tensor):
+        check_form(where, saved, own, any_size=True)
+        check_values(where, saved, own)
+    elif not isinstance(saved, int | float) or math.isnan(saved):
+        raise ValueError(f"{where} is {saved!r:.40}, but must be a number")
 
 
 def check_names(saved: object, own: Mapping[str, Any]) -> Mapping[str, Any]:

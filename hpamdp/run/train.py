@@ -26,13 +26,13 @@ from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun, assemble
-from hpamdp.run.callbacks import Callback
+from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of, mistakes_explained, named, states_of
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import Collection, CollectionError
 from hpamdp.run.folder import check_no_link, check_no_training, check_unused, mark_unfinished, moved_aside
 from hpamdp.run.recorder import Recorder
 from hpamdp.run.resume import check_saved_options, resolve
-from hpamdp.run.state_checks import example_steps
+from hpamdp.run.state_checks import check_numbers, example_steps
 from hpamdp.run.stopping import ProgramExitError, StopRequest, exits_explained, signals_ignored, stop_on_signals
 from hpamdp.run_files import CONFIG_NAME, DIVERGED_NAME, POLICY_NAME, TENSORBOARD_NAME, WANDB_NAME
 from hpamdp.shell import path_setting, program
@@ -59,7 +59,8 @@ def run(
     - 0: the run reached its end.
     - 130: a signal stopped the run, and it was saved.
     - 3: a reward, a loss or a weight was not finite. The last good checkpoint is kept.
-    - 1: a worker process died or could not start, or third-party code called `sys.exit`. The agent was saved.
+    - 1: a worker process died or could not start, third-party code called `sys.exit`, or a callback returned a value
+      that cannot be recorded. The agent was saved.
 
     Args:
         cfg: the composed config.
@@ -114,7 +115,7 @@ def begin(
         output_dir: folder of the run, created if it is missing. If None, the run writes nothing.
         overrides: the command line's words, which change a resumed run's config.
         may_overwrite: whether the results of a run in the folder may be overwritten, as with `overwrite=true`.
-        callbacks: called during training.
+        callbacks: called during training, after the callbacks that the config lists.
 
     Raises:
         ConfigError: a value or a path is wrong, or values do not go together.
@@ -132,13 +133,29 @@ def begin(
     torch.manual_seed(config.run.seed)
     parts = assemble(config)
     check_saved_options(config, parts.env.base_env)
-    trainer = Trainer(config, parts, output_dir, callbacks)
+    trainer = Trainer(config, parts, output_dir, _all_callbacks(config, callbacks) if is_training else ())
     if source is not None:
         trainer.restore(source)
         if is_training:
             check_more(overrides, trainer.frames, config.run.num_frames)
     trainer.start(is_own=is_own)
     return trainer
+
+
+def _all_callbacks(config: Config, given: Sequence[Callback]) -> list[Callback]:
+    """Build the callbacks of a config, and return them before the given ones.
+
+    Raises:
+        ConfigError: a given object is no callback.
+    """
+    for each in given:
+        if not isinstance(each, Callback):
+            what = f"{each.__name__}, a class" if isinstance(each, type) else type(each).__name__
+            raise ConfigError(f"callbacks: must be objects of subclasses of Callback, not {what}")
+    callbacks = [*(chosen.build() for chosen in config.callbacks), *given]
+    if config.run.save_best and not any(isinstance(each, BestAgent) for each in callbacks):
+        callbacks.insert(0, BestAgent())
+    return callbacks
 
 
 def _is_in(source: Path | None, folder: Path | None) -> bool:
@@ -155,12 +172,14 @@ def _run_to_the_end(trainer: Trainer, output_dir: Path, tell: Callable[[str], No
         except DivergedError as error:
             tell(f"{error} at frame {trainer.frames:,}: training stopped; {trainer.keep_for_inspection()}")
             return DIVERGED
-        except CollectionError as error:
+        except (CollectionError, CallbackError) as error:
             has_learned = (output_dir / checkpoint.FILE_NAME).is_file()
             saved = f"to go on: {_resuming(config, output_dir)}" if has_learned else "nothing was learned"
             tell(f"{error} at frame {trainer.frames:,}; {saved}")
             return FAILED
     say(trainer.finish(is_finished=not is_interrupted))
+    if trainer.stop_reason and not is_interrupted:
+        say(f"Training ended at {trainer.frames:,}{trainer.unit}: {trainer.stop_reason}")
     say(f"Everything is in {output_dir}")
     if is_interrupted:
         say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: {_resuming(config, output_dir)}")
@@ -189,6 +208,8 @@ class Trainer:
         frames: frames so far.
         wall_s, cpu_s: wall time and CPU time of training so far.
         last_score: score of the last evaluation; None before the first one.
+        stop_reason: why a callback has ended training; empty if none has, or if it gave no reason.
+        resumed_from: folder of the run that is continued, if any.
         shows_progress: whether a bar on stderr shows the progress.
     """
 
@@ -204,9 +225,12 @@ class Trainer:
         self.config = config
         self.parts = parts
         self.output_dir = output_dir
-        self.callbacks = list(callbacks)
+        self.callbacks = named(callbacks)
+        self._states_of_callbacks = states_of(self.callbacks)
         self.recorder = Recorder(config, parts, output_dir)
         self._is_stopped = False
+        self.stop_reason = ""
+        self.resumed_from: Path | None = None
         self.frames = 0
         self.wall_s = 0.0
         self.cpu_s = 0.0
@@ -232,12 +256,28 @@ class Trainer:
         if not is_training:
             saved.set_statistics(env)
             return
+        self.resumed_from = source.parent
         self.recorder.resume_from(source.parent, self.frames)
         try:
             self.recorder.set_state(saved.states["recorder"])
+            self._restore_callbacks(saved.states.get("callbacks", {}))
         except ValueError as error:
             raise ConfigError(f"{source}: does not fit this run ({first_line(error)})") from error
         self._saved = saved
+
+    def _restore_callbacks(self, states: Mapping[str, Any]) -> None:
+        """Set the saved states of callbacks. A callback without a saved state starts anew.
+
+        Raises:
+            ValueError: a state is of another callback, or holds invalid numbers.
+        """
+        for name, callback in self.callbacks.items():
+            if name in states:
+                check_numbers(name, states[name], self._states_of_callbacks[name])
+                callback.set_state(states[name])
+        dropped = [name for name, state in states.items() if state and name not in self.callbacks]
+        if dropped:
+            warn(f"the checkpoint holds the state of {', '.join(dropped)}, but this run has no such callback")
 
     def start(self, *, is_own: bool) -> None:
         """Write the config and start the logger, if the run has a folder.
@@ -266,9 +306,14 @@ class Trainer:
         with replacing(folder / CONFIG_NAME) as partial:
             partial.write_text(self.config.to_yaml())
 
-    def stop(self) -> None:
-        """End training after the current batch. The run counts as finished."""
+    def stop(self, reason: str = "") -> None:
+        """End training after the current batch. The run counts as finished.
+
+        Args:
+            reason: shown after the closing table.
+        """
         self._is_stopped = True
+        self.stop_reason = reason
 
     def finish(self, *, is_finished: bool = True) -> str:
         """Evaluate the agent, write what the run has found, and return the closing table as text.
@@ -287,6 +332,7 @@ class Trainer:
 
         Raises:
             DivergedError: a reward, a loss or a weight is not finite. Nothing has been saved since.
+            CallbackError: a callback returned a value that cannot be recorded. The agent has been saved.
         """
         with stop_on_signals() as request:
             collection: Collection = self.config.collector.build(
@@ -297,16 +343,25 @@ class Trainer:
                 self._loop(collection, request)
             except KeyboardInterrupt:  # the second signal, perhaps in the middle of an update
                 self.recorder.forget_evaluation()
+            except CallbackError:
+                self._save_and_close(collection)
+                raise
             except (DivergedError, ConfigError):
                 collection.close()
                 raise
             except BaseException:  # such as a dead worker; the agent is saved before the run fails
                 self._save_and_close(collection)
                 raise
-            for callback in self.callbacks:
-                callback.on_end(self)
-            self._save_and_close(collection)
+            try:
+                self._call(lambda callback: callback.on_end(self))
+            finally:
+                self._save_and_close(collection)
             return not self._is_over()
+
+    def _call(self, act: Callable[[Callback], None]) -> None:
+        for name, callback in self.callbacks.items():
+            with mistakes_explained(name):
+                act(callback)
 
     def _save_and_close(self, collection: Collection) -> None:
         """Save first, uninterrupted and without any output, then close the collection."""
@@ -352,6 +407,7 @@ class Trainer:
             assert isinstance(learner, Learner)
             learner.while_compiling = partial(_said_by, bar, "compiling the updates")
         with bar:
+            self._call(lambda callback: callback.on_start(self))
             if self.last_score is None and self.frames == 0:
                 self._evaluate(bar)
                 if self.parts.data is not None:
@@ -365,12 +421,12 @@ class Trainer:
                 self.frames += num
                 take_time()
                 bar.update(num)
-                for callback in self.callbacks:
-                    callback.on_batch(self)
-                if self.frames >= run.num_frames or _is_due(last, self.frames, run.eval_every):
+                self._call(lambda callback: callback.on_batch(self))
+                if self._is_over() or _is_due(last, self.frames, run.eval_every):
                     self._evaluate(bar)
                 elif _is_due(last, self.frames, run.log_every):
-                    self.recorder.log(self.frames, self.wall_s, is_evaluated=False)
+                    own = metrics_of(self.callbacks, self)
+                    self.recorder.log(self.frames, self.wall_s, is_evaluated=False, own=own)
                 is_time = run.checkpoint_minutes > 0.0 and time.monotonic() - saved_at > 60.0 * run.checkpoint_minutes
                 if not self._is_over() and (is_time or _is_due(last, self.frames, run.checkpoint_every)):
                     self.save(collection)
@@ -404,15 +460,30 @@ class Trainer:
         return self._is_stopped or is_reached or self.frames >= self.config.run.num_frames
 
     def _evaluate(self, bar: tqdm) -> None:
-        row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True)
+        own = metrics_of(self.callbacks, self)
+        row = self.recorder.log(self.frames, self.wall_s, is_evaluated=True, own=own)
         success = f", success {row['eval/success']:.1%}" if "eval/success" in row else ""
         self.last_score = row["eval/score"]
         bar.set_postfix_str(f"score {self.last_score:.2f}{success}")
-        for callback in self.callbacks:
-            callback.on_evaluation(self, row)
+        self._call(lambda callback: callback.on_evaluation(self, row))
 
     def save(self, collection: Collection) -> None:
         """Write the checkpoint and the file with only the networks, if the run has a folder.
+
+        Raises:
+            DivergedError: a weight is not finite, or another number is NaN.
+            CallbackError: a callback has a state that cannot be saved. Everything else is saved.
+        """
+        self.check_weights()
+        if self.output_dir is None:
+            return
+        try:
+            self._states_of_callbacks = states_of(self.callbacks)
+        finally:  # an error in a callback's code costs no training
+            self._write_checkpoint(self.output_dir, collection)
+
+    def check_weights(self) -> None:
+        """Check the numbers of the agent.
 
         Raises:
             DivergedError: a weight is not finite, or another number is NaN.
@@ -423,18 +494,27 @@ class Trainer:
         for name, value in self.parts.agent.state_dict().items():
             if isinstance(value, torch.Tensor) and value.is_floating_point() and value.isnan().any():
                 raise DivergedError(f"{name} is NaN")
-        if self.output_dir is None:
-            return
-        progress = self.progress()
-        file = self.output_dir / checkpoint.FILE_NAME
+
+    def _write_checkpoint(self, folder: Path, collection: Collection) -> None:
         with_replay = self.config.run.checkpoint_replay
-        states = {"collection": collection.state(), "recorder": self.recorder.state()}
-        checkpoint.save(file, self.parts.agent, states, progress, with_replay=with_replay)
-        self.save_policy(self.output_dir / POLICY_NAME)
+        states = {
+            "collection": collection.state(),
+            "recorder": self.recorder.state(),
+            "callbacks": self._states_of_callbacks,
+        }
+        file = folder / checkpoint.FILE_NAME
+        checkpoint.save(file, self.parts.agent, states, self.progress(), with_replay=with_replay)
+        self.save_policy(folder / POLICY_NAME)
 
     def save_policy(self, file: Path) -> None:
         """Write the networks, and the scale of the observations, to a file that `hpamdp.load` reads."""
         checkpoint.save_policy(file, self.parts.agent, self.parts.env.base_env, self.progress())
+
+    def load_policy(self, file: Path) -> None:
+        """Give the agent the networks, and the environment the scale of the observations, from such a file."""
+        saved = checkpoint.load(file, self.parts.agent, self.parts.device, with_training=False)
+        saved.set_statistics(self.parts.env.base_env)
+        self.recorder.forget_evaluation()
 
     def keep_for_inspection(self) -> str:
         """Save the current agent beside the last good checkpoint, and return a message about both files."""

@@ -1,0 +1,454 @@
+"""Callbacks stop training, keep the best agent and add metrics; a resumed run continues them."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import json
+import math
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import compose_config, make_config
+from hydra.core.hydra_config import HydraConfig
+from toy_callbacks import Faulty
+
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import read_saved
+from hpamdp.config.schema import Config
+from hpamdp.run import checkpoint
+from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, OwnMetrics, Patience, TimeLimit
+from hpamdp.run.continuation import rest_of
+from hpamdp.run.evaluate import Evaluation
+from hpamdp.run.players import load_player
+from hpamdp.run.recorder import Recorder
+from hpamdp.run.train import Trainer, begin, run
+
+SMALL = ["num_envs=8", "steps_per_batch=4", "total_frames=320", "eval.layouts=4", "eval.every=32", "low=random"]
+PLATFORM = [*SMALL[:-1], "env=platform", "high=none", "low=hppo", "low.minibatch_size=8", "low.hidden_dims=[8]"]
+
+
+def start(folder: Path, *words: str) -> int:
+    return run(compose_config([*SMALL, *words]), folder, list(words))
+
+
+def train(*callbacks: Callback, words: list[str] = SMALL, folder: Path | None = None) -> Trainer:
+    trainer = begin(make_config(words), None, folder, callbacks=callbacks)
+    trainer.shows_progress = False
+    trainer.train()
+    return trainer
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "metrics.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def tensors_in(policy: Path) -> dict[str, torch.Tensor]:
+    networks = torch.load(policy, weights_only=True)["agent"]
+    return {name: value for name, value in networks.items() if isinstance(value, torch.Tensor)}
+
+
+@pytest.fixture(autouse=True)
+def own_files(monkeypatch) -> None:
+    """Have the job that is said to run search tests/conf, too."""
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", compose_config([]))
+
+
+@pytest.fixture
+def scores(monkeypatch) -> list[float]:
+    """Scores of the evaluations of one run, which a test fills."""
+    given: list[float] = []
+    measure, numbers = Evaluation.measure, itertools.count()
+
+    def of_the_list(*arguments):
+        number = next(numbers) - 1  # the first are random actions
+        return measure(*arguments) | ({"score": given[number]} if 0 <= number < len(given) else {})
+
+    monkeypatch.setattr(Evaluation, "measure", of_the_list)
+    return given
+
+
+def test_patience_ends_a_run_after_evaluations_without_an_improvement_that_is_large_enough(scores):
+    scores += [0.0, 1.0, 1.4, 1.5, 1.9, 1.9, 1.9, 9.0]
+    trainer = train(Patience(evaluations=3, min_improvement=0.5))
+    assert (trainer.frames, trainer.last_score) == (192, 1.9)
+    assert trainer.stop_reason == "3 evaluations without an improvement"
+
+
+def test_an_equal_score_is_no_improvement(scores):
+    scores += [0.0, 0.0, 0.0, 9.0]
+    assert train(Patience(evaluations=2)).frames == 64
+
+
+def test_a_time_limit_counts_the_time_before_a_resumption_and_is_followed_by_an_evaluation(tmp_path):
+    assert start(tmp_path / "a", "eval.every=0", "total_frames=64") == 0
+    wall_s = json.loads((tmp_path / "a/summary.json").read_text())["wall_s"]
+    words = [
+        f"resume={tmp_path / 'a'}",
+        "total_frames=6400000",
+        f"callbacks=[{{name:time_limit,minutes:{wall_s / 60}}}]",
+    ]
+    assert run(compose_config(words), tmp_path / "b", words) == 0
+    assert json.loads((tmp_path / "b/summary.json").read_text())["frames"] == 64
+    words[-1] = f"callbacks=[{{name:time_limit,minutes:{(wall_s + 0.2) / 60}}}]"
+    assert run(compose_config(words), tmp_path / "c", words) == 0
+    last = rows_of(tmp_path / "c")[-1]
+    assert 64 < float(last["frames"]) < 6400000 and last["eval/score"]
+    assert wall_s + 0.2 <= float(last["wall_s"]) < wall_s + 2.0
+
+
+def test_the_best_agent_is_kept_and_can_be_scored_and_watched(scores, tmp_path):
+    scores += [0.0, 3.0, 7.0, 2.0, 7.0, 1.0]
+    words = [*PLATFORM, "total_frames=160", "save_best=true"]
+    assert run(compose_config(words), tmp_path / "run", words) == 0
+    best = checkpoint.progress_of(tmp_path / "run/best.pt")
+    assert (best["frames"], best["last_score"]) == (64, 7.0)
+    kept, last = (tensors_in(tmp_path / f"run/{name}.pt") for name in ("best", "policy"))
+    assert not all(torch.equal(value, last[name]) for name, value in kept.items())
+    player = load_player(str(tmp_path / "run/best.pt"), [])
+    assert all(torch.equal(value, player.agent.state_dict()[name]) for name, value in kept.items())
+    words = ["mode=eval", f"checkpoint={tmp_path / 'run/best.pt'}"]
+    assert run(compose_config(words), tmp_path / "eval", words) == 0
+    assert json.loads((tmp_path / "eval/summary.json").read_text())["frames"] == 64
+
+
+def test_the_best_agent_stays_in_memory_if_the_run_has_no_folder(scores):
+    scores += [0.0, 3.0, 1.0, 2.0]
+    best, weights = BestAgent(), []
+
+    class Weights(Callback):
+        def on_evaluation(self, trainer, row):
+            weights.append([weight.clone() for weight in trainer.parts.agent.parameters()])
+
+    trainer = train(best, Weights(), words=[*PLATFORM, "total_frames=96"])
+    assert best.best_score == 3.0
+    assert not all(map(torch.equal, trainer.parts.agent.parameters(), weights[1]))
+    best.restore(trainer)
+    assert all(map(torch.equal, trainer.parts.agent.parameters(), weights[1]))
+
+
+def test_a_best_agent_before_any_evaluation_cannot_be_restored():
+    with pytest.raises(RuntimeError, match="there was no evaluation yet"):
+        BestAgent().restore(begin(make_config(SMALL)))
+
+
+def test_a_callback_may_be_used_for_another_run(scores):
+    scores += [9.0, 0.0, 0.0, *itertools.repeat(1.0, 3)]
+    patience, best = Patience(evaluations=2), BestAgent()
+    assert (train(patience, best).frames, best.best_score) == (64, 9.0)
+    assert (train(patience, best, words=[*SMALL, "total_frames=32"]).frames, best.best_score) == (32, 1.0)
+
+
+def test_metrics_of_ones_own_are_columns_of_every_row_and_part_of_the_summary(tmp_path):
+    folder = tmp_path / "run"
+    own = OwnMetrics(lambda trainer: {"frames": trainer.frames, "tensor": torch.tensor(2), "flag": True})
+    trainer = train(own, words=[*SMALL, "log_every=32", "eval.every=64", "total_frames=128"], folder=folder)
+    trainer.finish()
+    rows = rows_of(folder)
+    assert [(row["own/frames"], row["own/tensor"], row["own/flag"]) for row in rows] == [
+        (row["frames"], "2.0", "1.0") for row in rows
+    ]
+    assert [row["frames"] for row in rows] == ["0.0", "32.0", "64.0", "96.0", "128.0"]
+    assert json.loads((folder / "summary.json").read_text())["own/frames"] == 128.0
+
+
+@pytest.mark.parametrize(
+    ("returned", "complaint"),
+    [
+        ({"x": math.nan}, "OwnMetrics.metrics: x=nan: must be a finite number"),
+        ({"x": "3"}, "OwnMetrics.metrics: x='3': must be a finite number"),
+        ({"x": torch.zeros(2)}, "OwnMetrics.metrics: x=tensor([0., 0.]): must be a finite number"),
+        ({"x": None}, "OwnMetrics.metrics: x=None: must be a finite number"),
+        ({"a\nb": 1.0}, "the name must be a text in one line"),
+        (3.0, "OwnMetrics.metrics: must return numbers by their names, not float"),
+    ],
+)
+def test_a_metric_that_is_no_number_is_told_in_one_line_after_training_was_saved(returned, complaint, tmp_path):
+    own = OwnMetrics(lambda trainer: returned if trainer.frames == 64 else {})
+    with pytest.raises(CallbackError) as error:
+        train(own, folder=tmp_path / "run")
+    assert complaint in str(error.value)
+    assert checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] == 64
+
+
+def test_two_metrics_of_one_name_are_refused():
+    with pytest.raises(CallbackError, match=r"OwnMetrics_2.metrics: x=2: another callback has a metric of this name"):
+        train(OwnMetrics(lambda trainer: {"x": 1}), OwnMetrics(lambda trainer: {"x": 2}))
+
+
+@pytest.mark.parametrize("method", ["on_start", "on_batch", "on_evaluation", "on_end", "metrics", "state"])
+def test_an_error_in_a_callback_goes_through_after_training_was_saved(method, tmp_path):
+    with pytest.raises(ZeroDivisionError) as error:
+        train(Faulty(method, at=0 if method == "on_start" else 64), folder=tmp_path / "run")
+    assert error.traceback[-1].path.name == "toy_callbacks.py"
+    saved = checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"]
+    assert saved == {"on_start": 0, "on_end": 320, "state": 320}.get(method, 64)
+
+
+def test_a_users_mistake_inside_a_callback_costs_no_training(tmp_path, capsys):
+    class Loading(Callback):
+        def on_batch(self, trainer):
+            checkpoint.find("nowhere", "checkpoint")
+
+    with pytest.raises(CallbackError, match=r"^Loading: checkpoint=nowhere: no checkpoint there"):
+        train(Loading(), folder=tmp_path / "run")
+    assert checkpoint.progress_of(tmp_path / "run/checkpoint.zip")["frames"] == 32
+
+
+def test_a_wrong_metric_of_a_callback_from_yaml_ends_the_run_in_one_line_that_says_how_to_go_on(tmp_path, capsys):
+    assert start(tmp_path / "run", "callbacks=[{name:recording,breaks_at:64}]") == 1
+    err = capsys.readouterr().err
+    told = err[err.rindex("Recording.metrics") :]
+    assert told.startswith("Recording.metrics: seen=nan: must be a finite number at frame 64; to go on: ")
+    assert f"resume={tmp_path / 'run'}" in told and "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("state", "complaint"),
+    [
+        ({"last": "x"}, "Stateful.state.last is of type str, but must be a number, a tensor or a mapping of them"),
+        ({"of": {3: 1.0}}, "Stateful.state.of: 3 must be a text, as the name of a value"),
+    ],
+)
+def test_a_state_that_no_checkpoint_can_hold_is_refused_before_the_run_starts(state, complaint, tmp_path):
+    class Stateful(Callback):
+        def state(self):
+            return state
+
+    with pytest.raises(CallbackError) as error:
+        train(Stateful(), folder=tmp_path / "run")
+    assert str(error.value) == complaint
+    assert not (tmp_path / "run").exists()
+
+
+def test_callbacks_are_called_in_the_order_of_the_list_and_before_those_from_python(tmp_path):
+    words = [*SMALL, "callbacks=[patience,{name:recording,breaks_at:0}]", "save_best=true"]
+    trainer = begin(make_config(words), callbacks=[TimeLimit()])
+    assert [*trainer.callbacks] == ["BestAgent", "Patience", "Recording", "TimeLimit"]
+    words = [*SMALL, "callbacks=[time_limit,best_agent]", "save_best=true"]
+    assert [*begin(make_config(words)).callbacks] == ["TimeLimit", "BestAgent"]
+
+
+@pytest.mark.parametrize(("given", "told"), [(Patience, "Patience, a class"), (print, "builtin_function_or_method")])
+def test_what_is_no_callback_is_refused(given, told):
+    with pytest.raises(ConfigError, match=rf"^callbacks: must be objects of subclasses of Callback, not {told}$"):
+        begin(make_config(SMALL), callbacks=[given])
+
+
+LIST = "callbacks=[time_limit,{name:patience,evaluations:5},{name:recording,breaks_at:${total_frames}}]"
+
+
+def test_a_saved_config_holds_the_list_in_full_and_is_read_again():
+    config = make_config([*SMALL, LIST])
+    assert config.to_dict()["callbacks"] == [
+        {"name": "time_limit", "minutes": 60.0},
+        {"name": "patience", "evaluations": 5, "min_improvement": 0.0},
+        {"name": "recording", "breaks_at": 320},
+    ]
+    assert read_saved(config.to_dict()) == config
+
+
+def saved_with(callbacks: object) -> dict:
+    return make_config(SMALL).to_dict() | {"callbacks": callbacks}
+
+
+@pytest.mark.parametrize(
+    ("callbacks", "complaint"),
+    [
+        ([{"name": "patience", "_target_": "os.PathLike"}], "callbacks.0._target_: a yaml file names the class"),
+        (["../low/random"], 'callbacks.0="../low/random": must be the name of a callback, or its name and settings'),
+        ([{"name": "recording", "breaks_at": "${oc.env:HOME}"}], "callbacks.0.breaks_at="),
+        ("patience", 'callbacks="patience": must be a list'),
+        ([["patience"]], "callbacks.0"),
+    ],
+)
+def test_a_saved_config_chooses_no_class_but_those_of_todays_yaml_files(callbacks, complaint):
+    with pytest.raises(ConfigError) as error:
+        read_saved(saved_with(callbacks))
+    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
+
+
+def test_a_guarded_setting_of_a_callback_in_a_saved_config_needs_trust():
+    saved = saved_with([{"name": "guarded", "command": "ls"}])
+    with pytest.raises(ConfigError, match=r"^callbacks=.*set by the saved run, and can run code"):
+        read_saved(saved)
+    assert read_saved(saved, trust=True).callbacks[0].settings == {"command": "ls"}
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (
+            ["callbacks=[patiense]"],
+            "callbacks.0=patiense: no such file in conf/callback; did you mean patience? It has ",
+        ),
+        (["callbacks=[time_limit,{minutes:3}]"], 'callbacks.1={"minutes": 3}: must be the name of a callback'),
+        (
+            ["callbacks=[{name:patience,evaluation:3}]"],
+            "callbacks.0.evaluation: no such setting of Patience (conf/callback/patience.yaml); did you mean ev",
+        ),
+        (["callbacks=[{name:time_limit,minutes:0}]"], "callbacks.0.minutes=0: must be greater than 0 (TimeLimit, "),
+        (["callbacks=[no_callback]"], "callback=no_callback: OrderedDict is no Callback (hpamdp.run.callbacks)"),
+        (["callbacks=[no_class]"], "callbacks.0=no_class: conf/callback/no_class.yaml names no class as _target_"),
+        (
+            ["callbacks=[patience]", "eval.every=0"],
+            "callback=patience: needs evaluations during training; set eval.every",
+        ),
+    ],
+)
+def test_a_callback_that_no_run_can_have_is_told_in_one_line(words, complaint, tmp_path):
+    with pytest.raises(ConfigError) as error:
+        start(tmp_path / "run", *words)
+    assert str(error.value).startswith(complaint) and "\n" not in str(error.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_callback_chosen_as_a_group_is_told_to_belong_into_the_list(command):
+    for word in ("callback=patience", "+callback=patience"):
+        assert command(word) == (2, "", f"{word}: a run has a list of callbacks; write callbacks=[NAME, ...]\n")
+
+
+def test_help_explains_the_settings_of_listed_callbacks(command):
+    code, out, _ = command("callbacks=[{name:patience,evaluations:7},best_agent]", "--help")
+    assert code == 0
+    assert "Settings of callback=patience\n  evaluations=7\n      Evaluations without" in out
+    assert "callback=best_agent has the settings of its class alone: none" in out
+
+
+STOPPED_AT = 5  # batches
+
+
+def interrupt_at(batch: int, monkeypatch) -> None:
+    take, batches = Recorder.take, itertools.count(1)
+
+    def interrupted(self, *given):
+        take(self, *given)
+        if next(batches) == batch:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(Recorder, "take", interrupted)
+
+
+@pytest.mark.parametrize("where", ["own", "new"])
+def test_a_resumed_run_counts_on_and_knows_its_best_agent(where, tmp_path, monkeypatch):
+    words = [*PLATFORM, "total_frames=960", "save_best=true", "callbacks=[{name:patience,evaluations:4},recording]"]
+    assert run(compose_config(words), tmp_path / "whole", words) == 0
+    with monkeypatch.context() as patch:
+        interrupt_at(STOPPED_AT, patch)
+        assert run(compose_config(words), tmp_path / "stopped", words) == 130
+    resumed = tmp_path / ("stopped" if where == "own" else "resumed")
+    again = [f"resume={tmp_path / 'stopped'}"]
+    assert run(compose_config(again), resumed, again) == 0
+    whole = json.loads((tmp_path / "whole/summary.json").read_text())
+    assert json.loads((resumed / "summary.json").read_text())["frames"] == whole["frames"] < 960
+    columns = ("frames", "eval/score", "own/seen")
+    assert [[row[name] for name in columns] for row in rows_of(resumed)] == [
+        [row[name] for name in columns] for row in rows_of(tmp_path / "whole")
+    ]
+    best = [folder / "best.pt" for folder in (tmp_path / "whole", resumed)]
+    kept, again_kept = map(tensors_in, best)
+    assert all(torch.equal(value, again_kept[name]) for name, value in kept.items())
+    assert len({checkpoint.progress_of(file)["last_score"] for file in best}) == 1
+
+
+def test_a_run_that_a_callback_ended_is_finished(tmp_path, capsys):
+    words = [*SMALL, "callbacks=[{name:patience,evaluations:1}]", "total_frames=6400"]
+    assert run(compose_config(words), tmp_path, words) == 0
+    printed = capsys.readouterr().out
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["frames"] < 6400 and summary["finished"]
+    assert f"Training ended at {summary['frames']} steps: 1 evaluations without an improvement" in printed
+    assert rest_of(make_config(words), tmp_path).score == summary["score"]
+    assert rest_of(make_config([*words, "save_best=true"]), tmp_path).score == summary["score"]
+
+
+def test_a_run_without_the_member_of_callbacks_is_resumed(tmp_path, monkeypatch):
+    write = checkpoint.save
+    monkeypatch.setattr(
+        checkpoint,
+        "save",
+        lambda file, agent, states, *given, **named: write(
+            file, agent, {name: states[name] for name in checkpoint.STATES}, *given, **named
+        ),
+    )
+    assert start(tmp_path / "a", "total_frames=64") == 0
+    words = [f"resume={tmp_path / 'a'}", "total_frames=128", "callbacks=[patience]"]
+    assert run(compose_config(words), tmp_path / "b", words) == 0
+    assert json.loads((tmp_path / "b/summary.json").read_text())["frames"] == 128
+
+
+@pytest.mark.parametrize(
+    ("state", "complaint"),
+    [
+        ({"best": math.nan, "evaluations": 0}, "Patience.best is nan, but must be a number"),
+        ({"best": 1.0, "evaluations": "many"}, "Patience.evaluations is 'many', but must be a number"),
+        ({"best": 1.0}, "a state dict without evaluations"),
+        (3, "a state dict is int"),
+    ],
+)
+def test_the_state_of_another_callback_is_refused_in_one_line(state, complaint, tmp_path, monkeypatch):
+    write = checkpoint.save
+    monkeypatch.setattr(
+        checkpoint,
+        "save",
+        lambda file, agent, states, *given, **named: write(
+            file, agent, {**states, "callbacks": {"Patience": state}}, *given, **named
+        ),
+    )
+    assert start(tmp_path / "a", "total_frames=64", "callbacks=[patience]") == 0
+    words = [f"resume={tmp_path / 'a'}", "total_frames=128"]
+    with pytest.raises(ConfigError) as error:
+        run(compose_config(words), tmp_path / "b", words)
+    assert complaint in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_dropped_callback_with_a_state_is_told(tmp_path, capsys):
+    assert start(tmp_path / "a", "total_frames=64", "callbacks=[patience,time_limit]") == 0
+    words = [f"resume={tmp_path / 'a'}", "total_frames=128", "callbacks=[]"]
+    assert run(compose_config(words), tmp_path / "b", words) == 0
+    assert "the checkpoint holds the state of Patience, but this run has no such callback" in capsys.readouterr().err
+
+
+def test_a_run_with_callbacks_of_ones_own_is_scored_and_watched_without_their_yaml_files(tmp_path, monkeypatch):
+    assert start(tmp_path / "a", "callbacks=[recording]", "total_frames=64") == 0
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", None)
+    words = ["hydra.searchpath=[]", "mode=eval", f"checkpoint={tmp_path / 'a'}"]
+    assert run(compose_config(words), tmp_path / "b", words) == 0
+    config: Config = load_player(str(tmp_path / "a"), []).config
+    assert config.callbacks == ()
+
+
+def test_a_new_run_does_not_overwrite_a_best_agent_that_a_killed_run_left(tmp_path):
+    assert start(tmp_path, "save_best=true") == 0
+    for name in ("summary.json", "checkpoint.zip", "policy.pt"):
+        (tmp_path / name).unlink()
+    with pytest.raises(ConfigError, match="holds the results of a run"):
+        start(tmp_path)
+    assert start(tmp_path, "overwrite=true") == 0
+    assert not (tmp_path / "best.pt").exists()
+
+
+def test_classes_of_a_user_that_values_name_are_imported_without_stand_ins(tmp_path):
+    from test_stand_ins import python
+
+    (tmp_path / "conf/callback").mkdir(parents=True)
+    (tmp_path / "conf/low").mkdir()
+    (tmp_path / "conf/callback/mine.yaml").write_text("_target_: mine.Mine\n")
+    (tmp_path / "conf/low/own.yaml").write_text("_target_: mine.Own\nbudget: {eval_every: 0}\n")
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\nfrom hpamdp.policies.low_level.random import Random\n"
+        "from hpamdp.run.callbacks import Callback\n\n\n"
+        "class Mine(Callback):\n    def __init__(self, weight: float = float(np.sqrt(4.0))):\n"
+        "        self.weight = weight\n\n    def metrics(self, trainer):\n        return {'weight': self.weight}\n\n\n"
+        "class Own(Random):\n    pass\n"
+    )
+    (tmp_path / "go.py").write_text("import sys\nfrom hpamdp.cli import main\nsys.path.insert(0, '.')\nmain()\n")
+    words = ["--config-dir", "conf", "env=platform", "high=uniform", "low=random", "+env.grouping=default"]
+    words += ["+low.per_option={jump: own}", "callbacks=[mine]", "total_frames=64", "num_envs=4", "steps_per_batch=8"]
+    done = python("go.py", *words, "eval.layouts=4", "film=false", "hydra.run.dir=out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {row["own/weight"] for row in rows_of(tmp_path / "out")} == {"2.0"}
