@@ -189,6 +189,17 @@ def test_an_error_in_a_callback_goes_through_after_training_was_saved(method, tm
     assert saved == {"on_start": 0, "on_end": 320, "state": 320}.get(method, 64)
 
 
+def test_the_command_line_shows_the_frames_of_the_callback_alone(command, tmp_path):
+    (tmp_path / "conf/callback").mkdir(parents=True)
+    (tmp_path / "conf/callback/faulty.yaml").write_text("_target_: toy_callbacks.Faulty\nmethod: on_batch\nat: 64\n")
+    words = [*SMALL, "callbacks=[faulty]", "film=false", "hydra.run.dir=out"]
+    code, _, err = command("--config-dir", "conf", *words)
+    told = err[err.rindex("Faulty raised ZeroDivisionError: division by zero (") :]
+    assert code == 1 and told.count("  File ") == 1 and "toy_callbacks.py" in told and "return 1 / 0" in told
+    assert "Traceback" not in err
+    assert checkpoint.progress_of(tmp_path / "out/checkpoint.zip")["frames"] == 64
+
+
 def test_a_users_mistake_inside_a_callback_costs_no_training(tmp_path, capsys):
     class Loading(Callback):
         def on_batch(self, trainer):

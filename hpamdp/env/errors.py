@@ -17,11 +17,11 @@ class ProblemError(ValueError):
 
 
 class EnvironmentFaultError(RuntimeError):
-    """A third-party environment raised an error. The message is one line that says where; the error is the cause.
+    """A third-party environment or callback raised an error. One line says where; the error is the cause.
 
     Args:
         line: the message.
-        frames: the environment's own lines of the traceback, as Python prints them.
+        frames: the third party's own lines of the traceback, as Python prints them.
     """
 
     def __init__(self, line: str, frames: str = "") -> None:
@@ -38,7 +38,7 @@ def fault_of(error: Exception, what: str) -> EnvironmentFaultError | None:
     """Return the fault that an error is, or None if no third-party code was running.
 
     Args:
-        error: raised while an environment was called.
+        error: raised while third-party code was called.
         what: who raised it, such as `my_module:Env: step`.
     """
     modules = [str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)]

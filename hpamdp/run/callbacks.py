@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from hpamdp.run.train import Trainer
 
 SCORE = "eval/score"
+_RAISED_BY = "_raised_by_callback"  # attribute of an error
 OWN = "own/"  # prefix of the columns with callbacks' metrics
 
 
@@ -246,6 +247,8 @@ def named(callbacks: Iterable[Callback]) -> dict[str, Callback]:
 def mistakes_explained(name: str) -> Iterator[None]:
     """Name the callback in the line about a user's mistake, so that training is saved before it ends.
 
+    Other errors go through as they are, with the callback's name for `raised_by`.
+
     Raises:
         CallbackError: the block raised a `ConfigError`.
     """
@@ -255,6 +258,14 @@ def mistakes_explained(name: str) -> Iterator[None]:
         raise
     except ConfigError as error:
         raise CallbackError(f"{name}: {first_line(error)}") from error
+    except Exception as error:
+        vars(error).setdefault(_RAISED_BY, name)
+        raise
+
+
+def raised_by(error: Exception) -> str | None:
+    """Return the name of the callback that raised an error, or None if it was no callback."""
+    return vars(error).get(_RAISED_BY)
 
 
 def metrics_of(callbacks: Mapping[str, Callback], trainer: Trainer) -> dict[str, float]:
@@ -295,7 +306,12 @@ def states_of(callbacks: Mapping[str, Callback]) -> dict[str, dict[str, Any]]:
     Raises:
         CallbackError: a checkpoint cannot hold a state.
     """
-    return {name: _savable(f"{name}.state", callback.state()) for name, callback in callbacks.items()}
+    states = {}
+    for name, callback in callbacks.items():
+        with mistakes_explained(name):
+            state = callback.state()
+        states[name] = _savable(f"{name}.state", state)
+    return states
 
 
 def _savable(where: str, value: Any) -> Any:

@@ -21,12 +21,22 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import needs_trust
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
+from hpamdp.env.errors import EnvironmentFaultError, fault_of
 from hpamdp.files import replacing
 from hpamdp.messages import LenientStream, first_line, say, warn
 from hpamdp.policies.base import Learner
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import AssembledRun, assemble
-from hpamdp.run.callbacks import BestAgent, Callback, CallbackError, metrics_of, mistakes_explained, named, states_of
+from hpamdp.run.callbacks import (
+    BestAgent,
+    Callback,
+    CallbackError,
+    metrics_of,
+    mistakes_explained,
+    named,
+    raised_by,
+    states_of,
+)
 from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.collection.base import Collection, CollectionError
 from hpamdp.run.folder import check_no_link, check_no_training, check_unused, mark_unfinished, moved_aside
@@ -177,6 +187,11 @@ def _run_to_the_end(trainer: Trainer, output_dir: Path, tell: Callable[[str], No
             saved = f"to go on: {_resuming(config, output_dir)}" if has_learned else "nothing was learned"
             tell(f"{error} at frame {trainer.frames:,}; {saved}")
             return FAILED
+        except Exception as error:
+            fault = _fault_of_callback(error, trainer)
+            if fault is None:
+                raise
+            raise fault from error
     say(trainer.finish(is_finished=not is_interrupted))
     if trainer.stop_reason and not is_interrupted:
         say(f"Training ended at {trainer.frames:,}{trainer.unit}: {trainer.stop_reason}")
@@ -184,6 +199,14 @@ def _run_to_the_end(trainer: Trainer, output_dir: Path, tell: Callable[[str], No
     if is_interrupted:
         say(f"Stopped at {trainer.frames:,}{trainer.unit}; to go on: {_resuming(config, output_dir)}")
     return INTERRUPTED if is_interrupted else 0
+
+
+def _fault_of_callback(error: Exception, trainer: Trainer) -> EnvironmentFaultError | None:
+    """Return the fault that an error in a callback of the user's own is, or None if the error came from elsewhere."""
+    name = raised_by(error)
+    if name is None or type(trainer.callbacks[name]).__module__.startswith("hpamdp."):
+        return None
+    return fault_of(error, name)
 
 
 def _resuming(config: Config, output_dir: Path) -> str:
