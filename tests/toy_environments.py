@@ -6,7 +6,7 @@ import os
 import signal
 from collections import OrderedDict
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -122,6 +122,20 @@ class Wrong(Toy):
 
     def _observation(self):
         return np.full(self.size, self.value)
+
+
+class Drawn(Toy):
+    """Draws a grey picture that grows lighter with every step."""
+
+    metadata: ClassVar = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None, is_wrong: bool = False):
+        super().__init__()
+        self.render_mode = render_mode
+        self.is_wrong = is_wrong
+
+    def render(self):
+        return np.zeros((2, 2)) if self.is_wrong else np.full((300, 600, 3), 100 * self.steps % 256, np.uint8)
 
 
 class Faulty(Toy):

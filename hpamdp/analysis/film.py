@@ -34,7 +34,7 @@ def film(env: PAMDPEnv, tracks: Sequence[Track], fps: float, size: int) -> list[
 
     Args:
         env: the problem, which draws the pictures.
-        tracks: the `env_state` of each episode at the start and after every step, columns `[1, ...]`.
+        tracks: the `film_state` of each episode at the start and after every step, columns `[1, ...]`.
         fps: pictures per second.
         size: width of one episode, px.
     """

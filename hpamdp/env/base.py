@@ -267,11 +267,18 @@ class PAMDPEnv(EnvBase):
         """
         return {}
 
+    def film_state(self, num: int) -> dict[str, Tensor]:
+        """Return what `film` needs to know of the first `num` environments now, columns `[num, ...]` on the CPU.
+
+        By default this is their `env_state`. It is empty if the problem has no pictures.
+        """
+        return {name: column[:num].cpu().clone() for name, column in self.env_state().items()}
+
     def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterable[np.ndarray]:
         """Return the pictures of one episode, uint8 `[size, size, 3]` each; none if the problem has no pictures.
 
         Args:
-            track: its `env_state` at the start and after every step, columns `[1, ...]`.
+            track: its `film_state` at the start and after every step, columns `[1, ...]`.
             fps: pictures a second.
             size: px from edge to edge.
         """

@@ -30,6 +30,8 @@ from hpamdp.specs import PAMDPSpecs
 
 # Number of episodes in the film of a run.
 FILMED_EPISODES = 3
+# Largest number of steps of an episode in it, few enough to film in a second or two.
+FILMED_STEPS = 40
 # Number of a learner's updates in a run from which compilation saves time, although it takes some 40 s.
 _UPDATES_THAT_PAY = 10_000
 
@@ -256,14 +258,17 @@ def make_data(config: Config, env: PAMDPEnv, gamma: float) -> Demonstrations | N
     return demonstrations
 
 
-def make_evaluation(config: Config, env: PAMDPEnv, num_filmed: int = FILMED_EPISODES) -> Evaluation:
+def make_evaluation(
+    config: Config, env: PAMDPEnv, num_filmed: int = FILMED_EPISODES, filmed_steps: int | None = FILMED_STEPS
+) -> Evaluation:
     """Build the evaluation on separate environments, which scale observations as `env` does.
 
-    The first `num_filmed` episodes are filmed, or none with `film=false`.
+    The first `filmed_steps` steps of the first `num_filmed` episodes are filmed, or none with `film=false`.
     """
     test_env = make_env(config, config.run.eval.layouts, env.device, seed=0)
     test_env.set_scaling_from(env)
-    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed, num_filmed if config.run.film else 0)
+    num_filmed = num_filmed if config.run.film else 0
+    return Evaluation(_with_decisions(test_env, config), config.run.eval.seed, num_filmed, filmed_steps)
 
 
 def acting(env: PAMDPEnv, agent: HierarchicalAgent, config: Config) -> tuple[TransformedEnv, TensorDictModuleBase]:

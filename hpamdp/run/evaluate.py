@@ -24,16 +24,18 @@ class Evaluation:
         env: a `PAMDPEnv` with tracked decisions, one environment for each episode, used for nothing else.
         seed: seed of the episodes.
         num_filmed: number of episodes, the first ones, whose states `run_agent` keeps.
+        filmed_steps: largest number of their steps that is kept. If None, all of them.
 
     Attributes:
-        states: the `env_state` of these episodes at the start and after every step, columns `[num_filmed, ...]`;
-            empty before the first `run_agent`, or if the environment has no `env_state`.
+        states: the `film_state` of these episodes at the start and after every step, columns `[num_filmed, ...]`;
+            empty before the first `run_agent`, or if the problem has none.
     """
 
-    def __init__(self, env: TransformedEnv, seed: int, num_filmed: int = 0) -> None:
+    def __init__(self, env: TransformedEnv, seed: int, num_filmed: int = 0, filmed_steps: int | None = None) -> None:
         self.env = env
         self.seed = seed
         self.num_filmed = num_filmed
+        self.filmed_steps = filmed_steps
         self.states: list[dict[str, Tensor]] = []
         self.episodes = env.fixed_episodes(seed)
         self._reset()
@@ -125,9 +127,9 @@ class Evaluation:
 
     def _film(self, states: list[dict[str, Tensor]] | None) -> None:
         """Append the current state of the filmed episodes to `states`."""
-        if states is not None and self.num_filmed > 0:
-            columns = self.problem.env_state()
-            states.append({name: column[: self.num_filmed].cpu().clone() for name, column in columns.items()})
+        is_short = states is not None and (self.filmed_steps is None or len(states) <= self.filmed_steps)
+        if states is not None and is_short and self.num_filmed > 0:
+            states.append(self.problem.film_state(self.num_filmed))
 
     def measure(self, played: Mapping[str, np.ndarray]) -> dict[str, float]:
         """Return the means of an evaluation: score, return, steps, success and the environment's own metrics.

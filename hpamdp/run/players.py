@@ -80,7 +80,7 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
         check_saved_options(config, env)
         saved = checkpoint.load(source, agent, device, with_training=False)
         saved.set_statistics(env)
-    return Player(config, agent, make_evaluation(config, env, num_filmed=config.run.eval.layouts))
+    return Player(config, agent, make_evaluation(config, env, num_filmed=config.run.eval.layouts, filmed_steps=None))
 
 
 def _config(path: str | None, settings: list[str]) -> tuple[Config, Path | None]:

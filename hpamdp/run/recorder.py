@@ -26,8 +26,8 @@ from hpamdp.run.state_checks import SavedPart, check_columns, check_values, chec
 from hpamdp.run.summary import summarise
 from hpamdp.run_files import EVALUATION_NAME, FILM_NAME, METRICS_NAME, SUMMARY_NAME
 
-# Small and short enough to film in a second or two.
-_FPS, _FILM_SIZE, _FILMED_STEPS = 20.0, 200, 40
+# Small enough to film in a second or two.
+_FPS, _FILM_SIZE = 20.0, 200
 
 
 class _State(SavedPart):
@@ -217,7 +217,7 @@ class Recorder:
     def _film(self, folder: Path) -> Path | None:
         """Film the first episodes of the last evaluation, if the problem has pictures, and return the file."""
         evaluation = self.parts.evaluation
-        tracks = film.tracks_of(evaluation.states, _FILMED_STEPS)
+        tracks = film.tracks_of(evaluation.states)
         pictures = film.film(evaluation.problem, tracks, _FPS, _FILM_SIZE)
         if not pictures:
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ _SUCCESS_ENTRIES = ("is_success", "success")
 # Columns of a table of results after the observation, before the masks.
 _NUM_AFTER = len(("reward", "terminated", "truncated", "success", "has_success"))
 _ALL = slice(None)  # rows
+_PICTURES_PER_SECOND = 4.0
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,8 @@ class Copies:
     Attributes:
         envs: the copies.
         max_steps: of the longest episode.
+        has_pictures: whether `pictures` returns some: the `render_mode` is `rgb_array`.
+        pictures_per_second: `render_fps` of the environment's metadata, or 4.
         option_names: what the environment calls its options, unchecked.
         results: what they have last returned.
 
@@ -137,6 +141,8 @@ class Copies:
         except ValueError as error:
             raise SettingError(f"{name}: {error}") from error
         self.option_names = getattr(self.envs[0].unwrapped, "option_names", ())
+        self.has_pictures = self.envs[0].render_mode == "rgb_array"
+        self.pictures_per_second = _rate_of(self.envs[0])
         mask_sizes = {mask: rows.shape[1] for mask, rows in self._masks.rows.items()}
         self.layout = Layout(self.observations.dim, mask_sizes)
         self.table = np.zeros((num, self.layout.num_result_columns))
@@ -230,6 +236,23 @@ class Copies:
         for name, masks in self._masks.rows.items():
             self.results.masks[name][:] = masks
 
+    def pictures(self, num: int) -> list[np.ndarray]:
+        """Return what `render` returns for the first `num` copies, uint8 `[height, width, 3]` each.
+
+        Raises:
+            ProblemError: it is no such picture.
+            EnvironmentFaultError: `render` raised an error.
+        """
+        pictures = []
+        with self._explained("render"):
+            for row in range(min(num, len(self.envs))):
+                self._row = row
+                picture: Any = self.envs[row].render()
+                if not (isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (3,)):
+                    raise ProblemError(f"render returned {_kind(picture)}, not a picture, uint8 [height, width, 3]")
+                pictures.append(picture)
+        return pictures
+
     @contextmanager
     def _explained(self, method: str) -> Iterator[None]:
         """Say which copy broke its contract or raised an error."""
@@ -249,6 +272,18 @@ class Copies:
         """Close the copies."""
         for env in self.envs:
             env.close()
+
+
+def _rate_of(env: gymnasium.Env) -> float:
+    rate: Any = env.metadata.get("render_fps")
+    is_rate = isinstance(rate, int | float) and not isinstance(rate, bool) and 0.0 < rate < math.inf
+    return float(rate) if is_rate else _PICTURES_PER_SECOND
+
+
+def _kind(picture: Any) -> str:
+    if isinstance(picture, np.ndarray):
+        return f"an array of {picture.dtype} {list(picture.shape)}"
+    return type(picture).__name__
 
 
 def _success_in(info: Mapping[str, Any]) -> bool | None:

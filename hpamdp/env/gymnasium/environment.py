@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from PIL import Image, ImageOps
 from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -28,6 +30,8 @@ from hpamdp.settings import SettingError, Settings
 
 _SUCCESS = "success"
 _SEED = "seed"
+_PICTURE = "picture"
+_LARGEST = 320  # px from edge to edge of a picture that is kept for a film
 # Separate streams of seeds for training and for the fixed episodes of evaluation.
 _TRAINING, _FIXED = 0, 1
 
@@ -217,6 +221,21 @@ class GymnasiumEnv(PAMDPEnv):
         """Continue with saved running statistics: they are the whole `env_state`."""
         self.set_env_state(columns)
 
+    def film_state(self, num: int) -> dict[str, Tensor]:
+        """Return what the first `num` copies draw, if their `render_mode` is `rgb_array`: uint8 `[num, H, W, 3]`."""
+        if not self._copies.has_pictures:
+            return {}
+        pictures = [_fitted(picture) for picture in self._copies.pictures(num)]
+        return {_PICTURE: torch.from_numpy(np.stack(pictures))}
+
+    def film(self, track: Sequence[Mapping[str, Tensor]], fps: float, size: int) -> Iterator[np.ndarray]:
+        """Yield the pictures of `render`, each for as long as the environment's `render_fps` says."""
+        for number, state in enumerate(track):
+            image = Image.fromarray(state[_PICTURE][0].numpy())
+            picture = np.array(ImageOps.pad(image, (size, size), color="white"))
+            shown = [round(fps * count / self._copies.pictures_per_second) for count in (number, number + 1)]
+            yield from itertools.repeat(picture, shown[1] - shown[0])
+
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the copies."""
         if not self.is_closed:
@@ -349,6 +368,13 @@ class GymnasiumEnv(PAMDPEnv):
             leaves[keys.REWARD] = torch.from_numpy(reward[:, None])
         td = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
         return self.check_masks(td) if results.masks else td
+
+
+def _fitted(picture: np.ndarray) -> np.ndarray:
+    """Return a picture with at most `_LARGEST` px from edge to edge."""
+    image = Image.fromarray(picture)
+    image.thumbnail((_LARGEST, _LARGEST))
+    return np.array(image)
 
 
 def _seeds(seed: int, num: int, stream: int, first: int = 0) -> list[int]:

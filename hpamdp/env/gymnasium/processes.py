@@ -92,6 +92,11 @@ class _BlockEnv(gymnasium.Env):
         if self._copies is not None:
             self._copies.close()
 
+    def pictures(self, num: int) -> list[np.ndarray]:
+        """Return the pictures of this worker's copies among the first `num` of all."""
+        assert self._copies is not None
+        return self._copies.pictures(max(0, num - self._block.first))
+
     def _results(self) -> np.ndarray:
         assert self._copies is not None
         self._table[: self._block.num] = self._copies.table
@@ -111,7 +116,8 @@ class ProcessCopies:
         num_workers: largest number of processes.
 
     Attributes:
-        max_steps, option_names, options, actions, observations, layout, table, results: as those of `Copies`.
+        max_steps, option_names, has_pictures, pictures_per_second: as those of `Copies`.
+        options, actions, observations, layout, table, results: as those of `Copies`.
         envs: empty, since the copies live elsewhere.
 
     Raises:
@@ -128,6 +134,7 @@ class ProcessCopies:
         probe = Copies(make, 1, reading, name)
         probe.close()
         self.max_steps, self.option_names, self.layout = probe.max_steps, probe.option_names, probe.layout
+        self.has_pictures, self.pictures_per_second = probe.has_pictures, probe.pictures_per_second
         self.options, self.actions, self.observations = probe.options, probe.actions, probe.observations
         self.table = np.zeros((num, self.layout.num_result_columns))
         self.results = self.layout.results(self.table)
@@ -161,6 +168,12 @@ class ProcessCopies:
         with self._explained():
             table = self._vector.step(actions.reshape(self._shape_of_actions))[0]
         self._keep(table)
+
+    def pictures(self, num: int) -> list[np.ndarray]:
+        """Return pictures of the first `num` copies; see `Copies.pictures`."""
+        with self._explained():
+            pictures = self._vector.call("pictures", num)
+        return [picture for of_worker in pictures for picture in of_worker]
 
     def _keep(self, table: np.ndarray) -> None:
         self.table[:] = table.reshape(-1, table.shape[-1])[: len(self.table)]

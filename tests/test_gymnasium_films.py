@@ -1,0 +1,63 @@
+"""Films of Gymnasium environments show what `render` returns."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gymnasium_players import step
+from PIL import Image
+
+from hpamdp.env.base import ProblemError
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+
+ENTRY_POINT = "toy_environments:Drawn"
+WORDS = ["high=none", "env=gymnasium", f"env.entry_point={ENTRY_POINT}", "env.max_steps=4"]
+
+
+def grey(picture: np.ndarray) -> int:
+    return int(picture[len(picture) // 2, len(picture) // 2, 0])
+
+
+@pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_film_has_the_pictures_of_render_at_their_own_speed(num_workers):
+    kwargs = {"render_mode": "rgb_array"}
+    env = GymnasiumEnv(3, entry_point=ENTRY_POINT, kwargs=kwargs, max_steps=4, num_workers=num_workers)
+    env.reset()
+    track = [env.film_state(2)]
+    for _ in range(2):
+        step(env)
+        track.append(env.film_state(2))
+    assert track[0]["picture"].shape == (2, 160, 320, 3)
+    pictures = list(env.film([{"picture": state["picture"][1:]} for state in track], fps=20.0, size=100))
+    assert [grey(picture) for picture in pictures] == [0, 0, 100, 100, 200, 200]
+    assert pictures[0].shape == (100, 100, 3) and pictures[0][0, 0].tolist() == [255, 255, 255]
+    env.close()
+
+
+def test_without_the_render_mode_there_is_nothing_to_film():
+    assert GymnasiumEnv(2, entry_point=ENTRY_POINT, max_steps=4).film_state(2) == {}
+
+
+def test_something_else_than_a_picture_is_told_in_one_line():
+    env = GymnasiumEnv(entry_point=ENTRY_POINT, kwargs={"render_mode": "rgb_array", "is_wrong": True}, max_steps=4)
+    env.reset()
+    with pytest.raises(
+        ProblemError, match=r"Drawn: environment 0: render returned an array of float64 \[2, 2\], not a"
+    ):
+        env.film_state(1)
+
+
+def test_watch_films_an_environment_of_ones_own(command, tmp_path):
+    code, out, err = command("watch", "low=random", *WORDS, "env.kwargs={render_mode:rgb_array}", "--episodes", "2")
+    assert code == 0 and not err and "2 episodes" in out
+    with Image.open(tmp_path / "episodes.gif") as film:
+        assert film.n_frames > 4 and film.size == (640, 320)
+    code, _, err = command("watch", "low=random", *WORDS)
+    assert code == 2 and err.count("\n") == 1 and "has no pictures to film" in err
+
+
+def test_a_run_with_running_statistics_evaluates_and_leaves_a_film(command, tmp_path):
+    words = [*WORDS, "env.kwargs={render_mode:rgb_array}", "env.observation_scaling=running", "low=random"]
+    code, _, err = command(*words, "num_envs=2", "steps_per_batch=4", "total_frames=16", "eval.layouts=2")
+    assert code == 0, err
+    assert list(tmp_path.rglob("episodes.gif"))
