@@ -1,11 +1,28 @@
 """A research framework for hierarchical and parameterised-action reinforcement learning.
 
-Importing it registers the Gymnasium ids of its problems and loads neither torch nor TorchRL.
+The names below are all that a user needs. Everything else is internal and may change between versions.
+
+- `make`, `make_gymnasium`: a problem as a TorchRL or as a Gymnasium environment.
+- `train`, `load`: train an agent, or load a trained one. Both return an `Agent`, which acts, is evaluated and saved.
+- `Callback`: the base of code that runs during training.
+- `PAMDPSpecs`: sizes and bounds of a problem, `PAMDPSpecs.from_env(env)`. Learners and selectors are built from it.
+- Learners: `BC`, `DLPA`, `HPPO`, `HSAC`, `HyAR`, `IQL`, `PADDPG`, `PDQN`, `PETS`, `QPAMDP`, `TD3BC`.
+- Selectors: `Actor`, `EpsilonGreedy`, `Exp3`, `LinThompson`, `LinUCB`, `MetaCritic`, `OptionCritic`, `Thompson`, `UCB`.
+- `PAMDPEnv`, `Learner`, `Selector`: the bases of a problem, a learner and a selector of your own.
+- `ConfigError`: raised for a user's mistake, with one line that says what is allowed. `DivergedError`: raised if
+  training reaches numbers that are not finite.
+
+Importing this package registers the Gymnasium ids of its problems. It loads neither torch nor TorchRL until one of the
+names is used.
 """
+
+import lazy_loader
 
 from hpamdp.search_path import is_command_line, put_working_directory_last
 
 __version__ = "0.3.0"
+# `__init__.pyi` lists the names with their modules, which are imported when a name is used.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 if is_command_line():
     # `python -m` puts the working directory first, and the next import needs other packages.

@@ -100,7 +100,8 @@ def imported(package: str) -> bool:
 
 def test_every_dependency_is_imported_by_something():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    modules = {"hydra-core": "hydra", "pillow": "PIL", "pyyaml": "yaml", "tensorboard": "torch.utils.tensorboard"}
+    modules = {"hydra-core": "hydra", "pillow": "PIL", "pyyaml": "yaml", "lazy-loader": "lazy_loader"}
+    modules["tensorboard"] = "torch.utils.tensorboard"
     for line in project["dependencies"]:
         name = re.match(r"[\w-]+", line).group()
         assert imported(modules.get(name, name)), name

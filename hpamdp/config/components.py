@@ -5,6 +5,7 @@ A class lists its settings in a model, `Options`. If it has none, its constructo
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import inspect
 from collections.abc import Callable, Iterable, Mapping
@@ -21,7 +22,7 @@ from hpamdp.settings import SettingError, Settings
 
 # Arguments that the run supplies to the constructor of a group's class. All others are settings.
 SUPPLIED_ARGUMENTS: dict[str, tuple[str, ...]] = {
-    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human"),
+    "env": ("num_envs", "device", "seed", "first_env", "dtype", "oracle", "human", "make"),
     "high": ("specs", "device"),
     "low": ("specs", "device"),
     "data": ("env",),
@@ -62,12 +63,14 @@ class Component:
         name: name of the yaml file, such as `hyar`.
         cls: the class; None for `high=none` and `data=none`.
         settings: checked values by name.
+        objects: further arguments of the constructor, from Python code. No file holds them.
     """
 
     group: str
     name: str
     cls: type | None
     settings: Mapping[str, Any]
+    objects: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __str__(self) -> str:
         return f"{self.group}={self.name}"
@@ -100,7 +103,7 @@ class Component:
         if self.cls is None:
             return None
         accepted = constructor_arguments(self.cls)
-        supplied = {name: value for name, value in context.items() if name in accepted}
+        supplied = {name: value for name, value in {**context, **self.objects}.items() if name in accepted}
         model = self.as_model
         settings = self.settings if model is None else {"options": model}
         try:
@@ -178,6 +181,17 @@ def check_base_class(group: str, name: str, target: object) -> None:
         raise ConfigError(f"{given} is abstract; choose one of its subclasses{missing} ({file})")
 
 
+# Classes that Python code passed, by their dotted names. Those defined in a notebook or a function cannot be imported.
+_passed: dict[str, type] = {}
+
+
+def name_of_passed(cls: type) -> str:
+    """Remember a class that Python code passes, and return the dotted name by which `load_class` finds it."""
+    dotted = f"{cls.__module__}.{cls.__qualname__}"
+    _passed[dotted] = cls
+    return dotted
+
+
 def load_class(dotted: str) -> type:
     """Import a class by its dotted name.
 
@@ -185,6 +199,8 @@ def load_class(dotted: str) -> type:
         ConfigError: there is no such class.
         RealImportsNeededError: see `check_readable`.
     """
+    if dotted in _passed:
+        return _passed[dotted]
     module_name, _, name = dotted.rpartition(".")
     if not module_name or not all(part.isidentifier() for part in dotted.split(".")):
         raise ConfigError(f"{dotted}: must be a class, as package.module.Class")

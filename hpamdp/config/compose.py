@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -74,9 +75,22 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     own = cfg.copy()
     OmegaConf.set_struct(own, False)
     own.pop("hydra", None)
+    folders: tuple[str, ...] = ()
     if "hydra" in cfg or HydraConfig.initialized():
-        _check_found(cfg.hydra if "hydra" in cfg else HydraConfig.get(), names)
-    return check(plain(own), names)
+        node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
+        _check_found(node, names)
+        folders = searched_folders(node)
+    return replace(check(plain(own), names), config_dirs=folders)
+
+
+def searched_folders(node: Any) -> tuple[str, ...]:
+    """Return the folders of yaml files that the command line adds to conf/, as absolute paths.
+
+    Args:
+        node: the config's `hydra` part.
+    """
+    added = [each for each in node.runtime.config_sources if each.provider not in ("hydra", "main", "schema")]
+    return tuple(str(Path(each.path).absolute()) for each in added if each.schema == "file")
 
 
 def _check_found(node: Any, names: Mapping[str, str]) -> None:
@@ -185,24 +199,6 @@ def compose(overrides: list[str]) -> DictConfig:
             return hydra.compose("config", overrides)
     except hydra.errors.MissingConfigException as error:
         raise MissingChoiceError(str(error.missing_cfg_file), error.options or ()) from error
-
-
-def compose_words(words: list[str]) -> DictConfig:
-    """Return the config of a command line's words with its `hydra` part, without running a job.
-
-    Raises:
-        ConfigError: the words cannot be composed.
-    """
-    folder = str(conf_dir())
-    try:
-        with hydra.initialize_config_dir(folder, version_base="1.3"):
-            cfg = hydra.compose("config", words, return_hydra_config=True)
-            HydraConfig.instance().set_config(cfg)  # as for a job; `compose` takes the searched folders from it
-            return cfg
-    except (hydra.errors.HydraException, OmegaConfBaseException, OSError, ValueError) as error:
-        raise ConfigError(beginning_of(words) + first_line(error)) from error
-    except RecursionError as error:
-        raise ConfigError(beginning_of(words) + NESTED) from error
 
 
 def beginning_of(words: Sequence[str]) -> str:

@@ -14,8 +14,9 @@ from pydantic_core import PydanticUndefined
 
 from hpamdp.config.command_line import CommandLine, choices_in
 from hpamdp.config.components import CALLBACK, GROUPS, component
-from hpamdp.config.compose import compose_words, listed_callbacks, plain
+from hpamdp.config.compose import listed_callbacks, plain
 from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import composed
 from hpamdp.config.schema import RunConfig
 from hpamdp.config.stand_ins import quick_imports
 from hpamdp.shell import program
@@ -80,13 +81,14 @@ def _explained_choices(line: CommandLine) -> Iterator[str]:
     groups = [group for group in line.given() if group in GROUPS]
     has_callbacks = "callbacks" in line.given()
     if groups or has_callbacks:
-        cfg = compose_words([*(word for word in line.words if not word.startswith("hydra.")), *line.search_path])
-        for group in groups:
-            name = str(cfg.hydra.runtime.choices[group])
-            yield _explained_choice(group, name, plain(cfg[group], group), f"{group}.")
-        if has_callbacks:
-            for name, given in listed_callbacks(plain(OmegaConf.masked_copy(cfg, "callbacks"))["callbacks"], {}):
-                yield _explained_choice(CALLBACK, name, given, "")
+        words = [word for word in line.words if not word.startswith("hydra.")]
+        with composed([*words, *line.search_path]) as cfg:
+            for group in groups:
+                name = str(cfg.hydra.runtime.choices[group])
+                yield _explained_choice(group, name, plain(cfg[group], group), f"{group}.")
+            if has_callbacks:
+                for name, given in listed_callbacks(plain(OmegaConf.masked_copy(cfg, "callbacks"))["callbacks"], {}):
+                    yield _explained_choice(CALLBACK, name, given, "")
 
 
 def _explained_choice(group: str, name: str, given: Mapping[str, Any], prefix: str) -> str:

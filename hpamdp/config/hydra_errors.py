@@ -11,7 +11,6 @@ from typing import Any
 
 import hydra
 import yaml
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -43,7 +42,7 @@ def explained(error: Exception, line: CommandLine, conf: Path) -> str:
         if override.is_sweep_override() and not line.is_multirun:
             several = f"{override.input_line}: several values; add --multirun to run them all, or put a list in [ ]"
             return f"{several}; for one text write {as_text(override.input_line or '')}"
-    return _wrong_setting(line.overrides, conf) or _first_lines(error, line.words)
+    return _wrong_setting(line, conf) or _first_lines(error, line.words)
 
 
 def not_understood(word: str) -> str:
@@ -81,14 +80,15 @@ def _first_lines(error: Exception, words: Sequence[str]) -> str:
     return ": ".join(dict.fromkeys(line for line in lines if line)) or type(error).__name__
 
 
-def _wrong_setting(overrides: Sequence[Override], conf: Path) -> str | None:
+def _wrong_setting(line: CommandLine, conf: Path) -> str | None:
     """Return a message about the first override of a setting that is not in the config; None if there is none."""
+    overrides = line.overrides
     groups = [o for o in overrides if "/" in o.key_or_group or os.path.isdir(conf / o.key_or_group)]
     others = [o for o in overrides if o not in groups and not o.is_add() and not o.is_force_add()]
     for choices in itertools.product(*map(written_out, groups)):
         try:
             with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-                cfg = hydra.compose("config", list(choices), return_hydra_config=True)
+                cfg = hydra.compose("config", [*line.search_path, *choices], return_hydra_config=True)
         except (HydraException, OmegaConfBaseException):
             return None
         for override in others:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
@@ -192,11 +192,25 @@ class Config:
     collector: Component
     low_of: Mapping[str, Component] = field(default_factory=dict)
     callbacks: tuple[Component, ...] = ()
+    # Folders of yaml files beside conf/ that were searched.
+    config_dirs: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def learners(self) -> list[Component]:
         """The learner `low` and the learners of single options."""
         return [self.low, *self.low_of.values()]
+
+    def with_run(self, **values: Any) -> Config:
+        """Return the config with other, checked values of the run."""
+        return replace(self, run=self.run.model_copy(update=values))
+
+    def with_problem(self, env: Component) -> Config:
+        """Return the config at another problem."""
+        return replace(self, env=env)
+
+    def with_objects(self, objects: Mapping[str, Any] | None) -> Config:
+        """Return the config with arguments for the problem's constructor that no file can hold."""
+        return replace(self, env=replace(self.env, objects=objects)) if objects else self
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config as plain values, the form in which a run saves it.
@@ -261,7 +275,7 @@ def checked_config(
     """
     for group in GROUPS:
         check_base_class(group, names[group], given[group].get(TARGET))
-    components = {group: component(group, names[group], given[group]) for group in GROUPS}
+    components: dict[str, Any] = {group: component(group, names[group], given[group]) for group in GROUPS}
     low_of = {}
     for option, (name, low) in learners.items():
         check_base_class("low", name, low.get(TARGET))

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from hpamdp import keys
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
+from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
 from hpamdp.geometry import PlaneGeometry, Symmetries
 
 if TYPE_CHECKING:
@@ -283,6 +284,10 @@ class PAMDPEnv(EnvBase):
             size: px from edge to edge.
         """
         return ()
+
+    def gymnasium_form(self) -> GymnasiumForm:
+        """Return how one environment of the problem looks to Gymnasium."""
+        return VectorForm(self)
 
     def page(self, seed: int) -> PlayPage | None:
         """Return the page on which people play this problem in a browser; None if there is none.

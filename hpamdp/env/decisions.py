@@ -183,9 +183,14 @@ class DecisionEnv(TransformedEnv):
         return self.base_env
 
 
-def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionEnv:
-    """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
+def decision_tracker(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionTracker:
+    """Return a tracker for this environment; arguments as for `DecisionTracker`."""
     option_actions = None
     if env.option_actions is not None and keys.ACTION_MASK in env.observation_spec.keys():
         option_actions = torch.tensor(env.option_actions, device=env.device)
-    return DecisionEnv(env, DecisionTracker(gamma, option_length, option_actions))
+    return DecisionTracker(gamma, option_length, option_actions)
+
+
+def with_decisions(env: PAMDPEnv, gamma: float = 1.0, option_length: float | None = None) -> DecisionEnv:
+    """Return the environment with its decisions tracked; arguments as for `DecisionTracker`."""
+    return DecisionEnv(env, decision_tracker(env, gamma, option_length))

@@ -283,6 +283,10 @@ def _gamma(agent: HierarchicalAgent) -> float:
     return 1.0 if agent.selector is None else agent.selector.gamma
 
 
+def option_length(config: Config) -> float | None:
+    """Return the steps of an option: None if it lasts its episode, infinite if the selector ends it."""
+    return math.inf if config.run.agent.termination == "learned" else config.run.agent.option_length
+
+
 def _with_decisions(env: PAMDPEnv, config: Config, gamma: float = 1.0) -> TransformedEnv:
-    is_learned = config.run.agent.termination == "learned"
-    return with_decisions(env, gamma, math.inf if is_learned else config.run.agent.option_length)
+    return with_decisions(env, gamma, option_length(config))

@@ -31,6 +31,7 @@ from torch import Tensor, nn
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.data import ReplayBuffer
 
+from hpamdp.config.compose import package_dir
 from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.files import replacing
@@ -91,13 +92,15 @@ def find(path: str | Path, where: str) -> Path:
     A folder without a checkpoint may hold only the networks, which suffice for everything except resuming the run.
 
     Args:
-        path: the file itself or the output folder of its run.
+        path: the file itself, the output folder of its run, or the name of an agent that comes with the package.
         where: the setting that gives the path, for the error.
 
     Raises:
         ConfigError: there is no checkpoint.
     """
     path = Path(os.path.expanduser(path))  # `Path` drops "./", which makes a name of ~
+    if not os.path.exists(path) and str(path) in agent_names():
+        path = agents_dir() / path
     is_folder = os.path.isdir(path)  # `Path.is_dir` would fail for some texts
     file = path / FILE_NAME if is_folder else path
     if where != "resume" and is_folder and not file.is_file() and (path / POLICY_NAME).is_file():
@@ -105,10 +108,21 @@ def find(path: str | Path, where: str) -> Path:
     if not os.path.isfile(file):
         has_policy = os.path.isfile(path / POLICY_NAME)
         why = "networks alone, which cannot be resumed" if has_policy else "no checkpoint there"
-        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}")
+        names = f", or one of {', '.join(agent_names())}" if os.sep not in str(path) and where != "resume" else ""
+        raise ConfigError(f"{where}={path}: {why}; give a run's output folder or its {FILE_NAME}{names}")
     if not zipfile.is_zipfile(file):
         raise ConfigError(f"{where}={file}: not a checkpoint of this program")
     return file
+
+
+def agents_dir() -> Path:
+    """Return the folder of the agents that come with the package; it need not exist."""
+    return package_dir("agents") or Path("agents")
+
+
+def agent_names() -> list[str]:
+    """Return the names of the agents that come with the package."""
+    return sorted(file.parent.name for file in agents_dir().glob(f"*/{POLICY_NAME}"))
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from typing import Any
 
 import torch
 
-from hpamdp.config.compose import compose_words, package_dir, read
+from hpamdp.config.compose import package_dir, read
 from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import composed
 from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import Config
 from hpamdp.env.play_page import EpisodeError, PlayPage
@@ -65,7 +66,8 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     path, settings = split_words(options.settings)
     if path is not None:
         raise ConfigError(f"{path}: not SETTING=VALUE; give an agent as --agent {path}")
-    config = read(compose_words(settings))
+    with composed(settings) as cfg:
+        config = read(cfg)
     page = _page(config, options.seed)
     agents = own_agents(config) if options.agent is None else given_agents(options.agent, config, settings)
     try:

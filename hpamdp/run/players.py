@@ -4,21 +4,40 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 import torch
 
-from hpamdp.config.compose import choosing, compose_words, read
+from hpamdp.config.compose import choosing, read
 from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import composed, searching, word
 from hpamdp.config.schema import Config
+from hpamdp.env.base import PAMDPEnv
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_built, choose_selector, make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
 from hpamdp.run.resume import check_saved_options, resolve, saved_choices
 from hpamdp.specs import PAMDPSpecs
+
+
+@dataclass(frozen=True)
+class LoadedAgent:
+    """A saved agent, or an agent that settings describe, ready to act.
+
+    Attributes:
+        config: config of the agent and its problem.
+        agent: the agent, with the weights of its checkpoint if there is one.
+        env: one environment, which scales observations as the agent's own did.
+        progress: what the checkpoint tells of its run; empty without one.
+    """
+
+    config: Config
+    agent: HierarchicalAgent
+    env: PAMDPEnv
+    progress: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -63,32 +82,59 @@ def load_player(path: str | None, settings: Sequence[str]) -> Player:
     """Build a player.
 
     Args:
-        path: the agent's folder, a checkpoint or `policy.pt`. If None, the settings describe the player.
+        path: the agent's folder, a checkpoint, `policy.pt`, or the name of an agent that comes with the package. If
+            None, the settings describe the player.
         settings: words of a command line, such as `env=goal` or `eval.layouts=6`.
 
     Raises:
         ConfigError: the agent does not exist, or a setting is wrong.
     """
-    config, source = _config(path, list(settings))
-    torch.set_num_threads(config.run.threads)
-    torch.manual_seed(config.run.seed)
-    device = config.run.resolve_device()
-    env = make_env(config, 1, device, config.run.seed)
-    check_built(config, env)
-    agent = make_agent(config, PAMDPSpecs.from_env(env), device)
-    if source is not None:
+    loaded = load_agent(path, settings)
+    num_filmed = loaded.config.run.eval.layouts
+    evaluation = make_evaluation(loaded.config, loaded.env, num_filmed=num_filmed, filmed_steps=None)
+    return Player(loaded.config, loaded.agent, evaluation)
+
+
+def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, Any] | None = None) -> LoadedAgent:
+    """Load a saved agent, or build one that settings describe.
+
+    Args:
+        path: as for `load_player`.
+        settings: words of a command line.
+        objects: arguments for the problem's constructor from Python code.
+
+    Raises:
+        ConfigError: the agent does not exist, or a setting is wrong.
+    """
+    words = list(settings)
+    if path is not None:
+        words = [*_saved_words(path, settings), *settings, "mode=eval", word("checkpoint", path)]
+    with composed(words) as cfg:
+        if path is None:
+            config, source = choose_selector(read(cfg).with_objects(objects), settings), None
+        else:
+            config, source = resolve(cfg, settings, objects)
+        torch.set_num_threads(config.run.threads)
+        torch.manual_seed(config.run.seed)
+        device = config.run.resolve_device()
+        env = make_env(config, 1, device, config.run.seed)
+        check_built(config, env)
+        agent = make_agent(config, PAMDPSpecs.from_env(env), device)
+        if source is None:
+            return LoadedAgent(config, agent, env, {})
         check_saved_options(config, env)
         saved = checkpoint.load(source, agent, device, with_training=False)
         saved.set_statistics(env)
-    return Player(config, agent, make_evaluation(config, env, num_filmed=config.run.eval.layouts, filmed_steps=None))
+        return LoadedAgent(config, agent, env, saved.progress)
 
 
-def _config(path: str | None, settings: list[str]) -> tuple[Config, Path | None]:
-    if path is None:
-        return choose_selector(read(compose_words(settings)), settings), None
-    chosen = saved_choices(path, "checkpoint", settings)
-    given = {word.partition("=")[0] for word in settings}
-    words = [choosing(group, name) for group, name in chosen.items() if group not in given]
-    cfg = compose_words([*words, *settings])
-    cfg.mode, cfg.checkpoint = "eval", path
-    return resolve(cfg, settings)
+def _saved_words(path: str, settings: Sequence[str]) -> list[str]:
+    """Return the choices of a saved agent as words, and its folders of yaml files if the settings trust it."""
+    given = {each.partition("=")[0] for each in settings}
+    words = []
+    if "trust=true" in settings and "hydra.searchpath" not in given:
+        folders = checkpoint.progress_of(checkpoint.find(path, "checkpoint")).get("config_dirs") or []
+        words = searching([folder for folder in folders if os.path.isdir(folder)])
+    with composed(words or [each for each in settings if each.startswith("hydra.searchpath=")]):
+        chosen = saved_choices(path, "checkpoint", settings)
+    return [*words, *(choosing(group, name) for group, name in chosen.items() if group not in given)]

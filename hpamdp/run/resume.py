@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.config.components import GROUPS
 from hpamdp.config.compose import RECIPE, chosen_names, plain, read
-from hpamdp.config.errors import ConfigError
+from hpamdp.config.errors import ConfigError, MissingChoiceError
 from hpamdp.config.saved import choices_of, read_saved, upgraded
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
@@ -31,7 +32,9 @@ _NOT_EVALUATED = ("data", "logger", "collector")
 _OF_TRAINING = ("callbacks", "save_best")
 
 
-def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | None]:
+def resolve(
+    cfg: DictConfig, overrides: Sequence[str], objects: Mapping[str, Any] | None = None
+) -> tuple[Config, Path | None]:
     """Return the config to run and the checkpoint to start from, if there is one.
 
     With `resume` or `mode=eval`, the config is the saved one, changed by the command line.
@@ -39,11 +42,12 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
     Args:
         cfg: the composed config.
         overrides: the words of the command line.
+        objects: arguments for the problem's constructor from Python code, if there are any.
 
     Raises:
         ConfigError: a value is wrong, the checkpoint does not exist, or a word would change the saved agent.
     """
-    config = choose_selector(read(cfg), overrides)
+    config = choose_selector(read(cfg).with_objects(objects), overrides)
     compatibility.check_rules(config, (compatibility.saved_runs_are_named,))
     where = "resume" if config.run.resume is not None else "checkpoint"
     source = config.run.resume or config.run.checkpoint
@@ -62,7 +66,13 @@ def resolve(cfg: DictConfig, overrides: Sequence[str]) -> tuple[Config, Path | N
     changed = map(_name, _changes(overrides, saved, file, where))
     values |= {name: _plain_value(cfg, name) for name in changed if not name.startswith("hydra")}
     names = {group: chosen_names(cfg)[group] for group in GROUPS if group in values}
-    return read_saved(saved, values, names, trust=config.run.trust, file=file), file
+    try:
+        resolved = read_saved(saved, values, names, trust=config.run.trust, file=file)
+    except MissingChoiceError as error:
+        folders = checkpoint.progress_of(file).get("config_dirs")
+        made_with = f" The run was made with --config-dir {' '.join(folders)}" if folders else ""
+        raise ConfigError(f"{error}{made_with}") from error
+    return replace(resolved, config_dirs=config.config_dirs).with_objects(objects), file
 
 
 def _plain_value(cfg: DictConfig, name: str) -> Any:

@@ -46,6 +46,7 @@ class Progress(SavedPart):
 
     config: dict[str, Any]
     option_names: list[str] | None = None
+    config_dirs: list[str] | None = None
     frames: Count
     wall_s: Amount
     cpu_s: Amount

@@ -554,6 +554,7 @@ class Trainer:
         return {
             "config": self.config.to_dict(),
             "option_names": list(self.parts.agent.specs.option_names),
+            "config_dirs": list(self.config.config_dirs),
             "frames": self.frames,
             "wall_s": self.wall_s,
             "cpu_s": self.cpu_s,

@@ -22,6 +22,7 @@ from hpamdp.env.base import Metric
 from hpamdp.env.batched_env import Action, BatchedEnv
 from hpamdp.env.boatdock import episode as episode_rules
 from hpamdp.env.boatdock import harbour, kernel, planner, task
+from hpamdp.env.boatdock.form import BoatForm
 from hpamdp.env.boatdock.human_choices import choice_probabilities, human_spec
 from hpamdp.env.boatdock.layouts import layout_columns
 from hpamdp.env.boatdock.options import BoatDockOptions
@@ -166,6 +167,10 @@ class BoatDockEnv(BatchedEnv[BoatState]):
     def start_columns(self, given: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Check a layout and return the columns of the state that it sets."""
         return layout_columns(given, self.num_envs, self.rules)
+
+    def gymnasium_form(self) -> BoatForm:
+        """Return the form of `hpamdp/BoatDock-v0`."""
+        return BoatForm(self, self.rules)
 
     @property
     def position(self) -> Tensor:

@@ -105,6 +105,7 @@ class Copies:
 
     Attributes:
         envs: the copies.
+        example: one of them, to read its spaces.
         max_steps: of the longest episode.
         has_pictures: whether `pictures` returns some: the `render_mode` is `rgb_array`.
         pictures_per_second: `render_fps` of the environment's metadata, or 4.
@@ -125,6 +126,7 @@ class Copies:
         self._check_spaces()
         try:
             self.envs, limits = map(list, zip(*[with_limit(env, reading.max_steps) for env in self.envs], strict=True))
+            self.example = self.envs[0]
             self.max_steps = max(limits)
             space = self.envs[0].observation_space
             self.options = OptionSpace(self.envs[0].action_space, reading.option_key)

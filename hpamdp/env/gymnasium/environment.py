@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -20,6 +20,7 @@ from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
 from hpamdp.env.gymnasium.copies import Copies, Reading
+from hpamdp.env.gymnasium.form import OwnForm
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import MaskSource
@@ -85,6 +86,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     Args:
         num_envs: number of copies.
+        make: class or function that returns a new copy. If None, `id` or `entry_point` names it.
         options: the settings; None for the defaults.
         device: of the tensors.
         seed: of the episodes, see above.
@@ -104,6 +106,7 @@ class GymnasiumEnv(PAMDPEnv):
         self,
         num_envs: int = 1,
         *,
+        make: Callable[..., Any] | None = None,
         options: GymnasiumOptions | None = None,
         device: torch.device | str | None = "cpu",
         seed: int = 0,
@@ -112,7 +115,7 @@ class GymnasiumEnv(PAMDPEnv):
     ) -> None:
         options = self.options = GymnasiumOptions.of(options, settings)
         # Not a check of the model: the command that resumes a run need not repeat them.
-        if (options.id is None) == (options.entry_point is None):
+        if make is None and (options.id is None) == (options.entry_point is None):
             given = "neither is" if options.id is None else "both are"
             raise SettingError(f"set env.id=Name-v0 or env.entry_point=package.module:name; {given} set")
         register()
@@ -121,9 +124,9 @@ class GymnasiumEnv(PAMDPEnv):
         super().__init__(device=device, batch_size=[num_envs])
         self.num_envs = num_envs
         self.first_env = first_env
-        self._name = f"GymnasiumEnv: {options.entry_point or options.id}"
-        make = Maker(self._name, options.id, options.entry_point, options.kwargs, options.max_steps)
-        self._copies = self._make_copies(make)
+        self._name = f"GymnasiumEnv: {options.entry_point or options.id or getattr(make, '__name__', 'environment')}"
+        maker = Maker(self._name, options.id, options.entry_point or make, options.kwargs, options.max_steps)
+        self._copies = self._make_copies(maker)
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         self.max_steps = self._copies.max_steps
         self.parameter_dims = self._copies.actions.parameter_dims
@@ -176,6 +179,10 @@ class GymnasiumEnv(PAMDPEnv):
         """Return seeds to `reset` with, one for each copy, from another stream than those of training."""
         seeds = torch.tensor(_seeds(seed, self.num_envs, _FIXED), device=self.device)
         return TensorDict({_SEED: seeds}, batch_size=self.batch_size, device=self.device)
+
+    def gymnasium_form(self) -> OwnForm:
+        """Return the form of the environment itself."""
+        return OwnForm(self._copies, self.scaling, self.options.action_mask)
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]` if any info so far had it."""

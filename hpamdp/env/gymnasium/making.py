@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib
 import traceback
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -23,13 +24,18 @@ class Maker:
     Args:
         name: what errors call the environment.
         id: its registered name, or None.
-        entry_point: instead, the class or function that returns it.
+        entry_point: instead, the class or function that returns it: its name, or itself.
         kwargs: arguments of its constructor.
         max_steps: time limit that `gymnasium.make` applies; None: the registered one.
     """
 
     def __init__(
-        self, name: str, id: str | None, entry_point: str | None, kwargs: dict[str, Any] | None, max_steps: int | None
+        self,
+        name: str,
+        id: str | None,
+        entry_point: str | Callable[..., Any] | None,
+        kwargs: dict[str, Any] | None,
+        max_steps: int | None,
     ) -> None:
         self.name = name
         self._id = id
@@ -66,7 +72,9 @@ class Maker:
             env = FourValueEnv(env)
         return checked(env)
 
-    def _load(self, entry_point: str) -> Any:
+    def _load(self, entry_point: str | Callable[..., Any]) -> Any:
+        if not isinstance(entry_point, str):
+            return entry_point
         module_name, _, name = entry_point.partition(":")
         if not all(part.isidentifier() for part in (*module_name.split("."), name)):
             raise SettingError(f"{self.name}: must be a class or function, as package.module:name")

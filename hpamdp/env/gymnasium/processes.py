@@ -119,6 +119,7 @@ class ProcessCopies:
         max_steps, option_names, has_pictures, pictures_per_second: as those of `Copies`.
         options, actions, observations, layout, table, results: as those of `Copies`.
         envs: empty, since the copies live elsewhere.
+        example: a closed copy, to read its spaces.
 
     Raises:
         SettingError: the spaces are not accepted, or this process may not start others.
@@ -133,6 +134,7 @@ class ProcessCopies:
         self.envs: list[gymnasium.Env] = []
         probe = Copies(make, 1, reading, name)
         probe.close()
+        self.example = probe.example
         self.max_steps, self.option_names, self.layout = probe.max_steps, probe.option_names, probe.layout
         self.has_pictures, self.pictures_per_second = probe.has_pictures, probe.pictures_per_second
         self.options, self.actions, self.observations = probe.options, probe.actions, probe.observations

@@ -56,10 +56,14 @@ class ObservationScaling:
 
     def scaled(self, vectors: np.ndarray) -> np.ndarray:
         """Return new observations `[M, dim]` scaled, float32; with `running`, they update the statistics first."""
+        if self.statistics is not None and not self._is_frozen:
+            self.statistics.update(vectors)
+        return self.rescaled(vectors)
+
+    def rescaled(self, vectors: np.ndarray) -> np.ndarray:
+        """Return observations `[M, dim]` scaled as by `scaled`, but without updating the statistics."""
         if self.statistics is None:
             return ((vectors - self._centre) / self._half_width).astype(np.float32)
-        if not self._is_frozen:
-            self.statistics.update(vectors)
         return self.statistics.normalised(vectors).clip(-_CLIP, _CLIP).astype(np.float32)
 
     def share(self, other: ObservationScaling) -> None:

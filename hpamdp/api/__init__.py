@@ -1,0 +1,1 @@
+"""The functions behind `import hpamdp`: thin, over `hpamdp.run`."""

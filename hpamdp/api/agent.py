@@ -1,0 +1,224 @@
+"""A trained agent, as Python code uses it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import keys
+from hpamdp.api.arguments import problem_arguments
+from hpamdp.config.compose import read
+from hpamdp.config.errors import ConfigError, validated
+from hpamdp.config.outside_jobs import composed
+from hpamdp.config.schema import Config, EvalConfig
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.decisions import DecisionTracker, decision_tracker
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.run import checkpoint
+from hpamdp.run.assemble import make_env, make_evaluation, option_length
+from hpamdp.specs import PAMDPSpecs
+
+
+class Agent:
+    """A selector and its learners, trained at one problem. `hpamdp.train` and `hpamdp.load` return it.
+
+    Attributes:
+        specs: sizes and bounds of the problem.
+        policy: a TensorDict module that writes `option`, if there is one to choose, and the action leaves. It explores
+            unless TorchRL's `set_exploration_type` says otherwise.
+        history: the rows of metrics of the training, each a dict of column and number; `pandas.DataFrame(history)`
+            makes a table. Empty if it is unknown.
+        observation_space, action_space: Gymnasium's spaces of the problem, which `act` reads and writes.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        agent: HierarchicalAgent,
+        env: PAMDPEnv,
+        progress: Mapping[str, Any],
+        history: Sequence[Mapping[str, float]] = (),
+    ) -> None:
+        self.specs: PAMDPSpecs = agent.specs
+        self.policy: TensorDictModuleBase = agent.policy
+        self.history = [dict(row) for row in history]
+        self._config = config
+        self._agent = agent
+        self._env = env
+        self._progress = progress
+        self._form = env.gymnasium_form()
+        self.observation_space = self._form.observation_space
+        self.action_space = self._form.action_space
+        self._tracker: DecisionTracker = decision_tracker(env, option_length=option_length(config))
+        # What must stay from step to step: the selector's choices, and the state of the learners' policies.
+        selector_keys = [] if agent.selector is None else agent.selector.out_keys
+        self._kept = [*selector_keys, *agent.router.state_keys]
+        self._last: TensorDictBase | None = None
+        self._starts = np.zeros(0, bool)
+
+    def __repr__(self) -> str:
+        frames = self._progress.get("frames")
+        trained = "untrained" if not frames else f"after {frames:,} frames"
+        return f"Agent({self._config.high}, {self._config.low}, {self._config.env}, {trained})"
+
+    @property
+    def num_parameters(self) -> int:
+        """Number of weights of all networks."""
+        return sum(each.numel() for each in self._agent.parameters())
+
+    def act(self, observation: Any, info: Mapping[str, Any] | None = None, *, greedy: bool = True) -> Any:
+        """Return the action for an observation, in Gymnasium's form.
+
+        The agent holds its option, and what its policy remembers, until `reset` says that a new episode begins. Agents
+        that hold nothing need no `reset`.
+
+        Args:
+            observation: one observation, or a batch, in which every leaf has a leading `[N]`.
+            info: the info of the same step. Its masks count if the problem gives them there.
+            greedy: whether to take the best action. Otherwise the agent explores as in training.
+
+        Raises:
+            ValueError: the observation is not in `observation_space`, the batch has another size than the last one, or
+                the running episode is longer than the problem allows, so that a `reset` is missing.
+
+        Example:
+            >>> import hpamdp
+            >>> agent = hpamdp.load("hppo_platform")
+            >>> env = hpamdp.make_gymnasium("platform")
+            >>> observation, info = env.reset(seed=0)
+            >>> discrete, parameters = agent.act(observation)
+        """
+        try:
+            fresh, is_batch = self._form.read(observation, info)
+        except ValueError as error:
+            raise ValueError(f"act: {error}") from error
+        seen = self._seen(fresh.to(self._env.device))
+        exploration = ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM
+        with set_exploration_type(exploration), torch.no_grad():
+            self._last = self.policy(seen)
+        self._starts[:] = False
+        return self._form.write(self._last, is_batch=is_batch)
+
+    def reset(self, starts: Any = None) -> None:
+        """Begin new episodes with the next `act`.
+
+        Args:
+            starts: which of a batch begin, bool `[N]`, such as `terminated | truncated`. If None, all of them.
+
+        Raises:
+            ValueError: the mask does not fit the batch.
+        """
+        if starts is None:
+            self._last = None
+            return
+        mask = np.asarray(starts)
+        if self._last is None:
+            return
+        if mask.dtype != bool or mask.shape != self._starts.shape:
+            raise ValueError(f"reset: starts must be bool {list(self._starts.shape)}, but is {starts!r:.80}")
+        self._starts |= mask
+
+    def _seen(self, fresh: TensorDict) -> TensorDictBase:
+        """Return what the policy reads: new rows `[N]`, and what stays from the last step."""
+        num = len(fresh)
+        never = torch.zeros(num, 1, dtype=torch.bool, device=fresh.device)
+        fresh.set(keys.DONE, never)
+        if self._last is None:
+            self._starts = np.ones(num, bool)
+            return self._tracker._reset(fresh.empty(), fresh)
+        if len(self._last) != num:
+            running = len(self._last)
+            raise ValueError(f"act: got {num} observations, but {running} episodes are running; call reset() first")
+        begun = self._tracker._reset(fresh.empty(), fresh.clone())
+        fresh.set(keys.REWARD, never.float())
+        going = self._tracker._step(self._last, fresh).exclude(keys.REWARD)
+        starts = torch.from_numpy(self._starts.copy()).to(fresh.device)
+        seen = begun.apply(lambda new, old: torch.where(_like(starts, new), new, old), going)
+        self._check_length(seen)
+        for key in self._kept:
+            value = self._last.get(key, None)
+            if value is not None:
+                seen.set(key, value)
+        return seen
+
+    def _check_length(self, seen: TensorDictBase) -> None:
+        if not self._kept:
+            return
+        steps, longest = int(seen.get(keys.EPISODE_STEPS).max()), self._env.max_steps
+        if steps >= longest:
+            raise ValueError(
+                f"act: {steps} steps without a reset(), but an episode has at most {longest}; call reset() when an "
+                "episode begins"
+            )
+
+    def evaluate(
+        self, env: Any = None, episodes: int = 100, *, seed: int | None = None, per_episode: bool = False
+    ) -> dict[str, Any]:
+        """Play episodes greedily and return their means.
+
+        Args:
+            env: another problem, as for `hpamdp.train`, with the same sizes. If None, the agent's own.
+            episodes: number of episodes.
+            seed: of the episodes. If None, that of the agent's own evaluations, so 100 episodes are their first 100.
+            per_episode: whether to return arrays with one entry for each episode instead of means.
+
+        Returns:
+            The means by name: `score`, `return`, `steps`, and what else the problem measures, such as `success`.
+
+        Raises:
+            ConfigError: the problem has other sizes, or a number is wrong.
+        """
+        config = self._config if env is None else self._config_at(env)
+        values: dict[str, Any] = {**dict(config.run.eval), "layouts": episodes}
+        if seed is not None:
+            values["seed"] = seed
+        checked = validated(EvalConfig, values, "evaluate: eval.", "value of eval", "hpamdp.Agent.evaluate")
+        config = config.with_run(eval=checked, film=False)
+        evaluation = make_evaluation(config, self._env)
+        played = evaluation.run(self.policy)
+        evaluation.env.close()
+        if per_episode:
+            return played
+        return evaluation.measure(played)
+
+    def _config_at(self, env: Any) -> Config:
+        """Return the agent's config at another problem.
+
+        Raises:
+            ConfigError: the problem has other sizes.
+        """
+        arguments = problem_arguments(env)
+        with composed(arguments.words) as cfg:
+            other = read(cfg).with_objects(arguments.objects)
+        config = self._config.with_problem(other.env)
+        built = make_env(config, 1, self._env.device, config.run.seed)
+        specs = PAMDPSpecs.from_env(built)
+        built.close()
+        if specs != self.specs:
+            both = [(each.name, getattr(specs, each.name), getattr(self.specs, each.name)) for each in fields(specs)]
+            name, theirs, ours = next(each for each in both if each[1] != each[2])
+            has = f"has {name}={theirs!r:.80}, but the agent's problem {ours!r:.80}"
+            raise ConfigError(f"evaluate: {other.env} {has}")
+        return config
+
+    def save(self, path: str | Path) -> None:
+        """Write the agent to a file, which `hpamdp.load` reads; an existing file is replaced.
+
+        The file holds the networks and the settings, not the replay buffer. To continue training, train with a folder.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        checkpoint.save_policy(Path(path), self._agent, self._env, self._progress)
+
+
+def _like(mask: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    return mask.reshape(-1, *[1] * (value.ndim - 1))

@@ -1,0 +1,150 @@
+"""Turn the arguments of Python functions into the words of a command line, and objects that no word can hold."""
+
+from __future__ import annotations
+
+import copy
+import re
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import gymnasium
+from gymnasium.vector import VectorEnv
+from torchrl.envs import EnvBase
+
+from hpamdp.config.components import GROUPS, takes_settings_model
+from hpamdp.config.compose import conf_dir
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import choosing_class, word
+from hpamdp.env.base import PAMDPEnv
+
+_ACCEPTED = (
+    "a name such as 'platform', a Gymnasium id, a function or class that returns a Gymnasium environment, such an "
+    "environment, or a PAMDPEnv or its class"
+)
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Arguments of a Python function.
+
+    Attributes:
+        words: the words of the command line that says the same.
+        objects: arguments for the constructor of the problem, which no word can hold.
+    """
+
+    words: list[str] = field(default_factory=list)
+    objects: Mapping[str, Any] = field(default_factory=dict)
+
+
+def settings_words(settings: Mapping[str, Any]) -> list[str]:
+    """Return the words for settings by their names on the command line, such as `seed` and `low.lr`.
+
+    The value of a group, such as `low`, is the name of a yaml file, a class, None, or a mapping of `name` and settings.
+
+    Raises:
+        ConfigError: a value has no such form.
+    """
+    words: list[str] = []
+    for name, value in settings.items():
+        words += _group_words(name, value) if name in GROUPS else [word(name, value)]
+    return words
+
+
+def _group_words(group: str, value: Any) -> list[str]:
+    if isinstance(value, type):
+        return [choosing_class(group, value)]
+    if isinstance(value, Mapping):
+        chosen = _group_words(group, value["name"]) if "name" in value else []
+        own = {name: each for name, each in value.items() if name != "name"}
+        return [*chosen, *(word(f"{group}.{name}", each) for name, each in own.items())]
+    if value is None:
+        return [f"{group}=none"]
+    if not isinstance(value, str):
+        raise ConfigError(f"{group}={value!r:.80}: must be a name, a class, None, or a dict of name and settings")
+    return [word(group, value)]
+
+
+def problem_arguments(env: Any) -> Arguments:
+    """Return the arguments that choose a problem.
+
+    Args:
+        env: see `hpamdp.train`.
+
+    Raises:
+        ConfigError: it is nothing of the accepted kind.
+    """
+    if env is None:
+        return Arguments()
+    if isinstance(env, str):
+        return Arguments(_words_of_name(env))
+    if isinstance(env, Mapping) or _is_problem_class(env):
+        return Arguments(_group_words("env", env))
+    if isinstance(env, PAMDPEnv):
+        return Arguments(_words_of_built(env))
+    if isinstance(env, gymnasium.Env):
+        return Arguments(["env=gymnasium"], {"make": _copier(env)})
+    if callable(env) and not isinstance(env, EnvBase | VectorEnv):
+        return _arguments_of_callable(env)
+    raise ConfigError(f"env={env!r:.80}: must be {_ACCEPTED}")
+
+
+def _is_problem_class(env: Any) -> bool:
+    return isinstance(env, type) and issubclass(env, PAMDPEnv)
+
+
+def _words_of_name(name: str) -> list[str]:
+    own = plain_name(name)
+    if name.startswith("hpamdp/"):
+        names = [file.stem for file in (conf_dir() / "env").glob("*.yaml") if plain_name(file.stem) == own]
+        if names:
+            return [word("env", names[0])]
+    is_id = name in gymnasium.registry or re.search(r"-v\d+$", name)
+    if is_id:
+        return ["env=gymnasium", word("env.id", name)]
+    if ":" in name:
+        return ["env=gymnasium", word("env.entry_point", name)]
+    return [word("env", name)]
+
+
+def plain_name(name: str) -> str:
+    """Return a name without case, underscores, namespace and version: `hard_goal` is `hpamdp/HardGoal-v0`."""
+    return name.removeprefix("hpamdp/").partition("-v")[0].replace("_", "").lower()
+
+
+def _words_of_built(env: PAMDPEnv) -> list[str]:
+    """Return the words for a problem like a built one, with as many environments."""
+    cls = type(env)
+    if not takes_settings_model(cls):
+        raise ConfigError(f"env={env!r:.80}: its settings are unknown; pass the class {cls.__name__}")
+    settings = [word(f"env.{name}", value) for name, value in env.options.model_dump(mode="json").items()]
+    return [choosing_class("env", cls), *settings, word("num_envs", env.num_envs)]
+
+
+def _copier(env: gymnasium.Env) -> Callable[[], gymnasium.Env]:
+    """Return a function that copies an environment, which itself stays as it is.
+
+    Raises:
+        ConfigError: the environment cannot be copied.
+    """
+    try:
+        first = copy.deepcopy(env)
+    except Exception as error:
+        raise ConfigError(
+            f"env={env!r:.80}: cannot be copied ({type(error).__name__}: {error}); pass a function that makes it"
+        ) from error
+    return partial(copy.deepcopy, first)
+
+
+def _arguments_of_callable(make: Callable[[], Any]) -> Arguments:
+    """Return the arguments for a class or a function: its name if it can be imported, otherwise itself."""
+    module, name = getattr(make, "__module__", None), getattr(make, "__qualname__", "")
+    if (
+        module not in (None, "__main__")
+        and name.isidentifier()
+        and getattr(sys.modules.get(module), name, None) is make
+    ):
+        return Arguments(["env=gymnasium", word("env.entry_point", f"{module}:{name}")])
+    return Arguments(["env=gymnasium"], {"make": make})

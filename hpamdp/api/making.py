@@ -1,0 +1,79 @@
+"""Make the package's environments, for TorchRL and for Gymnasium."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+
+from hpamdp.api.arguments import plain_name, problem_arguments
+from hpamdp.config.components import SUPPLIED_ARGUMENTS
+from hpamdp.config.compose import read
+from hpamdp.config.errors import ConfigError, no_such
+from hpamdp.config.outside_jobs import composed, word
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.registration import register
+
+
+def make(name: str, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **settings: Any) -> PAMDPEnv:
+    """Make a problem as a batched TorchRL environment.
+
+    Args:
+        name: a choice of `env` on the command line, such as `platform`, or a Gymnasium id.
+        num_envs: number of environments in the batch.
+        device: of the tensors.
+        seed: of the episodes.
+        settings: the problem's settings by their names without `env.`, such as `max_steps=50`. `oracle=True`
+            and `human=True` add entries for players that need them.
+
+    Raises:
+        ConfigError: there is no such problem, or a setting is wrong.
+
+    Example:
+        >>> import hpamdp
+        >>> env = hpamdp.make("platform", num_envs=4)
+        >>> env.rollout(3)["next", "reward"].shape
+        torch.Size([4, 3, 1])
+    """
+    supplied = {each: settings.pop(each) for each in SUPPLIED_ARGUMENTS["env"] if each in settings}
+    words = [*problem_arguments(name).words, *(word(f"env.{each}", value) for each, value in settings.items())]
+    with composed(words) as cfg:
+        component = read(cfg).env
+    return component.build(num_envs=num_envs, device=device, seed=seed, **supplied)
+
+
+def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> Any:
+    """Make a problem as a Gymnasium environment, or as a vector of them.
+
+    Args:
+        name: a problem of this package with a Gymnasium id, such as `platform`, or any id.
+        num_envs: number of environments in a vector. If None, a single environment.
+        settings: as for `gymnasium.make` or `gymnasium.make_vec`, such as `render_mode="rgb_array"`, and the problem's
+            own, such as `max_steps=50`.
+
+    Returns:
+        A `gymnasium.Env`, or a `gymnasium.vector.VectorEnv` if `num_envs` is given.
+
+    Raises:
+        ConfigError: there is no such id.
+
+    Example:
+        >>> import hpamdp
+        >>> env = hpamdp.make_gymnasium("platform")
+        >>> env.reset(seed=0)[0].shape
+        (9,)
+    """
+    env_id = _id_of(name)
+    if num_envs is None:
+        return gymnasium.make(env_id, **settings)
+    return gymnasium.make_vec(env_id, num_envs=num_envs, **settings)
+
+
+def _id_of(name: str) -> str:
+    register()
+    if name in gymnasium.registry or "-v" in name or ":" in name:
+        return name
+    ids = {plain_name(each): each for each in gymnasium.registry if each.startswith("hpamdp/")}
+    if plain_name(name) not in ids:
+        raise ConfigError(f"{name}: {no_such('problem with a Gymnasium id', name, ids.values())}")
+    return ids[plain_name(name)]

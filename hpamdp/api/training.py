@@ -1,0 +1,171 @@
+"""Train agents, and load trained ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from hpamdp.api.agent import Agent
+from hpamdp.api.arguments import problem_arguments, settings_words
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.outside_jobs import composed, searching
+from hpamdp.config.schema import RESUME_AUTO
+from hpamdp.messages import say
+from hpamdp.metrics_file import read_rows
+from hpamdp.run import checkpoint
+from hpamdp.run.callbacks import Callback
+from hpamdp.run.capacity import memory_errors_explained
+from hpamdp.run.continuation import rest_of
+from hpamdp.run.folder import locked
+from hpamdp.run.players import load_agent
+from hpamdp.run.resume import resolve
+from hpamdp.run.stopping import exits_explained
+from hpamdp.run.train import begin, problems_explained
+from hpamdp.run_files import METRICS_NAME
+
+
+def train(
+    env: Any = None,
+    *,
+    folder: str | Path | None = None,
+    callbacks: Sequence[Callback] = (),
+    config_dirs: Sequence[str | Path] = (),
+    progress: bool = True,
+    **settings: Any,
+) -> Agent:
+    """Train an agent, as `hpamdp SETTING=VALUE ...` does, and return it.
+
+    Ctrl-C ends training after the current batch. Then the agent with what it has learned so far is returned.
+
+    Args:
+        env: the problem: the name of a choice of `env`; a Gymnasium id; a function or a class that returns a Gymnasium
+            environment; such an environment, which is copied and itself stays as it is; a `PAMDPEnv` or its class; or
+            a dict of `name` and settings. If None, the default of the command line.
+        folder: folder of the run, as on the command line, created if it is missing. If None, nothing is written.
+        callbacks: called during training; see `hpamdp.Callback`.
+        config_dirs: folders of yaml files of your own, beside those of the package.
+        progress: whether to show a bar, and at the end the table that the command line shows.
+        settings: the settings of the command line by their names, such as `low="hppo"`, `high=None`,
+            `total_frames=200_000`, `seed=1` or `collector="multi"`. Settings of a group follow its name:
+            `low={"name": "hppo", "lr": 1e-3}`, or `**{"low.lr": 1e-3}`. Instead of a name a group takes a class.
+
+    Raises:
+        ConfigError: a value is wrong, values do not go together, or the folder holds another run. Nothing is written.
+        DivergedError: a reward, a loss or a weight is not finite.
+        CollectionError: a worker process died.
+
+    Example:
+        >>> import hpamdp
+        >>> agent = hpamdp.train("platform", low="hppo", total_frames=20_000, progress=False)
+    """
+    if settings.get("mode") == "eval":
+        raise ConfigError("mode=eval: use hpamdp.load(...).evaluate()")
+    arguments = problem_arguments(env)
+    goes_on = settings.get("resume") == RESUME_AUTO
+    if goes_on:
+        settings = {**settings, "resume": None}
+    words = [*searching(config_dirs), *arguments.words, *settings_words(settings)]
+    output_dir = None if folder is None else Path(folder)
+    with _threads_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
+        with composed(words) as cfg:
+            config, source = resolve(cfg, words, arguments.objects)
+            if output_dir is None and config.logger.name != "csv":
+                raise ConfigError(f"{config.logger}: writes files, so give the run a folder")
+            stack.enter_context(memory_errors_explained(config))
+            if output_dir is not None:
+                stack.enter_context(_own_folder(output_dir))
+            if goes_on and output_dir is not None:
+                score, source = rest_of(config, output_dir)
+                if score is not None:
+                    return load(output_dir, env=env, config_dirs=config_dirs, trust=True)
+            trainer = begin(config, source, output_dir, words, may_overwrite=goes_on, callbacks=callbacks)
+        trainer.shows_progress = progress
+        is_interrupted = trainer.train()
+        table = trainer.finish(is_finished=not is_interrupted)
+    parts = trainer.parts
+    parts.env.close()
+    parts.evaluation.env.close()
+    if progress:
+        say(table)
+    return Agent(config, parts.agent, parts.env.base_env, trainer.progress(), trainer.recorder.metrics.rows())
+
+
+@contextmanager
+def _own_folder(folder: Path) -> Iterator[None]:
+    """Keep other processes out of a folder, and leave no empty folder behind if the run is refused."""
+    is_new = not folder.exists()
+    try:
+        with locked(folder):
+            yield
+    except ConfigError:
+        if is_new:
+            with suppress(OSError):
+                folder.rmdir()
+        raise
+
+
+@contextmanager
+def _threads_restored() -> Iterator[None]:
+    """Give torch back its number of threads after a run, which sets its own."""
+    before = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def load(
+    source: str | Path,
+    *,
+    env: Any = None,
+    config_dirs: Sequence[str | Path] = (),
+    trust: bool = False,
+    **settings: Any,
+) -> Agent:
+    """Load a trained agent.
+
+    Args:
+        source: the folder of a run, a file in it or one that `Agent.save` wrote, or the name of an agent that comes
+            with the package, such as `hppo_platform`.
+        env: the problem, as for `train`. If None, that of the training. An agent that was trained on an object needs
+            it again.
+        config_dirs: folders of yaml files of your own, if the training had them.
+        trust: whether the file may name code to run, such as the entry point of an environment, and the folders of
+            yaml files that the training had.
+        settings: other settings, such as `device="cpu"` or `**{"env.max_steps": 50}`.
+
+    Raises:
+        ConfigError: there is no such agent, it does not fit the problem, or it needs your trust.
+
+    Example:
+        >>> import hpamdp
+        >>> hpamdp.load("hppo_platform").specs.parameter_dims
+        (1, 1, 1)
+    """
+    arguments = problem_arguments(env)
+    words = [*searching(config_dirs), *arguments.words, *settings_words(settings), *(["trust=true"] if trust else [])]
+    file = checkpoint.find(source, "load")
+    if env is None:
+        _check_problem(file, settings)
+    with _threads_restored(), problems_explained():
+        loaded = load_agent(str(source), words, arguments.objects)
+    rows = read_rows(file.parent / METRICS_NAME)
+    return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
+
+
+def _check_problem(file: Path, settings: Mapping[str, Any]) -> None:
+    """Refuse an agent whose problem was an object, unless settings name the problem.
+
+    Raises:
+        ConfigError: the problem is unknown.
+    """
+    saved = checkpoint.progress_of(file)["config"].get("env")
+    sources = ("id", "entry_point")
+    is_named = any(f"env.{name}" in settings for name in sources)
+    is_generic = isinstance(saved, Mapping) and {*sources} <= saved.keys()
+    if is_generic and not is_named and all(saved[name] is None for name in sources):
+        raise ConfigError(f"load: {file}: the agent was trained on an object from Python; pass it again as env")

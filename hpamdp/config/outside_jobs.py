@@ -1,0 +1,135 @@
+"""Compose configs outside of Hydra's jobs: for Python code, and for commands such as `hpamdp watch`."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from numbers import Integral, Real
+from pathlib import Path
+from typing import Any
+
+import hydra
+import yaml
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, OverrideParseException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from hpamdp.config.command_line import parse
+from hpamdp.config.components import (
+    SUPPLIED_ARGUMENTS,
+    TARGET,
+    check_base_class,
+    defaults_of,
+    file_of,
+    name_of_passed,
+    settings_model,
+)
+from hpamdp.config.compose import conf_dir, is_name
+from hpamdp.config.errors import ConfigError
+from hpamdp.config.hydra_errors import explained, not_understood
+from hpamdp.shell import for_hydra
+
+# Hydra keeps one state for the whole process.
+_HYDRA = threading.RLock()
+# Recommended budget of a learner's class that has no yaml file.
+_BUDGET = {"num_envs": 16, "steps_per_batch": 128, "total_frames": 200_000, "eval_every": 10_000}
+
+
+@contextmanager
+def composed(words: Sequence[str]) -> Iterator[DictConfig]:
+    """Compose a command line's words, and search their folders inside the block.
+
+    Other threads wait until the block ends. Then Hydra's state from before comes back.
+
+    Yields:
+        The config with its `hydra` part.
+
+    Raises:
+        ConfigError: the words cannot be composed.
+    """
+    with _HYDRA:
+        outer, outer_config = GlobalHydra.instance().hydra, HydraConfig.instance().cfg  # of a program that uses Hydra
+        GlobalHydra.instance().clear()
+        try:
+            cfg = _compose(words, conf_dir())
+            HydraConfig.instance().set_config(cfg)  # `compose` takes the searched folders from it
+            yield cfg
+        finally:
+            GlobalHydra.instance().hydra, HydraConfig.instance().cfg = outer, outer_config
+
+
+def _compose(words: Sequence[str], conf: Path) -> DictConfig:
+    try:
+        line = parse(words, conf)
+    except OverrideParseException as error:
+        raise ConfigError(not_understood(error.override)) from error
+    try:
+        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
+            return hydra.compose("config", line.words, return_hydra_config=True)
+    except ConfigError:
+        raise
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError) as error:
+        raise ConfigError(explained(error, line, conf)) from error
+
+
+def word(name: str, value: Any) -> str:
+    """Return the word of a command line that gives a setting this value.
+
+    Raises:
+        ConfigError: the value is no number, text, list or mapping of these.
+    """
+    return f"{name}={_written(name, value)}"
+
+
+def _written(name: str, value: Any) -> str:
+    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:  # a number of NumPy or torch
+        value = value.item()
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, Integral | Real):
+        return repr(value)
+    if isinstance(value, str | Path):
+        return for_hydra(str(value))
+    if isinstance(value, list | tuple):
+        return f"[{','.join(_written(name, item) for item in value)}]"
+    if isinstance(value, Mapping) and all(is_name(entry) for entry in value):
+        return f"{{{','.join(f'{entry}:{_written(name, item)}' for entry, item in value.items())}}}"
+    raise ConfigError(f"{name}={value!r:.80}: must be a number, a text, or a list or mapping of these")
+
+
+def searching(folders: Sequence[str | Path]) -> list[str]:
+    """Return the word that adds folders of yaml files, if there are any.
+
+    Raises:
+        ConfigError: a folder does not exist.
+    """
+    missing = [folder for folder in folders if not Path(folder).is_dir()]
+    if missing:
+        raise ConfigError(f"config_dirs: there is no folder {missing[0]}")
+    paths = [f"file://{Path(folder).resolve()}" for folder in folders]
+    return [word("hydra.searchpath", paths)] if paths else []
+
+
+def choosing_class(group: str, cls: type) -> str:
+    """Return the word that chooses a class for a group, by its yaml file or as a choice of its own.
+
+    Raises:
+        ConfigError: the class does not fit the group, or has the name of another choice.
+    """
+    dotted = name_of_passed(cls)
+    files = {file.stem: yaml.safe_load(file.read_text()) for file in sorted((conf_dir() / group).glob("*.yaml"))}
+    own = [name for name, values in files.items() if values.get(TARGET) == dotted]
+    if own:  # the file with the fewest differences from the class's defaults
+        return word(group, min(own, key=lambda name: len(files[name])))
+    name = cls.__name__
+    if name in files:
+        raise ConfigError(f"{group}: {dotted} has the name of {file_of(group, name)}; rename the class")
+    check_base_class(group, name, dotted)
+    budget = {"budget": _BUDGET} if group == "low" else {}
+    settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))
+    ConfigStore.instance().store(name=name, group=group, node={TARGET: dotted, **settings, **budget})
+    return word(group, name)

@@ -1,0 +1,352 @@
+"""The public names of the package: make, train, load, Agent, learners in plain TorchRL loops."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+
+import hpamdp
+from hpamdp.run_files import CHECKPOINT_NAME, METRICS_NAME
+
+TINY = {"total_frames": 1024, "num_envs": 8, "steps_per_batch": 64, "eval.layouts": 4, "progress": False}
+OWN = {**TINY, "env.max_steps": 5, "low": "hppo"}
+
+
+class Reach(gymnasium.Env):
+    """One step pays for a parameter that is near the first entry of the observation."""
+
+    observation_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+    action_space = spaces.Tuple(
+        (spaces.Discrete(2), spaces.Tuple((spaces.Box(-1.0, 1.0, (1,)), spaces.Box(0.0, 2.0, (2,)))))
+    )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.target = self.np_random.uniform(-1.0, 1.0, 3).astype(np.float32)
+        return self.target, {}
+
+    def step(self, action):
+        discrete, parameters = action
+        reward = -abs(float(parameters[0][0] - self.target[0])) if discrete == 0 else -1.0
+        return self.target, reward, False, False, {}
+
+
+@pytest.fixture(scope="module")
+def platform_agent() -> hpamdp.Agent:
+    return hpamdp.train("platform", low="hppo", **TINY)
+
+
+@pytest.fixture(scope="module")
+def boat_agent() -> hpamdp.Agent:
+    return hpamdp.load("linucb_hppo")
+
+
+# The six uses of a newcomer, each at most eight lines.
+
+
+def test_a_loaded_agent_plays_ten_episodes_in_gymnasium_as_its_evaluation_scores_it(platform_agent):
+    agent, env = hpamdp.load("hppo_platform"), hpamdp.make_gymnasium("platform")
+    returns = []
+    for episode in range(10):
+        observation, _ = env.reset(seed=episode)
+        done, total = False, 0.0
+        while not done:
+            observation, reward, terminated, truncated, _ = env.step(agent.act(observation))
+            done, total = terminated or truncated, total + reward
+        returns.append(total)
+    assert np.mean(returns) > 0.95
+    assert agent.evaluate(episodes=10)["score"] > 0.95
+
+
+def test_a_two_level_agent_holds_its_option_for_an_episode_in_gymnasium(boat_agent):
+    env, scores = hpamdp.make_gymnasium("boatdock"), []
+    for episode in range(5):
+        observation, info = env.reset(seed=episode)
+        boat_agent.reset()
+        options, done = set(), False
+        while not done:
+            action = boat_agent.act(observation)
+            options.add(int(action["option"]))
+            observation, _, terminated, truncated, info = env.step(action)
+            done = terminated or truncated
+        assert len(options) == 1
+        scores.append(info["score"])
+    assert np.mean(scores) > 3.0
+
+
+def test_an_own_environment_object_is_trained_in_a_cell_and_stays_as_it_is():
+    env = Reach()
+    agent = hpamdp.train(env, **OWN)
+    discrete, parameters = agent.act(np.zeros(3, np.float32))
+    assert (discrete, parameters) in env.action_space
+    assert not hasattr(env, "target")
+
+
+def test_a_learner_trains_in_a_plain_torchrl_loop_with_defaults():
+    env = hpamdp.make("platform", num_envs=8)
+    learner = hpamdp.HPPO(hpamdp.PAMDPSpecs.from_env(env), lr=3e-4)
+    before = [each.clone() for each in learner.parameters()]
+    for batch in Collector(env, learner.policy, frames_per_batch=256, total_frames=512):
+        learner.learn(batch, mask=torch.ones(batch.shape, dtype=torch.bool))
+    assert any(not torch.equal(*pair) for pair in zip(before, learner.parameters(), strict=True))
+
+
+def test_an_agent_acts_in_a_vector_of_environments_as_in_single_ones(boat_agent):
+    vector = hpamdp.make_gymnasium("boatdock", num_envs=3)
+    observations, _ = vector.reset(seed=0)
+    boat_agent.reset()
+    actions = boat_agent.act(observations)
+    assert actions in vector.action_space
+    for row, observation in enumerate(observations):
+        boat_agent.reset()
+        single = boat_agent.act(observation)
+        assert int(single["key"]) == actions["key"][row]
+        np.testing.assert_allclose(single["duration"], actions["duration"][row], atol=1e-5)
+
+
+# Import and names.
+
+
+def test_importing_the_package_loads_no_torch_and_gives_exactly_the_public_names():
+    code = "import sys, hpamdp; assert 'torch' not in sys.modules; print(*hpamdp.__all__)"
+    names = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {"Agent", "ConfigError", "HPPO", "UCB", "load", "make", "train"} <= {*names}
+    assert all(getattr(hpamdp, name).__doc__ for name in names)
+
+
+def test_a_name_that_is_not_public_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="nothing_of_this_name"):
+        _ = hpamdp.nothing_of_this_name
+
+
+# Training.
+
+
+def test_training_without_a_folder_writes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    agent = hpamdp.train("platform", low="hppo", **TINY)
+    assert not [*tmp_path.iterdir()]
+    assert agent.history[-1]["frames"] == 1024
+    assert isinstance(agent.policy, TensorDictModuleBase)
+
+
+def test_training_with_a_folder_equals_the_command_lines_run(tmp_path, command):
+    folder = tmp_path / "python"
+    agent = hpamdp.train("platform", low="hppo", folder=folder, **TINY)
+    words = [f"{name}={value}" for name, value in TINY.items() if name != "progress"]
+    command("env=platform", "low=hppo", *words, f"hydra.run.dir={tmp_path / 'shell'}")
+    texts = [(tmp_path / name / "config.yaml").read_text() for name in ("python", "shell")]
+    assert texts[0] == texts[1]
+    rows = hpamdp.load(tmp_path / "shell").history
+    timeless = [{name: value for name, value in row.items() if name != "wall_s"} for row in agent.history]
+    assert timeless == [{name: value for name, value in row.items() if name != "wall_s"} for row in rows]
+
+
+def test_an_interrupted_training_in_a_folder_goes_on_with_resume_auto(tmp_path):
+    class Stop(hpamdp.Callback):
+        def on_batch(self, trainer):
+            raise KeyboardInterrupt
+
+    arguments = {**TINY, "low": "hppo", "folder": tmp_path / "run"}
+    agent = hpamdp.train("platform", callbacks=[Stop()], **arguments)
+    assert agent.history[-1]["frames"] < 1024
+    assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 1024
+    again = hpamdp.train("platform", resume="auto", **arguments)  # nothing is left to do
+    assert again.history[-1]["frames"] == 1024
+
+
+def test_a_callback_sees_the_trainer_and_ends_the_training():
+    class Two(hpamdp.Callback):
+        batches, evaluated, ended = 0, 0, False
+
+        def on_batch(self, trainer):
+            self.batches += 1
+            if self.batches == 1:
+                trainer.stop()
+
+        def on_evaluation(self, trainer, row):
+            self.evaluated += "eval/score" in row
+
+        def on_end(self, trainer):
+            self.ended = True
+
+    callback = Two()
+    agent = hpamdp.train("platform", low="hppo", callbacks=[callback], **TINY)
+    assert (callback.batches, callback.ended) == (1, True)
+    assert callback.evaluated >= 1
+    assert agent.history[-1]["frames"] == 512
+
+
+@pytest.mark.parametrize("env", ["hpamdp/Platform-v0", {"name": "moving", "max_steps": 20}, Reach, lambda: Reach()])
+def test_a_problem_may_be_an_id_a_dict_a_class_or_a_function(env):
+    more = {} if isinstance(env, str | dict) else {"env.max_steps": 5}
+    agent = hpamdp.train(env, low="hppo", high=None, **{**TINY, **more})
+    assert agent.history[-1]["frames"] == 1024
+
+
+def test_a_torchrl_problem_and_a_learners_class_are_trained():
+    class OwnLearner(hpamdp.HPPO):
+        pass
+
+    agent = hpamdp.train(hpamdp.make("goal", num_envs=4), low=OwnLearner, **{**TINY, "num_envs": 4})
+    assert "OwnLearner" in repr(agent)
+    assert agent.observation_space.shape == (17,)
+
+
+def test_threads_train_at_the_same_time_and_get_their_own_agents():
+    agents: dict[str, hpamdp.Agent] = {}
+
+    def run(name: str) -> None:
+        agents[name] = hpamdp.train(name, low="hppo", **TINY)
+
+    threads = [threading.Thread(target=run, args=(name,)) for name in ("platform", "moving")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert {name: agent.specs.num_discrete for name, agent in agents.items()} == {"platform": 3, "moving": 3}
+
+
+def test_training_gives_torch_its_threads_back():
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        hpamdp.train("platform", low="hppo", **TINY)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+# Saving and loading.
+
+
+def test_a_saved_agent_acts_as_before(platform_agent, tmp_path):
+    platform_agent.save(tmp_path / "a.pt")
+    loaded = hpamdp.load(tmp_path / "a.pt")
+    observation = np.linspace(-0.5, 0.5, 9, dtype=np.float32)
+    before, after = platform_agent.act(observation), loaded.act(observation)
+    assert before[0] == after[0]
+    for mine, theirs in zip(before[1], after[1], strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_saved_agent_keeps_the_learned_scale_of_its_observations(tmp_path):
+    agent = hpamdp.train(Reach, **{**OWN, "env.observation_scaling": "running"})
+    agent.save(tmp_path / "a.pt")
+    loaded = hpamdp.load(tmp_path / "a.pt", env=Reach, **{"env.max_steps": 5})
+    observation = np.array([0.9, -0.9, 0.3], np.float32)
+    np.testing.assert_array_equal(agent.act(observation)[1][0], loaded.act(observation)[1][0])
+
+
+def test_an_agent_that_was_trained_on_an_object_needs_it_again(tmp_path):
+    hpamdp.train(lambda: Reach(), folder=tmp_path / "run", **OWN)
+    with pytest.raises(hpamdp.ConfigError, match="trained on an object from Python; pass it again as env"):
+        hpamdp.load(tmp_path / "run")
+    agent = hpamdp.load(tmp_path / "run", env=Reach)
+    assert agent.evaluate(episodes=3)["steps"] == 5.0
+    assert {row["frames"] for row in agent.history} == {0.0, 1024.0}
+    assert (tmp_path / "run" / METRICS_NAME).is_file() and (tmp_path / "run" / CHECKPOINT_NAME).is_file()
+
+
+def test_an_evaluation_returns_means_or_one_entry_for_each_episode(platform_agent):
+    scores = platform_agent.evaluate(episodes=6, per_episode=True)["score"]
+    assert scores.shape == (6,)
+    assert platform_agent.evaluate(episodes=6)["score"] == pytest.approx(scores.mean())
+    assert platform_agent.evaluate(episodes=6, seed=5)["score"] != pytest.approx(scores.mean())
+
+
+# Bad input: one clear exception, and nothing is written.
+
+
+@pytest.mark.parametrize(
+    ("observation", "message"),
+    [
+        (np.zeros(8), r"shape \[8\], but must have \[9\] or \[N, 9\]"),
+        (np.zeros((2, 3, 9)), r"shape \[2, 3, 9\]"),
+        (np.zeros((0, 9)), r"shape \[0, 9\]"),
+        (np.full(9, np.nan), "entry 0 of the observation is not finite"),
+        ("left", "must hold 9 numbers, but is 'left'"),
+        (None, "must have"),
+    ],
+)
+def test_a_wrong_observation_is_refused_with_its_shape(platform_agent, observation, message):
+    with pytest.raises(ValueError, match=message):
+        platform_agent.act(observation)
+
+
+def test_a_missing_reset_is_refused_once_an_episode_is_longer_than_the_problem_allows(boat_agent):
+    boat_agent.reset()
+    observation, _ = hpamdp.make_gymnasium("boatdock").reset(seed=0)
+    with pytest.raises(ValueError, match=r"call reset\(\) when an episode begins"):
+        for _ in range(1000):
+            boat_agent.act(observation)
+    boat_agent.reset()
+    boat_agent.act(observation)
+
+
+def test_another_batch_size_without_a_reset_is_refused(boat_agent):
+    observations, _ = hpamdp.make_gymnasium("boatdock", num_envs=2).reset(seed=0)
+    boat_agent.reset()
+    boat_agent.act(observations)
+    with pytest.raises(ValueError, match="got 1 observations, but 2 episodes are running"):
+        boat_agent.act(observations[0])
+    with pytest.raises(ValueError, match=r"starts must be bool \[2\]"):
+        boat_agent.reset([True])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"low": "hpp"}, "low=hpp: no such choice"),
+        ({"total_frame": 3}, "did you mean total_frames"),
+        ({"low.gama": 0.5}, "did you mean gamma"),
+        ({"seed": "x"}, "seed"),
+        ({"low": 3}, "must be a name, a class, None, or a dict"),
+        ({"mode": "eval"}, r"use hpamdp.load\(...\).evaluate"),
+        ({"logger": "wandb"}, "writes files, so give the run a folder"),
+        ({"seed": object()}, "must be a number, a text, or a list or mapping"),
+        ({"high": "ucb"}, "has no options to choose"),
+        ({"env": 3}, "must be a name such as"),
+        ({"env": "nosuch"}, "env=nosuch: no such choice"),
+        ({"env": "CartPole-v1"}, r"action space Discrete\(2\)"),
+        ({"env": lambda: 3}, "is no environment"),
+        ({"env": Reach}, "no time limit of its own; set env.max_steps"),
+        ({"config_dirs": ["nowhere"]}, "there is no folder nowhere"),
+        ({"low": gymnasium.Env}, "is no Learner"),
+    ],
+)
+def test_a_wrong_argument_is_one_config_error_and_nothing_is_written(tmp_path, arguments, message):
+    folder = tmp_path / "run"
+    given = {"env": "platform", **TINY, **arguments}
+    with pytest.raises(hpamdp.ConfigError, match=message) as raised:
+        hpamdp.train(given.pop("env"), folder=None if "logger" in given else folder, **given)
+    assert "\n" not in str(raised.value)
+    assert not folder.exists()
+
+
+def test_a_folder_with_another_run_is_refused_and_stays(tmp_path):
+    hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **TINY)
+    before = {path.name: path.read_bytes() for path in Path(tmp_path, "run").iterdir()}
+    with pytest.raises(hpamdp.ConfigError, match="holds the results of a run"):
+        hpamdp.train("platform", low="hppo", folder=tmp_path / "run", **TINY)
+    assert before == {path.name: path.read_bytes() for path in Path(tmp_path, "run").iterdir()}
+
+
+def test_an_agent_is_refused_at_a_problem_of_other_sizes(platform_agent):
+    with pytest.raises(hpamdp.ConfigError, match="env=goal has observation_dim=17, but the agent's problem 9"):
+        platform_agent.evaluate("goal", episodes=2)
+
+
+def test_an_unknown_agent_is_refused_with_the_names_that_exist():
+    with pytest.raises(hpamdp.ConfigError, match="linucb_hppo"):
+        hpamdp.load("no_such_agent")
