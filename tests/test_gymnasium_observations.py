@@ -14,6 +14,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.env.base import ProblemError
 from hpamdp.env.gymnasium.environment import GymnasiumEnv
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.scaling import ObservationScaling
 from hpamdp.run.train import run
 
 
@@ -139,3 +140,20 @@ def test_an_environment_with_a_counter_that_leaves_its_space_trains_unchanged(tm
     assert run(compose_config([*words, "env.observation_keys=[0]"]), tmp_path / "chosen") == 0
     with pytest.raises(ConfigError, match=r"^env: .*entry 1 is 200, outside Discrete\(200\)"):
         run(compose_config(words), tmp_path / "all")
+
+
+@pytest.mark.parametrize("scaling", ["bounds", "running"])
+def test_raw_entries_are_not_scaled(scaling):
+    parts = spaces.Dict(a=spaces.Box(0, 8, (2,)), b=spaces.Box(0, 8, (1,)))
+    vectors = np.array([[2.0, 4.0, 6.0], [0.0, 8.0, 6.0]])
+    by_name = ObservationScaling(ObservationSpace(parts), scaling, ["a"]).scaled(vectors)
+    assert by_name[:, :2].tolist() == vectors[:, :2].tolist() and abs(by_name[0, 2]) <= 1.0
+    plain = ObservationSpace(spaces.Box(0, 8, (3,)))
+    by_number = ObservationScaling(plain, scaling, [2]).scaled(vectors)
+    assert by_number[:, 2].tolist() == [6.0, 6.0] and abs(by_number[:, :2]).max() <= 1.0
+
+
+@pytest.mark.parametrize(("given", "allowed"), [([2], r"0 to 1"), (["a"], r"0 to 1")])
+def test_raw_entries_that_are_not_observed_are_refused_in_one_line(given, allowed):
+    with pytest.raises(ValueError, match=rf"raw_observations=.*: must name observed entries, which are {allowed}$"):
+        make(raw_observations=given)

@@ -28,6 +28,8 @@ TWO_BOXES = Tuple([Box(0, 1, (1,)), Box(0, 1, (2,))])
             Tuple([Box(np.zeros((2, 9)), np.ones((2, 9)) * np.arange(1.0, 10.0), dtype=np.float64), Discrete(3)]),
             "no Discrete for the discrete actions",
         ),
+        (Dict(a=Discrete(3), b=UNIT, c=UNIT), "3 discrete actions, but 2 Boxes"),
+        (Dict(a=Discrete(2), b=UNIT, c=UNIT, d=Discrete(2)), "not of these forms"),
         (Dict(a=UNIT, b=UNIT), "no Discrete for the discrete actions"),
         (Tuple([Discrete(3), TWO_BOXES]), "3 discrete actions, but 2 Boxes"),
         (Tuple([Discrete(3), UNIT, UNIT]), "3 discrete actions, but 2 Boxes"),

@@ -7,7 +7,8 @@ entry, with any names, and a `OneOf` of K boxes. The `Discrete` may have any `st
   discrete action without parameters has a box of shape `(0,)`. In a `Tuple` the K boxes may also follow the `Discrete`
   directly.
 - a `Dict` of K boxes, which belong to the discrete actions in the order of the space (Gymnasium sorts the names of a
-  plain dict) or, if all names end in different numbers, in the order of these numbers.
+  plain dict) or, if all names end in different numbers, in the order of these numbers. The K boxes may also be entries
+  beside the `Discrete`: `Dict(mode=Discrete(2), a=Box, b=Box)`, where `a` belongs to the first discrete action.
 - one `Box` for all discrete actions. With `parameter_dims` it is split among them, side by side, and always passed as a
   whole. Without, each discrete action takes the whole box: the vector holds one copy for each, and the chosen action's
   copy is passed.
@@ -35,7 +36,8 @@ from hpamdp.settings import SettingError
 
 _ACCEPTED = (
     "accepted are Tuple(Discrete(K), P) and a Dict of a Discrete(K) and P, where P is a Tuple or a Dict of K Boxes or "
-    "one Box for all discrete actions, Tuple(Discrete(K), Box, ..., Box) with K Boxes, and OneOf(K Boxes)"
+    "one Box for all discrete actions, Tuple(Discrete(K), Box, ..., Box) and a Dict of a Discrete(K) and K Boxes, and "
+    "OneOf(K Boxes)"
 )
 
 # Of a parameter, in widths of its Box.
@@ -114,6 +116,9 @@ class ActionSpace:
         if self._is_one_of:
             chosen = zip(values, discrete.tolist(), strict=True)
             return list(zip(natives, [boxes[index] for boxes, index in chosen], strict=True))
+        if self._part_names is not None and self._is_flat:
+            (name, _) = self._part_names
+            return [{name: native, **boxes} for native, boxes in zip(natives, values, strict=True)]
         if self._part_names is not None:
             first, second = self._part_names
             return [{first: native, second: boxes} for native, boxes in zip(natives, values, strict=True)]
@@ -134,6 +139,10 @@ class ActionSpace:
             names = sorted(space.spaces, key=lambda name: not isinstance(space.spaces[name], spaces.Discrete))
             self._part_names = (names[0], names[1])
             parts = [space.spaces[name] for name in names]
+        elif isinstance(space, spaces.Dict) and _is_choice_with_boxes(space):
+            ((name, choice),) = [(name, part) for name, part in space.items() if isinstance(part, spaces.Discrete)]
+            self._part_names, self._is_flat = (name, ""), True
+            return choice, spaces.Dict([each for each in space.items() if each[0] != name])
         elif isinstance(space, spaces.Tuple) and len(space.spaces) >= 2:
             parts = list(space.spaces)
             self._is_flat = len(parts) > 2
@@ -204,8 +213,10 @@ class OptionSpace:
         self._is_dict = isinstance(space, spaces.Dict)
         if option_key is None:
             others = [entry for name, entry in entries.items() if name != "option"]
-            # Where one entry is left, it must be an action by itself; else `option` is the name of the action.
-            if not self._is_dict or len(others) == len(entries) or (len(others) == 1 and not _is_action(others[0])):
+            # If boxes alone are left, or one entry that is no action by itself, `option` is the name of the action.
+            is_action = all(isinstance(other, spaces.Box) for other in others)
+            is_action |= len(others) == 1 and not _is_action(others[0])
+            if not self._is_dict or len(others) == len(entries) or is_action:
                 return
             option_key = "option"
         option = entries.pop(option_key, None)
@@ -236,6 +247,13 @@ class OptionSpace:
         values = [action] if len(self._names) == 1 else list(action)
         values.insert(int(self._key), native)
         return tuple(values)
+
+
+def _is_choice_with_boxes(space: spaces.Dict) -> bool:
+    """Return whether a space has one `Discrete` and at least two boxes beside it, and nothing else."""
+    parts = list(space.spaces.values())
+    num_boxes = sum(isinstance(part, spaces.Box) for part in parts)
+    return num_boxes >= 2 and num_boxes == len(parts) - 1 and any(isinstance(part, spaces.Discrete) for part in parts)
 
 
 def _is_action(space: spaces.Space) -> bool:

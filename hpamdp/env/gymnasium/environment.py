@@ -66,6 +66,8 @@ class GymnasiumOptions(Settings):
     """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If None, all but masks."""
     observation_scaling: Scaling = "bounds"
     """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not."""
+    raw_observations: list[int | str] | None = None
+    """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If None, all are scaled."""
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
     num_workers: NonNegativeInt = 0
@@ -131,7 +133,9 @@ class GymnasiumEnv(PAMDPEnv):
         self.max_steps = self._copies.max_steps
         self.parameter_dims = self._copies.actions.parameter_dims
         try:
-            self.scaling = ObservationScaling(self._copies.observations, options.observation_scaling)
+            self.scaling = ObservationScaling(
+                self._copies.observations, options.observation_scaling, options.raw_observations or ()
+            )
         except ValueError as error:
             raise SettingError(f"{self._name}: {error}") from error
         self.option_names = self._names_of_options()

@@ -55,6 +55,27 @@ class ObservationSpace:
         self._clip_high = np.concatenate([leaf.clip_high for leaf in self.leaves])
         self._is_clipped = out_of_bounds == "clip"
 
+    def places(self, entries: Sequence[int | str]) -> np.ndarray:
+        """Return which numbers of the vectors belong to these entries, bool `[dim]`.
+
+        Args:
+            entries: of a `Tuple` (numbers from 0) or `Dict` (names); of any other space, numbers of the vector.
+
+        Raises:
+            ValueError: there is no such entry.
+        """
+        allowed = list(dict.fromkeys(leaf.path[0] for leaf in self.leaves)) if self._names else [*range(self.dim)]
+        wrong = [entry for entry in entries if entry not in allowed]
+        if wrong:
+            named = str(allowed) if self._names else f"0 to {self.dim - 1}"
+            raise SettingError(f"raw_observations={list(entries)}: must name observed entries, which are {named}")
+        is_place = np.zeros(self.dim, bool)
+        if not self._names:
+            is_place[[int(entry) for entry in entries]] = True
+        for leaf, own in zip(self.leaves, self.slices, strict=True):
+            is_place[own] |= bool(leaf.path) and leaf.path[0] in entries
+        return is_place
+
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the bounds of the vectors, float64 `[dim]` each."""
         box = flatten_space(self._space)

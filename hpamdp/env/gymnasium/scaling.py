@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -28,19 +28,21 @@ class ObservationScaling:
         scaling: `bounds` maps entries with finite bounds at most a million apart to [-1, 1] and leaves the others as
             they are. `running` normalises to mean 0 and standard deviation 1 over all observations so far, and clips to
             [-10, 10]. `none` changes nothing.
+        raw: entries that stay as they are, whatever the scaling; see `ObservationSpace.places`.
 
     Attributes:
         statistics: of all observations so far, with `running`; else None.
 
     Raises:
-        ValueError: there is no such scaling.
+        ValueError: there is no such scaling or entry.
     """
 
-    def __init__(self, space: ObservationSpace, scaling: Scaling) -> None:
+    def __init__(self, space: ObservationSpace, scaling: Scaling, raw: Sequence[int | str] = ()) -> None:
         if scaling not in get_args(Scaling):
             raise SettingError(f"observation_scaling={scaling!r}, but must be one of {', '.join(get_args(Scaling))}")
         self.dim = space.dim
         self.statistics = RunningStatistics(self.dim) if scaling == "running" else None
+        self._is_raw = space.places(raw) if raw else None
         self._is_frozen = False
         self._centre = np.zeros(self.dim)
         self._half_width = np.ones(self.dim)
@@ -62,6 +64,10 @@ class ObservationScaling:
 
     def rescaled(self, vectors: np.ndarray) -> np.ndarray:
         """Return observations `[M, dim]` scaled as by `scaled`, but without updating the statistics."""
+        scaled = self._all_scaled(vectors)
+        return scaled if self._is_raw is None else np.where(self._is_raw, vectors.astype(np.float32), scaled)
+
+    def _all_scaled(self, vectors: np.ndarray) -> np.ndarray:
         if self.statistics is None:
             return ((vectors - self._centre) / self._half_width).astype(np.float32)
         return self.statistics.normalised(vectors).clip(-_CLIP, _CLIP).astype(np.float32)
