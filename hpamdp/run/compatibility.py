@@ -217,12 +217,12 @@ def collector_fits_the_run(config: Config) -> str | None:
 
 
 def shared_scaling_needs_one_process(config: Config, problem: ProblemFacts) -> str | None:
-    """Require a single process for environments that learn a common scale."""
+    """Require a single process for environments that learn a common scale or start processes themselves."""
     if config.run.mode == "eval" or config.collector.settings.get("num_workers", 1) == 1 or problem.is_shardable:
         return None
     return (
-        f"{config.collector}: {config.env} learns the scale of its observations from all environments together; "
-        "use collector=single or env.observation_scaling=bounds"
+        f"{config.collector}: {config.env} learns the scale of its observations or rewards from all environments "
+        "together, or starts processes itself; use collector=single"
     )
 
 

@@ -25,9 +25,9 @@ from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import MaskSource
 from hpamdp.env.gymnasium.processes import ProcessCopies
-from hpamdp.env.gymnasium.scaling import ObservationScaling, Scaling
+from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
 from hpamdp.env.registration import register
-from hpamdp.settings import SettingError, Settings
+from hpamdp.settings import PositiveFraction, SettingError, Settings
 
 _SUCCESS = "success"
 _SEED = "seed"
@@ -68,6 +68,8 @@ class GymnasiumOptions(Settings):
     """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not."""
     raw_observations: list[int | str] | None = None
     """Entries that stay unscaled: names in a `Dict`, numbers in a `Tuple` or of the vector. If None, all are scaled."""
+    reward_scaling: PositiveFraction | None = None
+    """Divide rewards in training by the running deviation of the return with this discount. If None, they stay."""
     out_of_bounds: OutOfBounds = "refuse"
     """If a number is outside the bounds of its `Box`, `refuse` ends the run, `clip` moves it, and `allow` keeps it."""
     num_workers: NonNegativeInt = 0
@@ -140,6 +142,8 @@ class GymnasiumEnv(PAMDPEnv):
             raise SettingError(f"{self._name}: {error}") from error
         self.option_names = self._names_of_options()
         self._make_specs()
+        gamma = options.reward_scaling
+        self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma)
         self._action_shapes = (self.batch_size, torch.Size((num_envs, sum(self.parameter_dims))))
         self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
         self._reports_success = False
@@ -172,7 +176,7 @@ class GymnasiumEnv(PAMDPEnv):
     @property
     def is_shardable(self) -> bool:
         """Whether no running statistics are kept, which all environments must share, and no processes are started."""
-        return self.scaling.statistics is None and self.options.num_workers == 0
+        return not self._statistics() and self.options.num_workers == 0
 
     @property
     def title(self) -> str:
@@ -205,6 +209,11 @@ class GymnasiumEnv(PAMDPEnv):
         """
         self.scaling.share(other.scaling)
 
+    def seed_evaluation(self, seed: int) -> None:
+        """Seed the episodes of an evaluation, which reports rewards as they are."""
+        super().seed_evaluation(seed)
+        self._reward_scaling = None
+
     @property
     def keeps_episodes(self) -> bool:
         """Whether episodes continue in a resumed run: no, the state of somebody else's environment is unknown."""
@@ -212,8 +221,11 @@ class GymnasiumEnv(PAMDPEnv):
 
     def env_state(self) -> dict[str, Tensor]:
         """Return the running statistics, if there are any; the state of the episodes is unknown."""
-        statistics = self.scaling.statistics
-        return {} if statistics is None else statistics.columns()
+        return {name: column for each in self._statistics() for name, column in each.columns().items()}
+
+    def _statistics(self) -> list[RunningStatistics]:
+        kept = [self.scaling.statistics, None if self._reward_scaling is None else self._reward_scaling.statistics]
+        return [statistics for statistics in kept if statistics is not None]
 
     def set_env_state(self, columns: Mapping[str, Tensor]) -> None:
         """Continue with saved running statistics; new episodes start.
@@ -221,8 +233,8 @@ class GymnasiumEnv(PAMDPEnv):
         Raises:
             ValueError: the statistics are of observations of another length.
         """
-        if self.scaling.statistics is not None and columns:
-            self.scaling.statistics.set_columns(columns)
+        for statistics in self._statistics() if columns else ():
+            statistics.set_columns(columns)
 
     def statistics(self) -> dict[str, Tensor]:
         """Return the running statistics: they are the whole `env_state`."""
@@ -299,6 +311,8 @@ class GymnasiumEnv(PAMDPEnv):
             self._next_seeds[row] = None
         self._copies.reset(chosen)
         self._scale(is_reset)
+        if self._reward_scaling is not None:
+            self._reward_scaling.begin(is_reset)
         return self._read()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -310,7 +324,10 @@ class GymnasiumEnv(PAMDPEnv):
         self._copies.step(np.flatnonzero(is_stepped).tolist(), option, chosen, values)
         self._reports_success |= bool(results.has_success.any())
         self._scale(is_stepped)
-        return self._read(np.where(is_stepped, results.reward, 0.0).astype(np.float32))
+        rewards = np.where(is_stepped, results.reward, 0.0)
+        if self._reward_scaling is not None:
+            rewards = self._reward_scaling.scaled(rewards, is_stepped)
+        return self._read(rewards.astype(np.float32))
 
     def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
         # `_read` returns every entry in its final shape. TorchRL takes a quarter of its own time to check that.

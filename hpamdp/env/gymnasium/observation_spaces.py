@@ -147,10 +147,12 @@ class ObservationSpace:
 def _check_entries(space: spaces.Space, entries: Sequence[int | str]) -> None:
     names = list(children(space))
     if not names:
-        raise SettingError(f"observation_keys={entries}: the observation {written(space)} has no entries; use null")
+        raise SettingError(
+            f"observation_keys={list(entries)}: the observation {written(space)} has no entries; use null"
+        )
     wrong = [entry for entry in entries if entry not in names]
     if wrong or not entries or len(set(entries)) < len(entries):
-        raise SettingError(f"observation_keys={entries}: must name different entries of {names}; null: all")
+        raise SettingError(f"observation_keys={list(entries)}: must name different entries of {names}; null: all")
 
 
 def _is_flat(space: spaces.Space) -> bool:

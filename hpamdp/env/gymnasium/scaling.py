@@ -18,6 +18,7 @@ Scaling = Literal["bounds", "running", "none"]
 # Bounds further apart than this count as none: some environments write 1e10 or the largest float.
 _WIDEST = 1e6
 _CLIP = 10.0
+_SMALLEST = 1e-6  # standard deviation that is not counted as 0
 
 
 class ObservationScaling:
@@ -86,6 +87,46 @@ class ObservationScaling:
         self._is_frozen = True
 
 
+class RewardScaling:
+    """Divides rewards by the running standard deviation of the discounted return, in training.
+
+    Source: `gymnasium.wrappers.vector.NormalizeReward`.
+
+    Differs from the source:
+    - a return starts again at 0 with every episode, also after a time limit;
+    - a deviation below 1e-6 counts as 1, and scaled rewards are clipped to [-10, 10].
+
+    Args:
+        num: number of environments.
+        gamma: discount of the return.
+
+    Attributes:
+        statistics: of all discounted returns so far.
+    """
+
+    def __init__(self, num: int, gamma: float) -> None:
+        self.statistics = RunningStatistics(1, "return")
+        self._gamma = gamma
+        self._returns = np.zeros(num)
+
+    def begin(self, is_reset: np.ndarray) -> None:
+        """Begin the returns of these environments, bool `[N]`."""
+        self._returns[is_reset] = 0.0
+
+    def scaled(self, rewards: np.ndarray, is_stepped: np.ndarray) -> np.ndarray:
+        """Return the rewards `[N]` of a step scaled, after an update of the statistics.
+
+        Args:
+            rewards: 0 where no step was taken.
+            is_stepped: which environments took a step, bool `[N]`.
+        """
+        if is_stepped.any():
+            self._returns = np.where(is_stepped, self._gamma * self._returns + rewards, self._returns)
+            self.statistics.update(self._returns[is_stepped, None])
+        deviation = float(np.sqrt(self.statistics.var[0]))
+        return (rewards / (deviation if deviation > _SMALLEST else 1.0)).clip(-_CLIP, _CLIP)
+
+
 class RunningStatistics(RunningMeanStd):
     """Gymnasium's mean and variance of all vectors so far, float64 `[dim]`, that can be saved.
 
@@ -93,22 +134,24 @@ class RunningStatistics(RunningMeanStd):
 
     Args:
         dim: length of the vectors.
+        name: beginning of the columns' names.
     """
 
-    def __init__(self, dim: int) -> None:
+    def __init__(self, dim: int, name: str = "observation") -> None:
+        self._name = name
         super().__init__(epsilon=0.0, shape=(dim,))
 
     def normalised(self, vectors: np.ndarray) -> np.ndarray:
         """Return vectors `[M, dim]` minus the mean, in standard deviations; constant entries keep their unit."""
         deviation = np.sqrt(self.var)
-        return (vectors - self.mean) / np.where(deviation > 1e-6, deviation, 1.0)
+        return (vectors - self.mean) / np.where(deviation > _SMALLEST, deviation, 1.0)
 
     def columns(self) -> dict[str, Tensor]:
         """Return a copy of the statistics, for a checkpoint."""
         return {
-            "observation_count": torch.tensor(self.count, dtype=torch.float64),
-            "observation_mean": torch.tensor(self.mean, dtype=torch.float64),
-            "observation_variance": torch.tensor(self.var, dtype=torch.float64),
+            f"{self._name}_count": torch.tensor(self.count, dtype=torch.float64),
+            f"{self._name}_mean": torch.tensor(self.mean, dtype=torch.float64),
+            f"{self._name}_variance": torch.tensor(self.var, dtype=torch.float64),
         }
 
     def set_columns(self, columns: Mapping[str, Tensor]) -> None:
@@ -120,9 +163,9 @@ class RunningStatistics(RunningMeanStd):
         for name, column in self.columns().items():
             if name not in columns or columns[name].shape != column.shape:
                 raise ValueError(f"running statistics: {name} must have shape {list(column.shape)}")
-            is_mean = name == "observation_mean"
+            is_mean = name == f"{self._name}_mean"
             if not (columns[name].isfinite() & (is_mean | (columns[name] >= 0.0))).all():
                 raise ValueError(f"running statistics: {name} must be finite{'' if is_mean else ' and at least 0'}")
-        self.count = columns["observation_count"].item()
-        self.mean = columns["observation_mean"].to("cpu", torch.float64, copy=True).numpy()
-        self.var = columns["observation_variance"].to("cpu", torch.float64, copy=True).numpy()
+        self.count = columns[f"{self._name}_count"].item()
+        self.mean = columns[f"{self._name}_mean"].to("cpu", torch.float64, copy=True).numpy()
+        self.var = columns[f"{self._name}_variance"].to("cpu", torch.float64, copy=True).numpy()

@@ -1,0 +1,46 @@
+"""Rewards of training are scaled if asked; those of evaluations never are."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from gymnasium_players import make, step
+
+from hpamdp.env.gymnasium.environment import GymnasiumEnv
+
+
+def steps(env: GymnasiumEnv, num: int) -> np.ndarray:
+    """Return the rewards of steps with resets in between, `[num, N]`."""
+    rewards = []
+    env.reset()
+    for _ in range(num):
+        after = step(env)
+        rewards.append(after["reward"].squeeze(-1).double().numpy())
+        env.maybe_reset(after)
+    return np.stack(rewards)
+
+
+def test_rewards_are_divided_by_the_deviation_of_the_discounted_returns_so_far():
+    plain, scaled = (steps(make(2, max_steps=3, reward_scaling=gamma), 7) for gamma in (None, 0.5))
+    returns, so_far = np.zeros(2), []
+    for number, rewards in enumerate(plain):
+        returns = rewards + (0.0 if number % 3 == 0 else 0.5) * returns
+        so_far.extend(returns)
+        deviation = np.std(so_far)
+        expected = rewards / (deviation if deviation > 1e-6 else 1.0)
+        assert np.allclose(scaled[number], expected.clip(-10.0, 10.0), atol=1e-5)
+
+
+def test_an_evaluation_reports_rewards_as_they_are():
+    env = make(2, max_steps=3, reward_scaling=0.9)
+    env.seed_evaluation(0)
+    assert np.array_equal(steps(env, 3), steps(make(2, max_steps=3), 3))
+
+
+def test_the_statistics_of_rewards_are_saved_and_restored():
+    one, other = (make(2, max_steps=3, reward_scaling=0.9, observation_scaling="running") for _ in range(2))
+    steps(one, 5)
+    other.set_env_state(one.env_state())
+    assert len(one.env_state()) == 6
+    assert all(torch.equal(column, one.env_state()[name]) for name, column in other.env_state().items())
+    assert not one.is_shardable
