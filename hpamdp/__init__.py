@@ -4,7 +4,8 @@ The names below are all that a user needs. Everything else is internal and may c
 
 - `make`, `make_gymnasium`: a problem as a TorchRL or as a Gymnasium environment.
 - `train`, `load`: train an agent, or load a trained one. Both return an `Agent`, which acts, is evaluated and saved.
-- `Callback`: the base of code that runs during training.
+- `Callback`: the base of code that runs during training. `BestAgent`, `Patience`, `TimeLimit` and `OwnMetrics` are
+  callbacks to choose from.
 - `PAMDPSpecs`: sizes and bounds of a problem, `PAMDPSpecs.from_env(env)`. Learners and selectors are built from it.
 - Learners: `BC`, `DLPA`, `HPPO`, `HSAC`, `HyAR`, `IQL`, `PADDPG`, `PDQN`, `PETS`, `QPAMDP`, `TD3BC`.
 - Selectors: `Actor`, `EpsilonGreedy`, `Exp3`, `LinThompson`, `LinUCB`, `MetaCritic`, `OptionCritic`, `Thompson`, `UCB`.

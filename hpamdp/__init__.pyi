@@ -30,7 +30,13 @@ from .policies.low_level.pdqn import PDQN as PDQN
 from .policies.low_level.pets.learner import PETS as PETS
 from .policies.low_level.qpamdp import QPAMDP as QPAMDP
 from .policies.low_level.td3_bc import TD3BC as TD3BC
-from .run.callbacks import Callback as Callback
+from .run.callbacks import (
+    BestAgent as BestAgent,
+    Callback as Callback,
+    OwnMetrics as OwnMetrics,
+    Patience as Patience,
+    TimeLimit as TimeLimit,
+)
 from .run.train import DivergedError as DivergedError
 from .specs import PAMDPSpecs as PAMDPSpecs
 

@@ -34,7 +34,7 @@ OPTIONS = dict(
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> DLPA:
-    return DLPA(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+    return DLPA(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
 def boats(seen: torch.Tensor) -> episode.BoatState:

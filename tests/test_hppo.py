@@ -27,7 +27,7 @@ OPTIONS = dict(
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> HPPO:
     torch.manual_seed(0)
-    return HPPO(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+    return HPPO(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
 @pytest.mark.parametrize("greedy_discrete", ["most_probable", "sampled"])

@@ -25,7 +25,7 @@ OPTIONS = dict(
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> HSAC:
-    return HSAC(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+    return HSAC(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
 def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Tensor) -> float:

@@ -25,7 +25,7 @@ OPTIONS = dict(
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> HyAR:
-    return HyAR(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+    return HyAR(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
 def one_step_rows(learner: HyAR, num: int) -> TensorDict:

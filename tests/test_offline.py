@@ -302,13 +302,13 @@ def greedy_action(learner, num_updates: int) -> tuple[int, float]:
 
 def test_behaviour_cloning_finds_the_mean_parameter_of_the_data():
     options = COMMON | dict(min_scale=0.02, max_scale=1.0, lr=3e-3, weight_decay=0.0)
-    _, parameter = greedy_action(BC(SPECS, torch.device("cpu"), **options), 400)
+    _, parameter = greedy_action(BC(SPECS, device=torch.device("cpu"), **options), 400)
     assert parameter == pytest.approx(0.55, abs=0.05)
 
 
 @pytest.mark.parametrize(("learner", "options"), [(IQL, IQL_OPTIONS), (TD3BC, TD3BC_OPTIONS)], ids=["iql", "td3_bc"])
 def test_offline_learners_find_the_better_actions_of_the_data(learner, options):
-    discrete, parameter = greedy_action(learner(SPECS, torch.device("cpu"), **options), 600)
+    discrete, parameter = greedy_action(learner(SPECS, device=torch.device("cpu"), **options), 600)
     assert discrete == 1
     assert parameter == pytest.approx(0.95, abs=0.12)
 

@@ -38,7 +38,7 @@ def make_critic(**changes: object) -> OptionCritic:
         epsilon_steps=2000, buffer_size=20_000, batch_size=128, updates_per_step=0.05, max_updates=64,
         warmup_steps=500, lr=3e-3, termination_lr=3e-3, tau=0.05,
     )  # fmt: skip
-    return OptionCritic(SPECS, CPU, **{**options, **changes})
+    return OptionCritic(SPECS, device=CPU, **{**options, **changes})
 
 
 def make_meta_critic() -> MetaCritic:
@@ -48,7 +48,7 @@ def make_meta_critic() -> MetaCritic:
         ucb_width=2.0, gamma=GAMMA, buffer_size=10_000, batch_size=64, updates_per_decision=0.1,
         max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
     )  # fmt: skip
-    return MetaCritic(SPECS, CPU, **options)
+    return MetaCritic(SPECS, device=CPU, **options)
 
 
 def ending(selector, learners=None) -> HierarchicalAgent:

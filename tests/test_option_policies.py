@@ -43,7 +43,7 @@ OPTIONS = {
 
 def make(cls: type, seed: int = 0, **changes: object) -> MetaCritic | Actor:
     torch.manual_seed(seed)
-    return cls(SPECS, CPU, **{**OPTIONS[cls], **changes})
+    return cls(SPECS, device=CPU, **{**OPTIONS[cls], **changes})
 
 
 def greedy_regret(selector: MetaCritic | Actor) -> float:

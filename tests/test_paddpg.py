@@ -22,7 +22,7 @@ GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> PADDPG:
-    return PADDPG(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+    return PADDPG(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
 def rows_with_scores(num: int = 200) -> TensorDict:

@@ -26,7 +26,7 @@ PUBLISHED = dict(twin=False, target_smoothing=0.0, policy_delay=1)
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> PDQN:
-    return PDQN(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+    return PDQN(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
 def learn(learner: PDQN, num_batches: int, size: int = 200) -> None:

@@ -35,7 +35,7 @@ OPTIONS = dict(
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> PETS:
     torch.manual_seed(0)
-    return PETS(specs, CPU, **{**OPTIONS, **changes})
+    return PETS(specs, device=CPU, **{**OPTIONS, **changes})
 
 
 def batch_of(state, discrete, unit, reward, next_state, terminated, truncated=None, specs=SPECS) -> TensorDict:

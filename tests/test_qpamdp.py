@@ -40,7 +40,7 @@ GREEDY = set_exploration_type(ExplorationType.DETERMINISTIC)
 
 
 def make(specs: PAMDPSpecs = SPECS, **changes) -> QPAMDP:
-    return QPAMDP(specs, torch.device("cpu"), **{**OPTIONS, **changes})
+    return QPAMDP(specs, device=torch.device("cpu"), **{**OPTIONS, **changes})
 
 
 def make_sarsa(**changes) -> SarsaLambda:

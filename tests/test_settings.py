@@ -34,3 +34,8 @@ def test_widths_are_a_list_or_a_tuple_and_never_a_set():
     assert HPPO.Options(hidden_dims=[8, 4]).hidden_dims == (8, 4)
     with pytest.raises(ValueError, match="hidden_dims"):
         HPPO.Options(hidden_dims={8, 4})
+
+
+def test_a_number_in_the_place_of_the_device_is_refused_by_python():
+    with pytest.raises(TypeError, match="takes 2 positional arguments"):
+        HPPO(SPECS, 1e-3)

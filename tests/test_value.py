@@ -81,7 +81,7 @@ def test_epsilon_is_the_share_of_random_options():
 def make_agent(is_shared: bool) -> HierarchicalAgent:
     torch.manual_seed(0)
     specs = [BOATS.with_option_observed()] if is_shared else [BOATS.of_option(i) for i in range(2)]
-    learners = [PETS(own, CPU, **OPTIONS) for own in specs]
+    learners = [PETS(own, device=CPU, **OPTIONS) for own in specs]
     return HierarchicalAgent(Value(BOATS, epsilon=0.0), learners, BOATS, is_shared=is_shared)
 
 
@@ -104,7 +104,7 @@ def test_plans_choose_the_boat(is_shared):
 
 @pytest.mark.parametrize("end_values", [False, True])
 def test_while_exploring_options_without_an_update_come_first(end_values):
-    learners = [PETS(BOATS.of_option(i), CPU, **{**OPTIONS, "end_values": end_values}) for i in range(2)]
+    learners = [PETS(BOATS.of_option(i), device=CPU, **{**OPTIONS, "end_values": end_values}) for i in range(2)]
     agent = HierarchicalAgent(Value(BOATS, epsilon=0.0), learners, BOATS)
     learners[0].updates += 1
     learners[0].policy.is_trained.fill_(True)

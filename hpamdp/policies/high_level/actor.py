@@ -65,6 +65,7 @@ class Actor(OnPolicy, Selector):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: ActorOptions | None = None,
         **settings: Any,

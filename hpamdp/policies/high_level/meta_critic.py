@@ -62,6 +62,7 @@ class MetaCritic(Selector):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: MetaCriticOptions | None = None,
         **settings: Any,

@@ -74,6 +74,7 @@ class OptionCritic(Selector):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: OptionCriticOptions | None = None,
         **settings: Any,

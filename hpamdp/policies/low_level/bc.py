@@ -46,6 +46,7 @@ class BC(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: BCOptions | None = None,
         **settings: Any,

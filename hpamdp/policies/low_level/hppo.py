@@ -113,6 +113,7 @@ class HPPO(OnPolicy, Learner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: HPPOOptions | None = None,
         **settings: Any,

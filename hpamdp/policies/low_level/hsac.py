@@ -151,6 +151,7 @@ class HSAC(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: HSACOptions | None = None,
         **settings: Any,

@@ -386,6 +386,7 @@ class HyAR(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: HyAROptions | None = None,
         **settings: Any,

@@ -66,6 +66,7 @@ class IQL(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: IQLOptions | None = None,
         **settings: Any,

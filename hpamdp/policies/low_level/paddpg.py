@@ -146,6 +146,7 @@ class PADDPG(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: PADDPGOptions | None = None,
         **settings: Any,

@@ -220,6 +220,7 @@ class PDQN(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: PDQNOptions | None = None,
         **settings: Any,

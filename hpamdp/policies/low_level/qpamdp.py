@@ -410,6 +410,7 @@ class QPAMDP(Learner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: QPAMDPOptions | None = None,
         **settings: Any,

@@ -135,6 +135,7 @@ class TD3BC(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: TD3BCOptions | None = None,
         **settings: Any,

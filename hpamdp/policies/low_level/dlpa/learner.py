@@ -116,6 +116,7 @@ class DLPA(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: DLPAOptions | None = None,
         **settings: Any,

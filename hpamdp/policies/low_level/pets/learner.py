@@ -86,6 +86,7 @@ class PETS(ReplayLearner):
     def __init__(
         self,
         specs: PAMDPSpecs,
+        *,
         device: torch.device | str = "cpu",
         options: PETSOptions | None = None,
         **settings: Any,
