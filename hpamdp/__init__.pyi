@@ -7,7 +7,6 @@ from .api.training import load as load
 from .api.training import train as train
 from .config.errors import ConfigError as ConfigError
 from .env.base import PAMDPEnv as PAMDPEnv
-from .env.registration import register as register
 from .policies.base import Learner as Learner
 from .policies.base import Selector as Selector
 from .policies.high_level.actor import Actor as Actor
@@ -30,13 +29,11 @@ from .policies.low_level.pdqn import PDQN as PDQN
 from .policies.low_level.pets.learner import PETS as PETS
 from .policies.low_level.qpamdp import QPAMDP as QPAMDP
 from .policies.low_level.td3_bc import TD3BC as TD3BC
-from .run.callbacks import (
-    BestAgent as BestAgent,
-    Callback as Callback,
-    OwnMetrics as OwnMetrics,
-    Patience as Patience,
-    TimeLimit as TimeLimit,
-)
+from .run.callbacks import BestAgent as BestAgent
+from .run.callbacks import Callback as Callback
+from .run.callbacks import OwnMetrics as OwnMetrics
+from .run.callbacks import Patience as Patience
+from .run.callbacks import TimeLimit as TimeLimit
 from .run.train import DivergedError as DivergedError
 from .specs import PAMDPSpecs as PAMDPSpecs
 
