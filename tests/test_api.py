@@ -350,3 +350,31 @@ def test_an_agent_is_refused_at_a_problem_of_other_sizes(platform_agent):
 def test_an_unknown_agent_is_refused_with_the_names_that_exist():
     with pytest.raises(hpamdp.ConfigError, match="linucb_hppo"):
         hpamdp.load("no_such_agent")
+
+
+@pytest.mark.parametrize(("name", "problem"), [("meta_critic_hppo_rooms", "rooms"), ("linucb_hppo", "boatdock")])
+def test_acting_step_by_step_equals_the_evaluation_also_if_options_end_inside_episodes(name, problem):
+    agent = hpamdp.load(name)
+    expected = agent.evaluate(episodes=6, seed=3, per_episode=True)
+    env = hpamdp.make(problem, num_envs=6)
+    env.seed_evaluation(3)
+    td, total = env.reset(env.fixed_episodes(3)), torch.zeros(6)
+    done = torch.zeros(6, dtype=torch.bool)
+    while not done.all():
+        acted = agent.act(td["observation"].numpy())
+        if isinstance(acted, dict):
+            option, discrete, parameters = acted["option"], acted["key"], acted["duration"]
+        else:
+            option, discrete, parameters = *acted[:2], np.concatenate(acted[2], -1)
+        leaves = {"option": option, ("action", "discrete"): discrete, ("action", "parameters"): parameters}
+        for key, leaf in leaves.items():
+            td[key] = torch.from_numpy(leaf)
+        td = env.step(td)["next"]
+        total += td["reward"].squeeze(-1)
+        done |= td["done"].squeeze(-1)
+    np.testing.assert_allclose(total, expected["return"], atol=1e-4)
+
+
+def test_fewer_episodes_of_a_seed_are_the_first_of_more(platform_agent):
+    few, more = (platform_agent.evaluate(episodes=num, per_episode=True)["return"] for num in (3, 6))
+    np.testing.assert_array_equal(few, more[:3])

@@ -129,6 +129,8 @@ class Agent:
     def _seen(self, fresh: TensorDict) -> TensorDictBase:
         """Return what the policy reads: new rows `[N]`, and what stays from the last step."""
         num = len(fresh)
+        if not self._kept:  # every step is like a first one
+            return fresh.set(keys.IS_DECISION, torch.ones(num, 1, dtype=torch.bool, device=fresh.device))
         never = torch.zeros(num, 1, dtype=torch.bool, device=fresh.device)
         fresh.set(keys.DONE, never)
         if self._last is None:
@@ -150,8 +152,6 @@ class Agent:
         return seen
 
     def _check_length(self, seen: TensorDictBase) -> None:
-        if not self._kept:
-            return
         steps, longest = int(seen.get(keys.EPISODE_STEPS).max()), self._env.max_steps
         if steps >= longest:
             raise ValueError(

@@ -91,6 +91,8 @@ def train(
     parts.evaluation.env.close()
     if progress:
         say(table)
+        if is_interrupted:
+            say(f"Stopped at {trainer.frames:,}{trainer.unit}")
     return Agent(config, parts.agent, parts.env.base_env, trainer.progress(), trainer.recorder.metrics.rows())
 
 
