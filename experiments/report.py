@@ -4,7 +4,9 @@ python experiments/report.py    runs `main([])` of every study.py; renews the ta
                                 report/report.html, and every figure as SVG
 
 In the page of a study, `<!-- table -->` and `<!-- /table -->` enclose all its tables. In the project's README, that of
-agents/ and in docs/, `<!-- table 2 of STUDY -->` and `<!-- /table -->` enclose the second table of that study.
+agents/ and in docs/, `<!-- table 2 of STUDY -->` and `<!-- /table -->` enclose the second table of that study. In
+docs/, tables made from csv files and from rows of a study's tables are renewed by docs/hooks.py, which explains their
+marks.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
+from types import ModuleType
 from unittest import mock
 
 import markdown
@@ -70,6 +73,7 @@ def report(experiments: Path, target: Path) -> list[str]:
     for page in (root / "README.md", root / "agents/README.md", *sorted((root / "docs").glob("*.md"))):
         if page.exists():
             failures += renew_numbered(page, tables)
+    failures += renew_filled(root / "docs")
     (target / "report.html").write_text(bind(pages), encoding="utf-8")
     return failures
 
@@ -102,12 +106,17 @@ def page_of(folder: Path, tables: str | None) -> str | None:
 
 def run(script: Path, figures: Path) -> str:
     """Run `main([])` of a study, return the printed text, and save its figures also as SVG."""
-    spec = importlib.util.spec_from_file_location(f"study_{script.parent.name}", script)
-    module = importlib.util.module_from_spec(spec)
     with redirect_stdout(io.StringIO()) as printed, saved_as_svg_too(figures):
-        spec.loader.exec_module(module)
-        module.main([])
+        _load(script, f"study_{script.parent.name}").main([])
     return printed.getvalue()
+
+
+def _load(script: Path, name: str) -> ModuleType:
+    """Return a module that lies outside the package."""
+    spec = importlib.util.spec_from_file_location(name, script)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @contextmanager
@@ -177,6 +186,28 @@ def renew_numbered(page: Path, tables: Mapping[str, str]) -> list[str]:
 
     renew(page, table_for)
     return missing
+
+
+def renew_filled(docs: Path) -> list[str]:
+    """Renew the tables that the directives of docs/hooks.py describe, in all pages of docs/.
+
+    Returns:
+        A line for each page with a directive that leads nowhere.
+    """
+    if not (docs / "hooks.py").exists():
+        return []
+    hooks = _load(docs / "hooks.py", "site_hooks")
+    failures = []
+    for page in sorted(docs.rglob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        try:
+            renewed = hooks.with_tables(text)
+        except (hooks.SiteError, OSError) as error:
+            failures.append(f"{page.name}: {error}")
+            continue
+        if renewed != text:
+            page.write_text(renewed, encoding="utf-8")
+    return failures
 
 
 def to_html(text: str, folder: Path) -> tuple[str, list[str]]:

@@ -16,6 +16,7 @@ from hpamdp.analysis.study import (
     finished,
     groups,
     interquartile_mean,
+    mean_interval,
     middle_half,
     read_csv,
     spread,
@@ -159,9 +160,9 @@ def test_seeds_that_do_not_vary_have_an_interval_of_no_width(values):
     assert interquartile_mean(values) == (2.0, 2.0, 2.0)
 
 
-def test_an_interquartile_mean_is_shown_from_five_seeds_on():
-    assert middle_half([1.0, 2.0, 3.0, 4.0]) == ""
-    assert middle_half([1.0, 1.0, 1.0, 1.0, 1.0]) == "1.000 (1.000 to 1.000)"
+def test_an_interquartile_mean_is_shown_from_ten_seeds_on():
+    assert middle_half([1.0, 2.0, 3.0, 4.0] * 2) == ""
+    assert middle_half([1.0] * 10) == "1.000 (1.000 to 1.000)"
 
 
 def test_a_difference_is_clear_where_its_interval_excludes_0():
@@ -177,17 +178,23 @@ def test_a_difference_is_clear_where_its_interval_excludes_0():
     assert difference([1.0, 1.0], [1.0, 1.0]).improvement == 0.5
 
 
-def test_a_difference_has_no_interval_with_one_seed_and_leaves_outer_quarters_out_from_five_on():
+def test_a_difference_has_no_interval_with_one_seed_and_leaves_outer_quarters_out_from_ten_on():
     assert str(difference([2.0], [1.0, 1.5])) == "+0.750" and not difference([2.0], [1.0, 1.5]).is_clear
-    assert difference([1.0, 1.0, 1.0, 1.0, 100.0], [0.0] * 5).mean == 1.0
-    assert difference([1.0, 1.0, 1.0, 97.0], [0.0] * 5).mean == 25.0
+    assert difference([*[1.0] * 9, 100.0], [0.0] * 10).mean == 1.0
+    assert difference([1.0, 1.0, 1.0, 97.0], [0.0] * 10).mean == 25.0
 
 
 def test_the_interval_of_a_difference_covers_the_truth_about_as_often_as_it_says():
     generator = np.random.default_rng(0)
-    for num in (3, 12):
-        pairs = [difference(generator.normal(size=num), generator.normal(size=num)) for _ in range(40)]
-        assert 0.85 <= np.mean([not pair.is_clear for pair in pairs]) <= 1.0
+    for num, repeats, least in ((3, 400, 0.93), (5, 400, 0.93), (12, 40, 0.85)):
+        pairs = [difference(generator.normal(size=num), generator.normal(size=num)) for _ in range(repeats)]
+        assert least <= np.mean([not pair.is_clear for pair in pairs]) <= 1.0
+
+
+def test_the_interval_of_a_mean_covers_the_truth_as_often_as_it_says():
+    draws = np.random.default_rng(0).normal(size=(1000, 3))
+    assert np.mean([low <= 0.0 <= high for low, high in map(mean_interval, draws)]) == pytest.approx(0.95, abs=0.02)
+    assert np.isnan(mean_interval([1.0])).all() and mean_interval([2.0, 2.0]) == (2.0, 2.0)
 
 
 def test_a_curve_of_one_seed_has_no_deviation():
@@ -246,6 +253,12 @@ def test_few_steps_keeps_runs_that_were_left_running_apart(tmp_path):
     assert last == "| congruent | 1 | 1.500 | 2.500 | 1 s |"
 
 
+def test_the_hierarchy_is_tabulated_from_its_stored_runs():
+    hierarchy = study("hierarchy")
+    lines = hierarchy.table(read_csv(EXPERIMENTS / "hierarchy/results.csv")).splitlines()
+    assert any(line.startswith("| actor | hppo | 4,000,000, 1,000,000 | 3 | 3.579 ± 0.001 |") for line in lines)
+
+
 def test_domains_scores_each_learner_by_its_longest_runs_and_finds_the_steps_to_the_best_published_score():
     domains = study("domains")
 
@@ -263,17 +276,33 @@ def test_domains_scores_each_learner_by_its_longest_runs_and_finds_the_steps_to_
     assert domains.at_published_steps(curves + too_many) == curves[:6]
 
 
-def test_domains_ranks_learners_by_the_mean_that_it_shows_and_counts_runs_within_the_cpu_limit():
+def test_domains_ranks_learners_by_the_plain_mean_and_counts_runs_within_the_cpu_limit():
     domains = study("domains")
 
     def runs(learner, frames, cpu_s, *scores):
         name = {"domain": "goal", "learner": learner, "frames": frames, "cpu_s": cpu_s}
         return [name | {"seed": seed, "success": score} for seed, score in enumerate(scores)]
 
-    # One bad seed of five does not move the interquartile mean, but the mean.
+    # One bad seed of five lowers the mean, but not the interquartile mean.
     bad_seed, steady = runs("hyar", 1000, 500.0, 0.9, 0.9, 0.9, 0.9, 0.0), runs("pdqn", 1000, 700.0, *[0.8] * 5)
     line = domains.best_table(bad_seed + steady, [{"domain": "goal", "method": "chdp", "score": 0.81}]).splitlines()[-1]
-    assert line.startswith("| goal | hyar | 0.900 [") and "| pdqn | 0.80 | 0.81 (chdp) | 500 s |" in line
+    assert line.startswith("| goal | pdqn | 2 | 0.800 ± 0.000 (5), IQM 0.800 success | 0.800 to 0.800 | hyar (5) |")
+    assert line.endswith("| 0.20 | hyar | 0.81 (chdp) | 700 s |")
     assert domains.within_cpu_limit(bad_seed + steady + runs("hyar", 3000, 601.0, 1.0)) == bad_seed
     table = domains.table(steady, [], [{"domain": "goal", "player": "random", "score": 0.0004}])
     assert table.splitlines()[-1].startswith("| random |  | 0.0004 |")
+    assert "| 0.720 ± 0.402 (5), IQM 0.900 |" in domains.table(bad_seed, [], [])
+
+
+def test_domains_names_learners_that_differ_from_the_best_by_chance():
+    domains = study("domains")
+
+    def runs(learner, *scores):
+        name = {"domain": "goal", "learner": learner, "frames": 1000, "cpu_s": 1.0}
+        return [name | {"seed": seed, "success": score} for seed, score in enumerate(scores)]
+
+    results = (
+        runs("hppo", 0.9, 0.8, 0.7) + runs("pdqn", 0.9, 0.7, 0.7) + runs("hyar", 0.1, 0.1, 0.2) + runs("dlpa", 0.75)
+    )
+    cells = domains.best_table(results, []).splitlines()[-1].split("|")
+    assert [cell.strip() for cell in cells[5:9]] == ["0.552 to 1.048", "pdqn (3)", "0.61", "pdqn; one seed: dlpa"]

@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, NullFormatter
 
 from hpamdp.analysis.study import (
-    MIN_SEEDS,
     Rows,
     Run,
     curve,
@@ -28,6 +27,7 @@ from hpamdp.analysis.study import (
     first_at,
     groups,
     interquartile_mean,
+    mean_interval,
     read_csv,
     spread,
     write_tables,
@@ -51,6 +51,7 @@ DOMAINS = {
 }
 BATCH_TOLERANCE = 0.03  # a run ends with a whole batch, so its steps exceed the published ones by a little
 MIN_SEEDS_COMPARED = 3  # least seeds of both learners for a probability of improvement
+MIN_SEEDS_MIDDLE = 5  # least seeds for an interquartile mean beside the mean
 FIRST_STEPS = 700  # start of the curves' axes, before any evaluation
 CPU_LIMIT = 600.0  # seconds, of the table within ten minutes
 AUGMENTED = "_augment"  # follows a learner's name if it learns from steps mapped by the problem's symmetries
@@ -163,45 +164,58 @@ def _values(rows: Rows) -> list[float]:
 
 
 def _cell(values: list[float]) -> str:
-    """Return the interquartile mean and interval with `MIN_SEEDS` seeds, else mean ± deviation, and the seeds."""
+    """Return mean ± deviation, the number of seeds and, with `MIN_SEEDS_MIDDLE` seeds, the interquartile mean."""
     if not values:
         return ""
-    if len(values) < MIN_SEEDS:
-        return f"{spread(values)} ({len(values)})"
-    middle, low, high = interquartile_mean(values)
-    return f"{middle:.3f} [{low:.3f}, {high:.3f}] ({len(values)})"
-
-
-def _middle(values: list[float]) -> float:
-    """Return the mean that a cell shows."""
-    return float(np.mean(values)) if len(values) < MIN_SEEDS else interquartile_mean(values)[0]
+    middle = f", IQM {interquartile_mean(values)[0]:.3f}" if len(values) >= MIN_SEEDS_MIDDLE else ""
+    return f"{spread(values)} ({len(values)}){middle}"
 
 
 def best_table(results: Rows, published: Rows) -> str:
-    """Return a line for each domain: our best learner, its probability of improvement, and the best published score."""
+    """Return a line for each domain: our learner with the highest mean, the next ones, and the best published score.
+
+    The highest mean is chosen on the scored episodes, so a column has the number of learners that it is chosen from.
+    """
     lines = [
-        "| domain | best | score | next best | probability of improvement | best published | CPU of a run |",
-        "|---|---|---|---|---|---|---|",
+        "| domain | highest mean | of learners | score | 95 % interval | next (seeds) | probability of improvement "
+        "| not clearly lower | best published | CPU of a run |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, (_, what) in DOMAINS.items():
         cells = groups([row for row in results if row["domain"] == name], "learner")
-        ranked = sorted(cells.items(), key=lambda cell: -_middle(_values(cell[1])))
-        if not ranked:
+        values = {low: _values(rows) for (low,), rows in cells.items()}
+        if not values:
             continue
-        (best,), rows = ranked[0]
-        second, improvement = "", ""
-        if len(ranked) > 1:
-            second = ranked[1][0][0]
-            if min(len(rows), len(ranked[1][1])) >= MIN_SEEDS_COMPARED:
-                improvement = f"{difference(_values(rows), _values(ranked[1][1])).improvement:.2f}"
+        best, *others = sorted(values, key=lambda low: -float(np.mean(values[low])))
+        second = f"{others[0]} ({len(values[others[0]])})" if others else ""
+        improvement = ""
+        if others and min(len(values[best]), len(values[others[0]])) >= MIN_SEEDS_COMPARED:
+            improvement = f"{difference(values[best], values[others[0]]).improvement:.2f}"
+        low, high = mean_interval(values[best])
         top = best_published(published, name)
-        beside = f"{top['score']:g} ({top['method']})" if top else ""
-        unit = "return" if what == "score" else "success"
-        cpu = f"{np.mean([row['cpu_s'] for row in rows]):.0f} s"
-        lines.append(
-            f"| {name} | {best} | {_cell(_values(rows))} {unit} | {second} | {improvement} | {beside} | {cpu} |"
-        )
+        columns = [
+            name,
+            best,
+            len(values),
+            f"{_cell(values[best])} {'return' if what == 'score' else 'success'}",
+            "" if np.isnan(low) else f"{low:.3f} to {high:.3f}",
+            second,
+            improvement,
+            _not_clearly_lower(values, best, others),
+            f"{top['score']:g} ({top['method']})" if top else "",
+            f"{np.mean([row['cpu_s'] for row in cells[(best,)]]):.0f} s",
+        ]
+        lines.append(f"| {' | '.join(map(str, columns))} |")
     return "\n".join(lines)
+
+
+def _not_clearly_lower(values: dict[str, list[float]], best: str, others: Sequence[str]) -> str:
+    """Return the learners whose difference to the best one has an interval with 0, and those with a single seed."""
+    found = {low: difference(values[best], values[low]) for low in others}
+    ties = [low for low, each in found.items() if not np.isnan(each.low) and not each.is_clear]
+    # The difference to a single seed has no interval. Only seeds within the range of the best learner's are named.
+    single = [low for low in others if len(values[low]) == 1 and values[low][0] >= min(values[best])]
+    return "; ".join([*([", ".join(ties)] if ties else []), *([f"one seed: {', '.join(single)}"] if single else [])])
 
 
 def cost_table(results: Rows) -> str:

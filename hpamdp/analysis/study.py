@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_
 
 Rows = list[dict[str, Any]]
 
-MIN_SEEDS = 5  # smallest number of seeds for an interquartile mean
+MIN_SEEDS = 10  # smallest number of seeds for an interquartile mean and a bootstrap interval
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ def spread(values: Sequence[float], digits: int = 3) -> str:
 def interquartile_mean(values: Sequence[float]) -> tuple[float, float, float]:
     """Return the mean of the middle half, and the bounds of its 95 % bootstrap interval over seeds.
 
-    With fewer than `MIN_SEEDS` values it is close to the plain mean, so `middle_half` omits it.
+    With fewer than `MIN_SEEDS` values the interval is too narrow, so `middle_half` omits both.
 
     Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
     """
@@ -152,14 +153,26 @@ def middle_half(values: Sequence[float]) -> str:
     return f"{middle:.3f} ({low:.3f} to {high:.3f})"
 
 
+def mean_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Return the bounds of Student's 95 % t interval of the mean over seeds; NaN with a single seed.
+
+    It assumes that scores are normal over seeds. If one seed in five fails, the mean is less certain than it says.
+    """
+    sample = np.asarray(values, dtype=float)
+    if len(sample) < 2:
+        return np.nan, np.nan
+    half = float(stats.t.ppf(0.975, len(sample) - 1) * stats.sem(sample))
+    return float(sample.mean()) - half, float(sample.mean()) + half
+
+
 @dataclass(frozen=True)
 class Difference:
     """Difference of two methods' scores, with the seeds as the unit.
 
     Attributes:
         mean: difference of the means, or of the interquartile means if both have `MIN_SEEDS` seeds or more.
-        low, high: 95 % bootstrap interval of the difference; NaN if either method has a single seed. With three seeds
-            of each, the interval contains the true difference in 90 % of cases.
+        low, high: 95 % interval of the difference; NaN if either method has a single seed. It is Welch's t interval, or
+            the bootstrap interval if both have `MIN_SEEDS` seeds or more.
         improvement: probability that a seed of the first method exceeds a seed of the second. Ties count half.
     """
 
@@ -187,24 +200,31 @@ def difference(values: Sequence[float], others: Sequence[float]) -> Difference:
     Source: Agarwal et al. 2021, arXiv 2108.13264, for one task.
     """
     sample, other = np.asarray(values, dtype=float), np.asarray(others, dtype=float)
-    proportion = 0.25 if min(len(sample), len(other)) >= MIN_SEEDS else 0.0
-
-    def statistic(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
-        return stats.trim_mean(x, proportion, axis=axis) - stats.trim_mean(y, proportion, axis=axis)
-
-    mean = float(statistic(sample, other, 0))
     pairs = np.sign(sample[:, None] - other[None, :])
     improvement = float((0.5 * (pairs + 1.0)).mean())
+    if min(len(sample), len(other)) >= MIN_SEEDS:
+        mean = float(_difference_of_middles(sample, other, 0))
+        return Difference(mean, *_interval((sample, other), _difference_of_middles), improvement)
+    mean = float(sample.mean() - other.mean())
     if min(len(sample), len(other)) < 2:
         return Difference(mean, np.nan, np.nan, improvement)
-    return Difference(mean, *_interval((sample, other), statistic), improvement)
+    if np.ptp(sample) == np.ptp(other) == 0.0:
+        return Difference(mean, mean, mean, improvement)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # scores of one of them that do not vary
+        bounds = stats.ttest_ind(sample, other, equal_var=False).confidence_interval()
+    return Difference(mean, float(bounds.low), float(bounds.high), improvement)
+
+
+def _difference_of_middles(x: np.ndarray, y: np.ndarray, axis: int) -> np.ndarray:
+    return stats.trim_mean(x, 0.25, axis=axis) - stats.trim_mean(y, 0.25, axis=axis)
 
 
 def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., np.ndarray]) -> tuple[float, float]:
     """Return the 95 % expanded percentile bootstrap interval of a statistic of independent samples.
 
-    The plain percentile interval of a few seeds is too narrow: for three seeds against three, it contains the true
-    difference in 78 % of cases. The expanded interval is as wide as Student's t interval, within the samples' range.
+    The plain percentile interval of a few seeds is too narrow. The expanded interval is as wide as Student's t
+    interval, within the samples' range, so it also needs `MIN_SEEDS` seeds.
 
     Source: Hesterberg 2015, *What teachers should know about the bootstrap*, arXiv 1411.5279.
     """
