@@ -11,6 +11,8 @@
   `<!-- csv experiments/domains/published.csv: domain=platform -->`: the rows of a csv file by a column;
   `<!-- runs experiments/domains/results.csv: learner=pdqn, pdqn_published -->`: a study's runs by a column. Runs that
   differ only in their seed become one row, mean ± standard deviation.
+  `experiments/report.py` also writes the tables of the last three kinds into the pages themselves, up to the next
+  `<!-- /table -->`, for readers of a clone. A test compares them with their sources.
 - Every module with a docstring gets a page in the API.
 """
 
@@ -36,6 +38,8 @@ log = logging.getLogger("mkdocs.hooks.pages")
 FENCE = re.compile(r"^ *```.*?^ *```[^\n]*$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?(?=\))")
 DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv|runs) (.+?) -->$", re.MULTILINE)
+# A directive whose table is in the page itself.
+FILLED = re.compile(r"^(<!-- (rows of|csv|runs) (.+?) -->\n)(?:[^<\n].*\n)*<!-- /table -->\n", re.MULTILINE)
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
 LANGUAGES = {".py": "python", ".yaml": "yaml", ".yml": "yaml", ".csv": "text", ".toml": "toml", ".cff": "yaml"}
 PICTURES = {".png", ".gif", ".svg"}
@@ -122,7 +126,8 @@ class Site:
 
     def converted(self, path: str) -> str:
         """Return the text of a page with its directives filled in and its links turned into the site's."""
-        text = TABLE_MARK.sub("", (ROOT / path).read_text(encoding="utf-8"))
+        text = FILLED.sub(r"\1", (ROOT / path).read_text(encoding="utf-8"))
+        text = TABLE_MARK.sub("", text)
 
         def fill(found: re.Match[str]) -> str:
             try:
@@ -159,6 +164,11 @@ class Site:
             body = f"```{LANGUAGES.get(file.suffix, 'text')}\n{file.read_text(encoding='utf-8').rstrip()}\n```"
         self.pages[place] = f"---\nsearch:\n  exclude: true\n---\n# `{target}`\n\n{body}\n"
         return place
+
+
+def with_tables(text: str) -> str:
+    """Return the text of a page with the tables of its directives filled in anew, as a clone shows it."""
+    return FILLED.sub(lambda found: f"{found[1]}{DIRECTIVES[found[2]](found[3])}\n<!-- /table -->\n", text)
 
 
 def outside_code(text: str, change: Callable[[str], str]) -> str:

@@ -69,6 +69,19 @@ def test_no_link_and_no_directive_of_the_site_leads_nowhere(hooks):
     assert {"index.md", "studies/table1.md", "changelog.md", "api/hpamdp/env/base.md"} <= site.pages.keys()
 
 
+def test_a_clone_shows_every_table_as_its_csv_file_has_it_or_says_where_to_look(hooks):
+    """A failure means: run `python experiments/report.py`."""
+    for file in sorted(DOCS.rglob("*.md")):
+        text = file.read_text()
+        assert hooks.with_tables(text) == text, f"the tables of {file.name} are out of date"
+        marks = re.findall(r"^<!-- (?:rows of|csv|runs) .+ -->$", text, re.MULTILINE)
+        assert len(marks) == len(hooks.FILLED.findall(text)), f"{file.name} has a directive without <!-- /table -->"
+        for path in re.findall(r"^<!-- docstring of (.+?):", text, re.MULTILINE):
+            assert re.search(rf"\]\([./]*{re.escape(path)}\)", text), f"{file.name} does not link to {path}"
+        if "<!-- settings of" in text:
+            assert re.search(r"The settings are (the (fields|arguments) of `\w+` in \[|those of \[)", text), file.name
+
+
 def test_directives_are_filled_in_and_wrong_ones_are_told(hooks, tmp_path, monkeypatch):
     (tmp_path / "docs").mkdir()
     (tmp_path / "hpamdp").mkdir()

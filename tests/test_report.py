@@ -33,6 +33,14 @@ after
 """
 
 
+HOOKS = """
+SiteError = ValueError
+
+def with_tables(text):
+    if "wrong" in text:
+        raise SiteError("no row")
+    return text.replace("old", "new")
+"""
 FIRST_TABLE = "| a | b |\n|---|---|\n| 1 \\ 2 | 0.5 |"
 SECOND_TABLE = "| c |\n|---|\n| 3 |"
 
@@ -141,3 +149,14 @@ def test_the_exit_code_says_whether_all_studies_worked(module, experiments, monk
     (experiments / "sad/study.py").write_text(STUDY)
     assert module.main() == 0
     assert capsys.readouterr().err == "" and "study_fine" not in sys.modules
+
+
+def test_tables_of_directives_are_renewed_in_all_pages_and_wrong_ones_are_told(module, tmp_path):
+    docs = tmp_path / "docs"
+    (docs / "domains").mkdir(parents=True)
+    (docs / "hooks.py").write_text(HOOKS)
+    (docs / "domains/a.md").write_text("old")
+    (docs / "b.md").write_text("wrong")
+    assert module.renew_filled(docs) == ["b.md: no row"]
+    assert (docs / "domains/a.md").read_text() == "new"
+    assert module.renew_filled(tmp_path) == []
