@@ -22,6 +22,12 @@ def speed(duration: Any) -> Any:
     return duration * duration * (100.0 - (20.0 / 3.0) * duration)
 
 
+# A new outcome, or another rule for docking, also has to be written where the rules are written again:
+# - `physics.press` and `kernel._press`;
+# - `planner`, which knows only docking at rest, and would give a wrong ceiling without an error;
+# - `play/page/physics.js` (rule and score) and `play/page/game.js` (its words for outcomes);
+# - `play/episodes.py` (`Episode.outcome` and `score`), `figures.py` (colours), `reference.py` (people's figures).
+# tests/test_rule_copies.py compares the names and constants, and the planner's docking with `physics`.
 # In this order: going on, success, the failures, the time limit. `physics` and `kernel` determine the outcome.
 OUTCOMES = ("sailing", "success", "too_fast", "out_of_bounds", "out_of_fuel", "time_limit")
 SAILING, SUCCESS, TOO_FAST, OUT_OF_BOUNDS, OUT_OF_FUEL, TIME_LIMIT = range(len(OUTCOMES))
