@@ -53,6 +53,8 @@ def closing_table(summary: Mapping[str, Any], metrics: Sequence[Metric]) -> str:
     for first, *others in cells:
         aligned = [first.ljust(widths[0]), *map(str.rjust, others, widths[1:])]
         lines.append("   ".join(aligned).rstrip())
+    if any("" in row[1:] for row in cells[1:]):
+        lines.append("empty cells: no figure is stored for that reference with these settings")
     lines += summary.get(SHORT_SIGHT, [])
     without = summary.get(WITHOUT_UPDATE, [])
     lines += [f"no update was made: {', '.join(without)}"] if without else []

@@ -263,7 +263,9 @@ class PDQN(ReplayLearner):
     def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared TD error, summed over the critics.
 
-        The target is r + discount * V(s'), where V is `value`.
+        The target is r + discount * V(s'), where V is `value`. A subclass may override `target`, which returns it as
+        `[B]`, given a sample with `state`, `discrete`, `unit` (the executed parameters in [-1, 1]), `reward`,
+        `next_state` and `discount`. `sample` also has the masks if the problem has any, and the options.
         """
         q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
         loss = (q - self.target(sample)).square().mean(-1).sum()  # q is [num_critics, B]
