@@ -95,7 +95,7 @@ def test_a_ceiling_with_changes_that_options_never_make_is_told_in_one_line(caps
         ),
         (
             "high=linucb env=boatdock env.observation=pixels",
-            "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all (LinUCB, conf/high/linucb.yaml)",
+            "high: inputs=[14, 15]: the observation has entries 0 to 13; null: all (LinUCB)",
         ),
         (
             "high=exp3 low=iql mode=offline data=human",

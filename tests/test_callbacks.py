@@ -300,7 +300,7 @@ def test_a_guarded_setting_of_a_callback_in_a_saved_config_needs_trust():
         (["callbacks=[time_limit,{minutes:3}]"], 'callbacks.1={"minutes": 3}: must be the name of a callback'),
         (
             ["callbacks=[{name:patience,evaluation:3}]"],
-            "callbacks.0.evaluation: no such setting of Patience (conf/callback/patience.yaml); did you mean ev",
+            "callbacks.0.evaluation: no such setting of Patience; did you mean ev",
         ),
         (["callbacks=[{name:time_limit,minutes:0}]"], "callbacks.0.minutes=0: must be greater than 0 (TimeLimit, "),
         (["callbacks=[no_callback]"], "callback=no_callback: OrderedDict is no Callback (hpamdp.run.callbacks)"),

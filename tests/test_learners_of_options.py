@@ -58,7 +58,7 @@ def test_the_learner_of_an_option_gets_the_recipe_of_the_problem_and_the_length_
         ),
         (
             ["+low.per_option={jump: {name: random, lr: 3}}"],
-            "low.per_option.jump.lr: no such setting of Random (conf/low/random.yaml)",
+            "low.per_option.jump.lr: no such setting of Random",
         ),
         (
             ["+low.per_option={jump: ../low/random}"],

@@ -86,7 +86,7 @@ def test_features_use_only_the_inputs():
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"inputs": [0, 2]}, "high: inputs=[0, 2]: the observation has entries 0 to 1; null: all (LinUCB, conf/high"),
+        ({"inputs": [0, 2]}, "high: inputs=[0, 2]: the observation has entries 0 to 1; null: all (LinUCB)"),
         ({"inputs": []}, "high: inputs=[]: the observation has entries 0 to 1"),
         ({"inputs": [-1]}, "high.inputs.0=-1: must be greater than or equal to 0"),
         ({"degree": 62}, "high: degree=62: 2016 features of 2 inputs; at most 2000"),

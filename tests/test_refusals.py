@@ -41,7 +41,7 @@ REFUSED = [
     ("low.latent_dim=1000000000000", "low.latent_dim=1000000000000, low.buffer_size=300000: takes more memory "),
     ("high.memory=sliding_window high.window=10000000000000", "high.window=10000000000000: takes more memory "),
     # Numbers out of all proportion.
-    ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO, conf/low/hppo.yaml)"),
+    ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO, given as an argument)"),
     ("low=pdqn low.actor_lr=5", "low.actor_lr=5: must be above 0 and at most 1"),
     ("low=hsac low.temperature_lr=0", "low.temperature_lr=0: must be above 0 and at most 1"),
     ("high=actor high.lr=-1", "high.lr=-1: must be above 0 and at most 1"),
@@ -94,7 +94,7 @@ REFUSED = [
     (
         "env.boats=[congruent,sideways]",
         "env: boats=['congruent', 'sideways']: no controller sideways; controllers has "
-        "congruent, incongruent1, incongruent2 (BoatDockEnv, conf/env/boatdock.yaml)",
+        "congruent, incongruent1, incongruent2 (BoatDockEnv)",
     ),
     ("env.boats=[congruent,congruent]", "must be different controllers"),
     ("env.boats=[congruent]", "boats=['congruent']: nothing to choose; name more, or use controller=congruent"),
@@ -219,7 +219,7 @@ def saved(tmp_path_factory):
         ("low=hyar", "low=hyar: resume takes the agent from "),
         (
             "env.nose=1",
-            "env.nose: no such setting of PlatformEnv (conf/env/platform.yaml); did you mean noise? It has ",
+            "env.nose: no such setting of PlatformEnv; did you mean noise? It has ",
         ),
         ("env.noise=-1", "env.noise=-1: must be greater than or equal to 0"),
         ("data=human", "data=human: low=hppo learns from its own steps only"),

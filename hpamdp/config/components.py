@@ -109,8 +109,7 @@ class Component:
         try:
             return self.cls(**supplied, **settings)
         except SettingError as error:
-            where = f"{self.cls.__name__}, {file_of(self.group, self.name)}"
-            raise ConfigError(f"{self.group}: {first_line(error)} ({where})") from error
+            raise ConfigError(f"{self.group}: {first_line(error)} ({self.cls.__name__})") from error
         except Exception as error:
             if not is_about_memory(error):
                 raise
@@ -123,7 +122,13 @@ class Component:
         return ", ".join(f"{self.group}.{name}={as_json(sizes[name])}" for name in reversed(largest)) or str(self)
 
 
-def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "") -> Component:
+def component(
+    group: str,
+    name: str,
+    given: Mapping[str, Any],
+    prefix: str = "",
+    place_of: Callable[[str], str | None] | None = None,
+) -> Component:
     """Check the class and the settings of a group without building the object.
 
     Args:
@@ -131,6 +136,7 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
         name: name of the chosen yaml file.
         given: the group's part of the config as plain values, with its `_target_`.
         prefix: what precedes the name of a setting in messages; by default the group and a dot.
+        place_of: returns where a setting with this name in messages was set; None if that is not known.
 
     Raises:
         ConfigError: a class or a setting is wrong; the message lists all mistakes in one line.
@@ -141,7 +147,7 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
     target = given.get(TARGET)
     if target is None and group in _CAN_BE_NONE:
         model = create_model("none", __config__=_STRICT)
-        validated(model, settings, f"{group}.", f"setting of none ({file})", f"none, {file}")
+        validated(model, settings, f"{group}.", "setting of none", f"none, {file}")
         return Component(group, name, None, {})
     cls = _load_target(group, target, file)
     model = settings_model(cls, SUPPLIED_ARGUMENTS.get(group, ()))
@@ -151,8 +157,12 @@ def component(group: str, name: str, given: Mapping[str, Any], prefix: str = "")
             f"{group}={name}: {cls.__name__} has a setting {taken[0]}, but {group}.{taken[0]} is a value of the run; "
             f"rename the setting ({file})"
         )
-    where = f"{cls.__name__}, {file}"
-    checked = validated(model, settings, prefix or f"{group}.", f"setting of {cls.__name__} ({file})", where)
+
+    def where(setting: str | None) -> str:
+        place = None if setting is None or place_of is None else place_of(setting)
+        return cls.__name__ if place is None else f"{cls.__name__}, {place}"
+
+    checked = validated(model, settings, prefix or f"{group}.", f"setting of {cls.__name__}", where)
     return Component(group, name, cls, dict(checked))
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -22,6 +23,7 @@ from hpamdp.messages import first_line
 
 NESTED = "a yaml file names itself among its defaults, or a value nests too deep"
 RECIPE = "recipe"
+_EXPERIMENT = "experiment"
 _LONGEST_NAME = 200  # letters of a yaml file's name
 _SHOWN = 200  # letters of a command line in an error
 _NAMED_BY_YAML = "a yaml file names the class; give the name of the file"
@@ -76,11 +78,34 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
     OmegaConf.set_struct(own, False)
     own.pop("hydra", None)
     folders: tuple[str, ...] = ()
+    place_of: Callable[[str], str | None] | None = None
     if "hydra" in cfg or HydraConfig.initialized():
         node = cfg.hydra if "hydra" in cfg else HydraConfig.get()
         _check_found(node, names)
         folders = searched_folders(node)
-    return replace(check(plain(own), names), config_dirs=folders)
+        place_of = partial(_place_of, _words_of(node), names, folders)
+    return replace(check(plain(own), names, place_of), config_dirs=folders)
+
+
+def _place_of(words: Sequence[str], names: Mapping[str, str], folders: Sequence[str], setting: str) -> str | None:
+    """Return where a setting was set: as an argument, or in the yaml file that comes last among those that name it.
+
+    Args:
+        words: the words of the command line, or those that Python's arguments were turned into.
+        names: the name that was chosen for each group.
+        folders: folders of yaml files besides conf/.
+        setting: its name on the command line, such as `low.lr`.
+    """
+    given = [re.split("[=~]", word.lstrip("+~"), maxsplit=1)[0] for word in words]
+    if any(setting == name or setting.startswith(f"{name}.") for name in given if name not in GROUPS):
+        return "given as an argument"
+    group, _, rest = setting.partition(".")
+    for where, path in ((_EXPERIMENT, setting), (f"{RECIPE}/{group}", setting), (RECIPE, setting), (group, rest)):
+        for folder in (*folders, str(conf_dir())):
+            file = Path(folder) / where / f"{names.get(where)}.yaml"
+            if file.is_file() and OmegaConf.select(OmegaConf.load(file), path) is not None:
+                return file_of(where, names[where])
+    return None
 
 
 def searched_folders(node: Any) -> tuple[str, ...]:
@@ -119,19 +144,22 @@ def _check_found(node: Any, names: Mapping[str, str]) -> None:
             raise ConfigError(f"{group}={recipe}: {no_such(f'file in conf/{group}', recipe, names_of(group))}")
 
 
-def check(given: Mapping[str, Any], names: Mapping[str, str]) -> Config:
+def check(
+    given: Mapping[str, Any], names: Mapping[str, str], place_of: Callable[[str], str | None] | None = None
+) -> Config:
     """Check the config as plain values, without resolving text.
 
     Args:
         given: the values of the run, and for each group a mapping of `_target_` and the settings.
         names: the name that was chosen for each group.
+        place_of: returns where a setting such as `low.lr` was set, for errors; None if that is not known.
 
     Raises:
         ConfigError: a value is wrong.
     """
     run = check_run(given, names)
     learners = _learners_of_options(run, names["env"])
-    return checked_config(run, given, names, learners, listed_callbacks(run.callbacks, run.model_dump()))
+    return checked_config(run, given, names, learners, listed_callbacks(run.callbacks, run.model_dump()), place_of)
 
 
 def _learners_of_options(run: RunConfig, env: str) -> dict[str, tuple[str, dict[str, Any]]]:

@@ -5,17 +5,22 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, TypeAlias, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from hpamdp.config.renamed import renamed
+from hpamdp.config.renamed import elsewhere, renamed
 
 _MOST_COMPLAINTS = 3
+_MOST_GUESSES = 3
+_ABOUT_AS_CLOSE = 0.1  # difference of two names' similarities to a third, for which both are guesses
 _LONGEST_VALUE = 300  # letters of a value in a message
 # Larger numbers leave the range that a computation can hold; infinity is refused as well.
 _LARGEST_FLOAT, _LARGEST_INT = 1e12, 2**63 - 1
+
+# The class or the file that defines a value, and where the value was set if that is known.
+Where: TypeAlias = Callable[[str | None], str]
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -43,14 +48,21 @@ def as_json(value: object) -> str:
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:
-    """Return a message that a name does not exist, with the likely spelling and all known names."""
+    """Return a message that a name does not exist, with the likely ones and all known names."""
     known = sorted(known)
-    close = difflib.get_close_matches(name, known, n=1)
-    guess = f"did you mean {close[0]}? It" if close else "it"
+    guesses = elsewhere(name, known) or _close(name, known)
+    guess = f"did you mean {' or '.join(guesses)}? It" if guesses else "it"
     return f"no such {what}; {guess} has {', '.join(known) or 'none'}"
 
 
-def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: str, where: str) -> ModelT:
+def _close(name: str, known: list[str]) -> list[str]:
+    """Return the known names that are closest to a name, best first; several if they are about as close."""
+    close = difflib.get_close_matches(name, known, n=_MOST_GUESSES)
+    similarity = [difflib.SequenceMatcher(None, each, name).ratio() for each in close]
+    return [each for each, ratio in zip(close, similarity, strict=True) if ratio >= similarity[0] - _ABOUT_AS_CLOSE]
+
+
+def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: str, where: Where | str) -> ModelT:
     """Return the values as the model.
 
     Args:
@@ -58,25 +70,36 @@ def validated(model: type[ModelT], values: dict[str, Any], prefix: str, what: st
         values: plain values by name.
         prefix: the names' prefix on the command line, such as `low.`.
         what: kind of the values, such as `setting of HPPO`.
-        where: class and file that define the values.
+        where: for the end of a complaint. A function gets the value's name on the command line, or None for a check of
+            several values.
 
     Raises:
         ConfigError: some values are wrong; the message lists all of them in one line.
     """
+
+    def place(setting: str | None) -> str:
+        return where if isinstance(where, str) else where(setting)
+
     try:
         # As JSON, in which the strict mode takes what a yaml can hold: a list where a tuple is wanted, 1 for 1.0.
         checked = model.model_validate_json(json.dumps(values, default=str))
     except ValidationError as error:
-        raise ConfigError(_in_one_line(error, model, values, prefix, what, where)) from error
-    _refuse_huge(model, values, prefix, where)
+        raise ConfigError(_in_one_line(error, model, values, prefix, what, place)) from error
+    _refuse_huge(model, values, prefix, place)
     return checked
 
 
 def _in_one_line(
-    error: ValidationError, model: type[BaseModel], values: dict[str, Any], prefix: str, what: str, where: str
+    error: ValidationError,
+    model: type[BaseModel],
+    values: dict[str, Any],
+    prefix: str,
+    what: str,
+    where: Where,
 ) -> str:
     unknown: list[str] = []
     wrong: dict[str, dict[str, None]] = {}
+    place: dict[str, str] = {}
     for problem in error.errors(include_url=False):
         path, value = _locate(problem["loc"], values)
         setting = prefix + ".".join(path)
@@ -85,14 +108,19 @@ def _in_one_line(
             unknown.append(f"{setting}: {renamed(setting, known) or no_such(what, path[-1], known)}")
         elif problem["type"] == "missing":
             wrong[setting] = {"missing": None}
+            place[setting] = where(setting)
         elif not path:  # a check of several fields, whose message names them
-            wrong[prefix.replace(".", ": ") + _reworded(problem["msg"], value)] = {"": None}
+            complaint = prefix.replace(".", ": ") + _reworded(problem["msg"], value)
+            wrong[complaint] = {"": None}
+            place[complaint] = where(None)
         else:
             # A union complains once for each of its types.
-            wrong.setdefault(f"{setting}={as_json(value)}", {})[_reworded(problem["msg"], value)] = None
+            given = f"{setting}={as_json(value)}"
+            wrong.setdefault(given, {})[_reworded(problem["msg"], value)] = None
+            place[given] = where(setting)
     complaints = [
-        f"{setting}: {' or '.join(messages)} ({where})" if any(messages) else f"{setting} ({where})"
-        for setting, messages in wrong.items()
+        f"{given}: {' or '.join(messages)} ({place[given]})" if any(messages) else f"{given} ({place[given]})"
+        for given, messages in wrong.items()
     ]
     return "; ".join([*_shortened(unknown), *complaints])
 
@@ -112,7 +140,7 @@ def _shortened(complaints: list[str]) -> list[str]:
     return complaints if num_more <= 0 else [*complaints[:_MOST_COMPLAINTS], f"and {num_more} more like this"]
 
 
-def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: str) -> None:
+def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str, where: Where) -> None:
     """Refuse numbers that are too large to compute with, in a model's fields and in lists there."""
     for name in model.model_fields:
         value = values.get(name)
@@ -121,8 +149,9 @@ def _refuse_huge(model: type[BaseModel], values: Mapping[str, Any], prefix: str,
                 continue
             largest = _LARGEST_INT if isinstance(number, int) else _LARGEST_FLOAT
             if abs(number) > largest:
+                setting = f"{prefix}{name}"
                 raise ConfigError(
-                    f"{prefix}{name}={as_json(value)}: must lie between -{largest} and {largest} ({where})"
+                    f"{setting}={as_json(value)}: must lie between -{largest} and {largest} ({where(setting)})"
                 )
 
 

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.config.command_line import GRAMMAR, CommandLine, as_text, choices_in, written_out
-from hpamdp.config.components import GROUPS, TARGET, file_of
+from hpamdp.config.components import GROUPS, TARGET
 from hpamdp.config.compose import NESTED, beginning_of
 from hpamdp.config.errors import no_such
 from hpamdp.config.renamed import renamed
@@ -118,5 +118,5 @@ def _no_such_setting(cfg: DictConfig, path: list[str], name: str, known: list[st
         return no_such(f"group or value of the run ({RUN_FILE})", name, {*known, *folders} - {"hydra"})
     if len(path) == 1 and path[0] in GROUPS:
         cls = str(OmegaConf.to_container(cfg[path[0]]).get(TARGET) or "none").rpartition(".")[2]  # type: ignore[union-attr]
-        return no_such(f"setting of {cls} ({file_of(path[0], cfg.hydra.runtime.choices[path[0]])})", name, known)
+        return no_such(f"setting of {cls}", name, known)
     return no_such(f"value of {'.'.join(path)}", name, known)

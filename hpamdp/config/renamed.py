@@ -1,4 +1,4 @@
-"""Refuse old names of settings with the new name, and read settings with old names from saved runs."""
+"""Translate names of settings: old names in errors and saved runs, and names of other libraries in errors."""
 
 from __future__ import annotations
 
@@ -21,6 +21,41 @@ _NEW_NAMES = {
     "target_noise_clip": "target_smoothing_clip",
     "exploration_noise": "parameter_noise",
 }
+# Names of settings in Stable-Baselines3, CleanRL and Spinning Up, and ours.
+_ELSEWHERE: dict[str, tuple[str, ...]] = {
+    "learning_rate": ("lr", "actor_lr", "critic_lr"),
+    "lr": ("actor_lr", "critic_lr"),
+    "batch_size": ("minibatch_size",),
+    "num_minibatches": ("minibatch_size",),
+    "n_epochs": ("epochs",),
+    "update_epochs": ("epochs",),
+    "clip_range": ("clip",),
+    "clip_coef": ("clip",),
+    "ent_coef": ("discrete_entropy", "parameter_entropy", "discrete_temperature", "parameter_temperature"),
+    "vf_coef": ("critic_weight",),
+    "tau": ("actor_tau", "critic_tau"),
+    "learning_starts": ("warmup_steps",),
+    "gradient_steps": ("updates_per_step",),
+    "train_freq": ("updates_per_step",),
+    "policy_frequency": ("policy_delay",),
+    "exploration_fraction": ("epsilon_steps",),
+    "exploration_final_eps": ("epsilon_final",),
+    "end_e": ("epsilon_final",),
+    "exploration_noise": ("parameter_noise",),
+    "net_arch": ("hidden_dims",),
+    "hidden_sizes": ("hidden_dims",),
+    "n_steps": ("steps_per_batch",),
+    "num_steps": ("steps_per_batch",),
+    "rollout_length": ("steps_per_batch",),
+    "total_timesteps": ("total_frames",),
+    "num_timesteps": ("total_frames",),
+    "total_steps": ("total_frames",),
+    "n_envs": ("num_envs",),
+    "eval_freq": ("eval.every",),
+    "n_eval_episodes": ("eval.layouts",),
+}
+# Those that are values of the run, which a group does not have.
+_OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts")
 # Old values whose meaning changed with the name.
 _NEW_VALUES: dict[tuple[str, Any], Any] = {("rl", "td3"): True, ("rl", "ddpg"): False}
 
@@ -44,6 +79,12 @@ def renamed(setting: str, known: Iterable[str]) -> str | None:
     ]
     meaning = f" ({', '.join(values)})" if values else ""
     return f"is called {setting.rpartition('.')[0]}.{new} now{meaning}"
+
+
+def elsewhere(name: str, known: Iterable[str]) -> list[str]:
+    """Return our names for a setting of another library: those among the known names, or values of the run."""
+    known = set(known)
+    return [ours for ours in _ELSEWHERE.get(name, ()) if ours in known or ours in _OF_RUN]
 
 
 def with_new_names(group: str, settings: Mapping[str, Any], known: Iterable[str]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -260,6 +260,7 @@ def checked_config(
     names: Mapping[str, str],
     learners: Mapping[str, tuple[str, Any]],
     callbacks: Sequence[tuple[str, Any]],
+    place_of: Callable[[str], str | None] | None = None,
 ) -> Config:
     """Check the classes and the settings of all groups.
 
@@ -269,13 +270,16 @@ def checked_config(
         names: the name that was chosen for each group.
         learners: for single options, by the option's name: the learner's name, and a mapping as for a group.
         callbacks: the name of each callback, and a mapping as for a group.
+        place_of: returns where a setting such as `low.lr` was set, for errors; None if that is not known.
 
     Raises:
         ConfigError: a wrong value.
     """
     for group in GROUPS:
         check_base_class(group, names[group], given[group].get(TARGET))
-    components: dict[str, Any] = {group: component(group, names[group], given[group]) for group in GROUPS}
+    components: dict[str, Any] = {
+        group: component(group, names[group], given[group], place_of=place_of) for group in GROUPS
+    }
     low_of = {}
     for option, (name, low) in learners.items():
         check_base_class("low", name, low.get(TARGET))
