@@ -41,7 +41,7 @@ REFUSED = [
     ("low.latent_dim=1000000000000", "low.latent_dim=1000000000000, low.buffer_size=300000: takes more memory "),
     ("high.memory=sliding_window high.window=10000000000000", "high.window=10000000000000: takes more memory "),
     # Numbers out of all proportion.
-    ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO, given as an argument)"),
+    ("low=hppo low.lr=1e30", "low.lr=1e+30: must be above 0 and at most 1 (HPPO)"),
     ("low=pdqn low.actor_lr=5", "low.actor_lr=5: must be above 0 and at most 1"),
     ("low=hsac low.temperature_lr=0", "low.temperature_lr=0: must be above 0 and at most 1"),
     ("high=actor high.lr=-1", "high.lr=-1: must be above 0 and at most 1"),
