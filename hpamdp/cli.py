@@ -29,7 +29,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.hydra_errors import explained, not_understood
 from hpamdp.config.schema import RESUME_AUTO
 from hpamdp.config.stand_ins import RealImportsNeededError, quick_imports
-from hpamdp.env.errors import EnvironmentFaultError
+from hpamdp.env.errors import EnvironmentFaultError, ProblemError
 from hpamdp.limits import limit_in
 from hpamdp.messages import (
     first_line,
@@ -48,7 +48,7 @@ from hpamdp.shell import program
 
 _MISTAKE, _INTERRUPTED = 2, 130
 # Further commands, and the modules whose `main` gets the words that follow and a parser.
-_COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play"}
+_COMMANDS = {"watch": "hpamdp.run.watch", "play": "hpamdp.run.play", "report": "hpamdp.run.report"}
 # Errors that Hydra raises for a wrong command line or yaml file.
 _BEFORE_A_JOB = (HydraException, OmegaConfBaseException, yaml.YAMLError, OSError, ValueError, RecursionError)
 # Errors that no other setting can avoid: a full disk, limits of the process, a medium that is read only.
@@ -146,7 +146,6 @@ def _check_surroundings() -> None:
 def _run_command(name: str, words: list[str]) -> int:
     """Run a command that has options of its own, and return its exit code."""
     command = importlib.import_module(_COMMANDS[name])
-    from hpamdp.env.base import ProblemError  # takes seconds, which the other commands need not wait for
     from hpamdp.run.stopping import ProgramExitError, exits_explained
 
     parser = _Parser(prog=f"{program()} {name}", formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -6,11 +6,12 @@ import csv
 import math
 import shutil
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, Protocol
 
-from hpamdp.files import replacing
+from hpamdp.files import read_regular, replacing
 from hpamdp.messages import warn
 
 FRAMES, WALL_SECONDS = "frames", "wall_s"
@@ -31,6 +32,29 @@ def read_rows(path: Path) -> list[dict[str, float]]:
     except csv.Error as error:
         warn(f"{path} cannot be read; its rows are left out: {error}")
         return []
+
+
+def read_curve(path: Path, column: str, max_bytes: int) -> tuple[list[str], list[tuple[float, float]]]:
+    """Return the names of the columns, and the points (frames, value) of one column.
+
+    Rows without a number in either column are left out, and so is an incomplete last line. The time is linear in the
+    size of the file, whoever wrote it.
+
+    Raises:
+        OSError: the file is missing, not regular, unreadable or larger than `max_bytes`.
+        csv.Error: the file is of another kind.
+    """
+    text = read_regular(path, max_bytes).decode(errors="replace")
+    rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
+    columns = next(rows, [])
+    if FRAMES not in columns or column not in columns:
+        return columns, []
+    x, y = columns.index(FRAMES), columns.index(column)
+    points = []
+    for row in rows:
+        with suppress(ValueError, IndexError):
+            points.append((float(row[x]), float(row[y])))
+    return columns, points
 
 
 def _numbers(cells: Mapping[str | None, Any]) -> Iterable[tuple[str, float]]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from hpamdp.config.errors import ConfigError
 from hpamdp.config.yaml_files import check_size
 from hpamdp.files import read_regular
 
@@ -30,6 +30,18 @@ FILM_NAME = "episodes.gif"
 ERROR_NAME = "error.txt"
 # The largest config or summary that is read.
 MAX_TEXT_BYTES = 1 << 24
+# Settings that change neither the training nor the score.
+_BOOKKEEPING = (
+    "resume",
+    "trust",
+    "overwrite",
+    "film",
+    "save_best",
+    "logger",
+    "checkpoint_every",
+    "checkpoint_minutes",
+    "checkpoint_replay",
+)
 
 
 def saved_config(folder: Path) -> dict[str, Any]:
@@ -38,7 +50,7 @@ def saved_config(folder: Path) -> dict[str, Any]:
         text = read_regular(folder / CONFIG_NAME, MAX_TEXT_BYTES)
         check_size(folder / CONFIG_NAME)
         config = yaml.safe_load(text)
-    except (OSError, yaml.YAMLError, RecursionError, ConfigError):
+    except Exception:  # PyYAML raises errors of any kind, such as a KeyError for `!!bool x`
         return {}
     return config if isinstance(config, dict) else {}
 
@@ -50,3 +62,20 @@ def saved_summary(folder: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError):  # missing, or cut off in the middle
         return {}
     return summary if isinstance(summary, dict) else {}
+
+
+def flat_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a saved config by their dotted names, except those that change no result."""
+    flat = _flat(config)
+    return {
+        name: value
+        for name, value in flat.items()
+        if name.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING
+    }
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return flat

@@ -71,7 +71,7 @@ def test_a_failing_job_loses_no_other_and_is_named_at_the_end(command, jobs, tmp
     ]
     assert "Traceback" in (tmp_path / "sweep/2/error.txt").read_text()
     assert out.endswith("4 jobs: 2 finished; 1 refused; 1 failed\nBest score 4.000: seed=4 high=fixed (sweep/3)\n")
-    assert {path.name for path in (tmp_path / "sweep").iterdir()} == {"0", "1", "2", "3", "multirun.yaml"}
+    assert {path.name for path in (tmp_path / "sweep").iterdir()} == {"0", "1", "2", "3", "multirun.yaml", "report.csv"}
 
 
 def test_a_job_that_diverges_is_named_with_the_reason(command, jobs):
@@ -79,6 +79,42 @@ def test_a_job_that_diverges_is_named_with_the_reason(command, jobs):
     assert code == 1
     assert err == "seed=6: reward is nan at frame 7: training stopped (sweep/1)\n"
     assert "Job 1: failed: reward is nan at frame 7: training stopped\n" in out
+
+
+def test_a_sweep_ends_with_a_table_of_means_over_all_its_seeds_also_of_earlier_starts(command, jobs, tmp_path):
+    words = ["high=none", "env=platform", "hydra.sweep.dir=sweep", "hydra.sweep.subdir=${low.lr}/${seed}"]
+    command("-m", "low=hppo", "low.lr=0.1,0.2", "seed=4,8", *words)
+    code, out, err = command("-m", "low=hppo", "low.lr=0.1,0.2", "seed=4,8,12", *words)
+    table = out[out.index("            ") : out.index("6 jobs: ")].splitlines()
+    assert (code, err) == (0, "") and [line.split() for line in table[1:3]] == [
+        ["low.lr=0.1", "3", "8.000", "±", "4.000", "4.000", "12.000", "200,000"],
+        ["low.lr=0.2", "3", "8.000", "±", "4.000", "4.000", "12.000", "200,000"],
+    ]
+    assert table[-1] == "Written: sweep/report.csv"
+    assert (tmp_path / "sweep/report.csv").read_text().count("\n") == 7
+    assert table[:-1] == command("report", "sweep")[1].splitlines()
+    _, out, _ = command("-m", "low=hppo", "low.lr=0.1", "seed=4", *words)
+    assert "3   8.000 ± 4.000" in out, "runs of earlier starts count, too"
+
+
+def test_a_report_of_the_users_own_stays(command, jobs, tmp_path):
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep/report.csv").write_text("mine")
+    code, out, err = command("-m", "seed=0,4", "hydra.sweep.dir=sweep")
+    assert code == 0 and "score: mean ± standard deviation over seeds\n" in out
+    assert err.endswith("sweep/report.csv: no report has written this file, so it stays; move it away\n")
+    assert (tmp_path / "sweep/report.csv").read_text() == "mine"
+
+
+def test_a_sweep_around_the_working_directory_reports_its_own_jobs_alone(command, jobs, tmp_path):
+    command("-m", "seed=0,4", "hydra.sweep.dir=elsewhere")
+    _, out, _ = command("-m", "seed=8", "hydra.sweep.dir=.")
+    assert "score: of one seed, so without a deviation" in out
+
+
+def test_a_sweep_that_was_stopped_has_no_table_yet(command, jobs, tmp_path):
+    _, out, _ = command("-m", "seed=0,3", "hydra.sweep.dir=sweep")
+    assert "seeds" not in out and not (tmp_path / "sweep/report.csv").exists()
 
 
 def test_a_sweep_that_fails_by_mistakes_alone_exits_with_2(command, jobs):
@@ -136,7 +172,12 @@ def test_a_sweep_over_experiments_of_ones_own_lies_in_the_folder_that_they_name(
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(f"# @package _global_\nhydra: {{sweep: {{dir: 'my runs', subdir: {name}}}}}\n")
     assert command("--config-dir", str(tmp_path / "mine"), "-m", "experiment=first,second", "low=random")[0] == 0
-    assert {path.name for path in (tmp_path / "my runs").iterdir()} == {"first", "second", "multirun.yaml"}
+    assert {path.name for path in (tmp_path / "my runs").iterdir()} == {
+        "first",
+        "second",
+        "multirun.yaml",
+        "report.csv",
+    }
 
 
 def test_a_run_that_ended_early_is_finished_and_one_that_was_stopped_is_not(command, jobs):

@@ -6,7 +6,7 @@ import csv
 import os
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,14 @@ import numpy as np
 from scipy import stats
 
 from hpamdp.files import replacing
-from hpamdp.messages import warn
+from hpamdp.messages import one_line, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run_files import CONFIG_NAME, SUMMARY_NAME, TENSORBOARD_NAME, WANDB_NAME, saved_config, saved_summary
 
 Rows = list[dict[str, Any]]
 
 MIN_SEEDS = 10  # smallest number of seeds for an interquartile mean and a bootstrap interval
+_MOST_FOLDERS = 100_000  # a link may lead to the whole disk
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     Links to folders are followed. A run that is found twice counts once.
     """
     runs, seen = [], set[str]()
-    found = [run for folder in folders for run in sorted(_run_folders(Path(folder), seen))]
+    found = [run for folder in folders for run in sorted(run_folders(Path(folder), seen))]
     for folder in found:
         summary, config = saved_summary(folder), saved_config(folder)
         if not summary or not config:
@@ -60,24 +61,35 @@ def finished(folders: Iterable[Path | str]) -> list[Run]:
     return runs
 
 
-def _run_folders(folder: Path, seen: set[str]) -> Iterator[Path]:
-    """Yield the folders with a summary that are not in `seen`, and warn about broken links."""
+def run_folders(folder: Path, seen: set[str], marks: Collection[str] = (SUMMARY_NAME,)) -> Iterator[Path]:
+    """Yield the folders that hold a file with one of these names, and warn about broken links.
+
+    Links to folders are followed. Folders whose names begin with a dot are left out.
+
+    Args:
+        folder: the folder to search.
+        seen: real paths of folders that were searched before, and are left out. The searched folders are added.
+        marks: the names.
+    """
 
     def report(error: OSError) -> None:
-        warn(f"{error.filename}: {error.strerror}, left out")
+        warn(one_line(f"{error.filename}: {error.strerror}, left out"))
 
     for path, folders, files in os.walk(folder, onerror=report, followlinks=True):
         real = os.path.realpath(path)
-        # A link may lead to a folder above itself.
-        folders[:] = () if real in seen else [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME)]
-        if real in seen:
+        if real in seen:  # a link may lead to a folder above itself
+            folders.clear()
             continue
+        folders[:] = [name for name in folders if name not in (TENSORBOARD_NAME, WANDB_NAME) and name[0] != "."]
         seen.add(real)
+        if len(seen) > _MOST_FOLDERS:
+            warn(f"{folder}: has more than {_MOST_FOLDERS:,} folders, the others are left out")
+            return
+        if not {*marks}.isdisjoint(files):
+            yield Path(path)
         for name in files:
-            if name == SUMMARY_NAME:
-                yield Path(path)
-            elif not os.path.exists(os.path.join(path, name)):
-                warn(f"{os.path.join(path, name)}: is a broken link, left out")
+            if name not in marks and not os.path.exists(os.path.join(path, name)):
+                warn(one_line(f"{os.path.join(path, name)}: is a broken link, left out"))
 
 
 def write_tables(folder: Path, tables: Mapping[str, Rows]) -> None:

@@ -50,6 +50,8 @@ Examples
       lets you play the problem yourself; see {program} play --help
   {program} watch FOLDER
       films the agent of a run; see {program} watch --help
+  {program} report FOLDER
+      compares the runs in a folder by their means over seeds; see {program} report --help
   {program} low=hyar --cfg job
       shows every value and setting without running
   {program} --hydra-help

@@ -13,20 +13,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import upgraded
 from hpamdp.config.schema import Config
 from hpamdp.run import checkpoint
-from hpamdp.run_files import SUMMARY_NAME, saved_config, saved_summary
-
-# Settings that change neither the training nor the score.
-_BOOKKEEPING = (
-    "resume",
-    "trust",
-    "overwrite",
-    "film",
-    "save_best",
-    "logger",
-    "checkpoint_every",
-    "checkpoint_minutes",
-    "checkpoint_replay",
-)
+from hpamdp.run_files import SUMMARY_NAME, flat_settings, saved_config, saved_summary
 
 
 class Rest(NamedTuple):
@@ -69,18 +56,11 @@ def rest_of(wanted: Config, folder: Path, name: str = "its folder") -> Rest:
 def _difference(wanted: Config, saved: Mapping[str, Any]) -> str:
     """Return the difference of two configs as text, except in bookkeeping; empty if they agree."""
     # Convert through yaml, like the saved config.
-    here, there = _flat(yaml.safe_load(wanted.to_yaml())), _flat(upgraded(saved) if saved else {})
+    here = flat_settings(yaml.safe_load(wanted.to_yaml()))
+    there = flat_settings(upgraded(saved) if saved else {})
     names = [name for name in {**here, **there} if here.get(name) != there.get(name)]
-    names = [name for name in names if name.removeprefix("choices.").partition(".")[0] not in _BOOKKEEPING]
     if not names:
         return ""
     more = f" and {len(names) - 1} more" if names[1:] else ""
     values = [json.dumps(each.get(names[0]), default=str) for each in (there, here)]
     return f"{names[0]}={values[0]} for {values[1]}{more}"
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in values.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat

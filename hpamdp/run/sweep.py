@@ -263,6 +263,8 @@ def report(start: str, error: BaseException | None = None) -> int:
         if job.state == _RUNNING:
             job.state, job.reason = (_STOPPED, "") if is_stopped else (_FAILED, "ended without a word, or still runs")
     failed = [job for job in jobs if job.state in (_REFUSED, _FAILED)]
+    if not is_stopped:
+        _report_seeds(sweep_dir, jobs)
     _print_tally(jobs)
     for job in failed:
         told = Path(job.folder, ERROR_NAME)
@@ -278,6 +280,32 @@ def report(start: str, error: BaseException | None = None) -> int:
     if not failed:
         return 0
     return _MISTAKE if all(job.state == _REFUSED for job in failed) else 1
+
+
+def _report_seeds(sweep_dir: Path, jobs: Sequence[Job]) -> None:
+    """Print the table of means over seeds, and write it with its figure into the sweep's folder.
+
+    All runs in the sweep's folder count, also those of earlier starts. If the working directory lies in that folder,
+    only the runs of these jobs count.
+    """
+    # These imports take a second, which --help need not wait for.
+    from hpamdp.analysis.seed_report import report_on
+
+    folders = [] if Path.cwd().is_relative_to(sweep_dir) else [sweep_dir]
+    folders += [Path(job.folder) for job in jobs]
+    try:
+        report = report_on(_shown(folder) for folder in folders if os.path.isdir(folder))
+    except ConfigError:  # no job has become a run
+        return
+    say(report.table())
+    try:
+        files = report.write(sweep_dir)
+    except ConfigError as error:
+        warn(str(error))
+    except OSError as error:
+        warn(f"{_shown(sweep_dir)}: the report cannot be written: {reason_of(error)}")
+    else:
+        say(f"Written: {', '.join(str(_shown(file)) for file in files)}")
 
 
 def _print_tally(jobs: list[Job]) -> None:

@@ -1,0 +1,257 @@
+"""Read runs as text and numbers, and group them by all of their settings but the seed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hpamdp.analysis.study import run_folders
+from hpamdp.messages import one_line, reason_of, warn
+from hpamdp.metrics_file import EVALUATION, read_curve
+from hpamdp.run_files import (
+    CONFIG_NAME,
+    DIVERGED_NAME,
+    ERROR_NAME,
+    MAX_TEXT_BYTES,
+    METRICS_NAME,
+    SUMMARY_NAME,
+    flat_settings,
+    saved_config,
+    saved_summary,
+)
+
+FINISHED, UNFINISHED, FAILED = "finished", "unfinished", "failed"
+_SEED, _CHOICE = "seed", "choices."
+_NO_METRICS = {"episodes", "finished", "frames", "wall_s", "cpu_s", _SEED}  # numbers of a summary
+_LARGEST = 1e100  # of a number in a statistic or a figure, so that their arithmetic does not overflow
+_LONGEST = 40  # letters of a value in a name
+
+
+@dataclass(frozen=True)
+class SeedRun:
+    """A run, as far as a report needs it.
+
+    Attributes:
+        folder: the run's folder.
+        state: `FINISHED`, `UNFINISHED` or `FAILED`.
+        settings: its settings as JSON, by their dotted names.
+        value: the metric at the end of the run; None if the run is not finished or has no finite value.
+        curve: the metric over training, rows of frames and value.
+        summary: its `summary.json`; empty if the run wrote none.
+        metrics: names of all its metrics.
+    """
+
+    folder: Path
+    state: str
+    settings: dict[str, str]
+    value: float | None
+    curve: np.ndarray
+    summary: dict[str, Any]
+    metrics: frozenset[str]
+
+    @property
+    def seed(self) -> str:
+        """The run's seed as text."""
+        return self.settings.get(_SEED, "null")
+
+    def effort(self, name: str) -> float | None:
+        """Return `frames`, `wall_s` or `cpu_s` of the summary, or None if it has no such number."""
+        return finite(self.summary.get(name))
+
+    def references(self, metric: str) -> dict[str, float]:
+        """Return a metric of the references that have it, by their names."""
+        references = self.summary.get("references")
+        if not metric.startswith(EVALUATION) or not isinstance(references, Mapping):
+            return {}
+        values = {
+            name: finite(figures.get(metric.removeprefix(EVALUATION)))
+            for name, figures in references.items()
+            if isinstance(figures, Mapping)
+        }
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Runs that differ only in their seeds.
+
+    Attributes:
+        settings: what distinguishes the configuration from the others of its report, by names of the command line.
+        problem: the problem's settings as text; equal for configurations whose scores can be compared.
+        runs: one run a seed.
+    """
+
+    settings: dict[str, str]
+    problem: str
+    runs: list[SeedRun]
+
+    @property
+    def name(self) -> str:
+        """The settings as words of a command line."""
+        return " ".join(f"{name}={value}" for name, value in self.settings.items()) or "all runs"
+
+    @property
+    def scored(self) -> list[SeedRun]:
+        """The runs with a final value."""
+        return [run for run in self.runs if run.value is not None]
+
+    @property
+    def values(self) -> list[float]:
+        """The final values, one a seed."""
+        return [run.value for run in self.runs if run.value is not None]
+
+    def count(self, state: str) -> int:
+        """Return the number of runs in a state."""
+        return sum(run.state == state for run in self.runs)
+
+
+def finite(value: object) -> float | None:
+    """Return a value as a float if it is a number that statistics can use, else None."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= _LARGEST:
+        return None
+    return float(value)
+
+
+def read_runs(folders: Iterable[Path], metric: str) -> list[SeedRun]:
+    """Return the runs in the folders, at any depth, and warn about each run that cannot be read.
+
+    Args:
+        folders: folders of runs, or folders that contain them. A run that is found twice counts once.
+        metric: a column of `metrics.csv`. The final value of `eval/NAME` is `NAME` of the summary.
+    """
+    seen = set[str]()
+    found = [
+        path
+        for folder in folders
+        for path in sorted(run_folders(folder, seen, (CONFIG_NAME, SUMMARY_NAME)), key=_natural)
+    ]
+    return [run for path in found if (run := _read(path, metric)) is not None]
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Return a key that sorts folder 10 after folder 9."""
+    parts = re.split(r"(\d+)", str(path))
+    return [(len(part.lstrip("0")), 0, part) if i % 2 else (0, 1, part) for i, part in enumerate(parts)]
+
+
+def _read(folder: Path, metric: str) -> SeedRun | None:
+    summary, config = saved_summary(folder), saved_config(folder)
+    if not summary and os.path.lexists(folder / SUMMARY_NAME):
+        warn(f"{one_line(folder)}: {SUMMARY_NAME} is damaged, left out")
+        return None
+    if not config:
+        warn(f"{one_line(folder)}: {CONFIG_NAME} is missing or damaged, left out")
+        return None
+    if not summary and not {"mode", _SEED, "env", "low"} <= config.keys():
+        return None  # a config of another program
+    columns, curve = _read_curve(folder / METRICS_NAME, metric)
+    if summary.get(FINISHED):
+        state = FINISHED
+    else:
+        is_failed = any(os.path.lexists(folder / name) for name in (ERROR_NAME, DIVERGED_NAME))
+        state = FAILED if is_failed else UNFINISHED
+    value = _final(summary, curve, metric) if state == FINISHED else None
+    measured = {f"{EVALUATION}{name}" for name in summary.keys() - _NO_METRICS if finite(summary[name]) is not None}
+    settings = {name: json.dumps(value, default=str, skipkeys=True) for name, value in flat_settings(config).items()}
+    return SeedRun(folder, state, settings, value, curve, summary, frozenset({*columns, *measured}))
+
+
+def _read_curve(path: Path, metric: str) -> tuple[list[str], np.ndarray]:
+    columns: list[str] = []
+    points: list[tuple[float, float]] = []
+    try:
+        columns, points = read_curve(path, metric, MAX_TEXT_BYTES)
+    except FileNotFoundError:  # as in the folder of an evaluation
+        pass
+    except (OSError, csv.Error) as error:
+        warn(f"{one_line(path)}: {reason_of(error)}; its curve is left out")
+    curve = np.array(points, dtype=float).reshape(-1, 2)
+    curve = curve[(np.abs(curve) <= _LARGEST).all(1)]
+    return columns, curve[np.argsort(curve[:, 0], kind="stable")]
+
+
+def _final(summary: Mapping[str, Any], curve: np.ndarray, metric: str) -> float | None:
+    name = metric.removeprefix(EVALUATION)
+    if name in summary:
+        return finite(summary[name])
+    return float(curve[-1, 1]) if len(curve) and not metric.startswith(EVALUATION) else None
+
+
+def configurations(runs: Sequence[SeedRun]) -> list[Configuration]:
+    """Group runs that differ only in their seeds, in order of appearance.
+
+    If two runs have the same settings and the same seed, only one of them counts, and a warning names the other.
+    """
+    per_seed = _derived_from_seed(runs)
+    groups: dict[tuple[tuple[str, str], ...], list[SeedRun]] = defaultdict(list)
+    for run in runs:
+        groups[tuple(sorted((name, text) for name, text in run.settings.items() if name not in per_seed))].append(run)
+    all_settings = [group[0].settings for group in groups.values()]
+    names = _distinguishing(all_settings, per_seed)
+    if not names:
+        names = [name for name in (f"{_CHOICE}env", f"{_CHOICE}high", f"{_CHOICE}low") if name in all_settings[0]]
+    return [
+        Configuration(
+            {name.removeprefix(_CHOICE): _shown(own[name]) for name in names if name in own},
+            " ".join(f"{name}={text}" for name, text in sorted(own.items()) if _is_of_problem(name)),
+            _one_a_seed(group),
+        )
+        for own, group in zip(all_settings, groups.values(), strict=True)
+    ]
+
+
+def _is_of_problem(name: str) -> bool:
+    return name == f"{_CHOICE}env" or name.startswith("env.")
+
+
+def _derived_from_seed(runs: Sequence[SeedRun]) -> set[str]:
+    """Return the settings that equal the seed in every run, such as those given as `${seed}`."""
+    if len({run.seed for run in runs}) < 2:
+        return {_SEED}
+    return {_SEED} | {name for name in runs[0].settings if all(run.settings.get(name) == run.seed for run in runs)}
+
+
+def _distinguishing(all_settings: Sequence[Mapping[str, str]], left_out: set[str]) -> list[str]:
+    """Return the names of the settings that distinguish the configurations.
+
+    A choice, such as `low`, brings its own settings along. So other settings count only if they differ between
+    configurations with the same choices. Of settings with the same values, such as those given as `${total_frames}`,
+    the first one counts.
+    """
+    names = [name for name in dict.fromkeys(name for own in all_settings for name in own) if name not in left_out]
+    choices = [name for name in names if name.startswith(_CHOICE)]
+    classes: dict[tuple[str | None, ...], list[Mapping[str, str]]] = defaultdict(list)
+    for own in all_settings:
+        classes[tuple(own.get(name) for name in choices)].append(own)
+    found: dict[tuple[str | None, ...], str] = {}
+    for name in sorted(names, key=lambda name: (name not in choices, "." in name)):
+        differs = any(len({own.get(name) for own in same}) > 1 for same in classes.values())
+        if differs or (name in choices and len({own.get(name) for own in all_settings}) > 1):
+            found.setdefault(tuple(own.get(name) for own in all_settings), name)
+    return list(found.values())
+
+
+def _shown(text: str) -> str:
+    value = json.loads(text)
+    line = one_line(value if isinstance(value, str) else text)
+    return line if len(line) <= _LONGEST else f"{line[: _LONGEST - 1]}…"
+
+
+def _one_a_seed(runs: Sequence[SeedRun]) -> list[SeedRun]:
+    """Return one run for each seed, a finished one if there is one."""
+    chosen: dict[str, SeedRun] = {}
+    for run in sorted(runs, key=lambda run: run.state != FINISHED):
+        if run.seed in chosen:
+            warn(one_line(f"{run.folder}: has the settings and the seed of {chosen[run.seed].folder}, left out"))
+        else:
+            chosen[run.seed] = run
+    return [run for run in runs if chosen[run.seed] is run]

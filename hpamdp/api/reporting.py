@@ -1,0 +1,44 @@
+"""Compare runs by their means over seeds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from hpamdp.analysis.seed_report import DEFAULT_METRIC, report_on
+
+
+def report(*folders: str | Path, metric: str = DEFAULT_METRIC, to: str | Path | None = None) -> list[dict[str, Any]]:
+    """Return statistics over seeds of the runs in some folders, as `hpamdp report` prints them.
+
+    Runs that differ only in their seeds are one configuration. Runs that are not finished count only as such.
+
+    Args:
+        folders: runs, or folders that contain runs at any depth, such as the folder of a sweep.
+        metric: a column of the runs' `metrics.csv`. Of `eval/...` the final evaluation counts.
+        to: folder for `report.csv` and `report.png`, created if it is missing. If None, nothing is written.
+
+    Returns:
+        A row for each configuration:
+        - `configuration`: its name, made of the settings that distinguish it, and `settings`: the same as a dict;
+        - `seeds`: number of finished runs with a finite value;
+        - `mean`, `std` (of a sample), `min`, `max` of the metric, and `interval`: the bounds of the mean's 95 %
+          interval (Student's t), from five seeds on;
+        - `frames`, `cpu_s`: means over these runs;
+        - `unfinished`, `failed`: numbers of other runs.
+
+        A statistic is None if there are too few seeds for it.
+
+    Raises:
+        ConfigError: a folder does not exist or has no runs, no run has the metric, or `to` holds a file of one of
+            these names that no report has written.
+        OSError: a file cannot be written.
+
+    Example:
+        >>> import hpamdp
+        >>> rows = hpamdp.report("multirun/mystudy")  # doctest: +SKIP
+    """
+    report = report_on(folders, metric)
+    if to is not None:
+        report.write(Path(to))
+    return report.rows()
