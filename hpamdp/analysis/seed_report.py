@@ -63,7 +63,7 @@ class Report:
         shown, is_search = self.shown()
         title = one_line(self.metric.removeprefix(EVALUATION))
         rows = [_cells(configuration, is_search) for configuration in shown]
-        header = ["", "seeds", title, "min", "max", f"95 % interval of the mean", "steps", "CPU time"]
+        header = ["", "seeds", title, "min", "max", "95 % interval of the mean", "steps", "CPU time"]
         header += ["unfinished", "failed"]
         kept = [i for i in range(len(header)) if i < 3 or any(row[i] for row in rows)]
         cells = [[row[i] for i in kept] for row in [header, *rows]]
