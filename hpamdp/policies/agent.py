@@ -129,7 +129,7 @@ class OptionValues(nn.Module):
         (learner,) = self._learners()
         values = []
         for one_hot in torch.eye(self.num_options, device=observation.device, dtype=torch.float32):
-            seen = torch.cat([observation, one_hot.expand(len(observation), -1)], -1)
+            seen = torch.cat([observation, one_hot.expand(observation.shape[0], -1)], -1)
             values.append(_exploring_value(learner, seen, *masks))
         return torch.stack(values, -1)
 
@@ -141,7 +141,7 @@ class OptionValues(nn.Module):
 
 def _exploring_value(learner: Learner, observation: Tensor, *masks: Tensor) -> Tensor:
     """Return a learner's values `[N]` of observations `[N, *]`; infinite if exploring before its first update."""
-    if learner.is_untrained() and not is_greedy():
+    if not is_greedy() and learner.is_untrained():
         return torch.full_like(observation[:, 0], torch.inf)
     return learner.value(observation, *masks)
 

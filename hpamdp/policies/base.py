@@ -84,11 +84,13 @@ class Level:
             argument are refused. Append the keys to `in_keys`.
         guarded_settings: settings that can run code, read files or reach servers.
         may_be_nan: the columns of the replay buffer that may hold NaN.
+        export_refusal: why its greedy policy cannot be exported to ONNX, if it cannot.
     """
 
     needs: ClassVar[tuple[str, ...]] = ()
     guarded_settings: ClassVar[tuple[str, ...]] = ()
     may_be_nan: ClassVar[frozenset[str]] = frozenset()
+    export_refusal: str | None = None
     specs: PAMDPSpecs
 
     def stateful(self) -> dict[str, Any]:
@@ -241,6 +243,14 @@ class Selector(Level, TensorDictModuleBase):
         Override it instead of `select` if there is more to return than the option.
         """
         return {keys.OPTION: self.select(td)}
+
+    def greedy_choice(self) -> Callable[[TensorDictBase], Tensor]:
+        """Return the function from a step `[*B]` to the greedy option of each environment, int64 `[*B]`, for an export.
+
+        Called while `is_greedy()`. The function is traced, so its control flow must not depend on numbers in tensors.
+        What depends on buffers alone is better computed before it is returned. Override it if `choose` does not fit.
+        """
+        return lambda td: self.choose(td)[keys.OPTION]
 
     def choose_uniformly(self, td: TensorDictBase) -> dict[str, Tensor]:
         """Return a uniformly random choice: a tensor `[*B]` for each of `out_keys`."""

@@ -17,7 +17,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hpamdp import keys
-from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.bandit import Bandit, BanditOptions, RewardStatistics
 from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
@@ -58,9 +57,10 @@ class Exp3(Bandit):
         weights = (exploration / num * self.gains.sums).softmax(0)
         return (1.0 - exploration) * weights + exploration / num
 
-    def best(self, allowed: Tensor | None = None) -> int:
-        """Return the allowed option with the largest weight."""
-        return int(masked_values(self.gains.sums, allowed).argmax())
+    @property
+    def greedy_values(self) -> Tensor:
+        """The gains, which order the options as their weights do."""
+        return self.gains.sums
 
     def sample(self, num: int, allowed: Tensor | None = None) -> Tensor:
         """Return `num` choices, with the probabilities of the allowed options in proportion."""

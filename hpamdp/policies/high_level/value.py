@@ -12,6 +12,7 @@ Differs from the source: while exploring, options whose learner has made no upda
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -57,8 +58,7 @@ class Value(Selector):
             None if mask is None else mask[is_decision]
             for mask in (td.get(keys.ACTION_MASK, None), td.get(keys.OPTION_MASK, None))
         )
-        value = self.option_values(td.get(keys.OBSERVATION)[is_decision], action_mask)
-        value = masked_values(value, option_mask)
+        value = self._values(td.get(keys.OBSERVATION)[is_decision], action_mask, option_mask)
         if is_greedy():
             best = value.argmax(-1)
         else:
@@ -69,3 +69,12 @@ class Value(Selector):
             best = torch.where(is_random, random_option, best)
         option[is_decision] = best
         return option
+
+    def greedy_choice(self) -> Callable[[TensorDictBase], Tensor]:
+        """Return the choice of the allowed option with the highest value, whether or not a decision is due."""
+        names = keys.OBSERVATION, keys.ACTION_MASK, keys.OPTION_MASK
+        return lambda td: self._values(*(td.get(name, None) for name in names)).argmax(-1)
+
+    def _values(self, observation: Tensor, action_mask: Tensor | None, option_mask: Tensor | None) -> Tensor:
+        """Return the value of each option, `[N, num_options]`, -inf where it is forbidden."""
+        return masked_values(self.option_values(observation, action_mask), option_mask)

@@ -127,7 +127,7 @@ class HSACPolicy(TensorDictModuleBase):
         observation = td.get(keys.OBSERVATION)
         allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
         distribution: HybridDistribution = self.actor(observation, allowed)
-        if self.is_random and not is_greedy():
+        if not is_greedy() and self.is_random:
             unit_parameters = 2.0 * torch.rand_like(distribution.mean) - 1.0
             discrete = random_choice(
                 unit_parameters.shape[:-1], self.specs.num_discrete, allowed, unit_parameters.device

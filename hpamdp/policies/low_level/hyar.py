@@ -248,7 +248,7 @@ class LatentActor(nn.Module):
 
     def proposals(self, given: Tensor, embeddings: Tensor) -> Tensor:
         """Return the proposals of what the actor gave, `[B, num_proposals, num_given]` in [-1, 1]."""
-        return torch.cat([embeddings.expand(len(given), -1, -1), given], -1) if self.proposes_each else given
+        return torch.cat([embeddings.expand(given.shape[0], -1, -1), given], -1) if self.proposes_each else given
 
     def given(self, proposals: Tensor) -> Tensor:
         """Return the part of proposals that the actor gives."""
@@ -290,7 +290,8 @@ def best_of_proposals(critics: LatentCritics, state: Tensor, candidates: Tensor)
     """
     q = critics(state, candidates.flatten(1, 2)).amin(0).unflatten(1, candidates.shape[1:3])
     best_value, best_index = q.max(-1)
-    return candidates.take_along_dim(best_index[..., None, None], 2).squeeze(2), best_value
+    indices = best_index[..., None, None].expand(-1, -1, 1, candidates.shape[-1])
+    return candidates.gather(2, indices).squeeze(2), best_value
 
 
 class HyARPolicy(TensorDictModuleBase):
@@ -336,7 +337,7 @@ class HyARPolicy(TensorDictModuleBase):
         if proposals.shape[1] > 1:
             q = self.critics(state, proposals).amin(0) if q is None else q
             best = masked_values(q, allowed).argmax(-1)
-            latent = proposals[torch.arange(len(best), device=best.device), best]
+            latent = proposals[torch.arange(best.shape[0], device=best.device), best]
         discrete, unit_parameters = self.decode(state, latent, allowed)
         if is_exploring and self.epsilon > 0.0:
             is_random = torch.rand_like(unit_parameters[:, :1]) < self.epsilon

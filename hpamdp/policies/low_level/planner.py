@@ -45,6 +45,7 @@ class Planner(Learner):
     """Follows the planner and learns nothing."""
 
     needs: ClassVar[tuple[str, ...]] = ("oracle",)
+    export_refusal = "plans at every step"
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

@@ -87,5 +87,7 @@ def with_variations(unit_actions: Tensor, variations: Tensor) -> Tensor:
 
 def in_pieces(function: Callable[..., tuple[Tensor, ...]], num_rows: int, *rows: Tensor) -> tuple[Tensor, ...]:
     """Return what a function makes of rows, each `[N, ...]`, given to it `num_rows` at a time: bounds the memory."""
+    if rows[0].shape[0] <= num_rows:
+        return function(*rows)
     pieces = [function(*piece) for piece in zip(*(each.split(num_rows) for each in rows), strict=True)]
     return tuple(torch.cat(made) for made in zip(*pieces, strict=True))

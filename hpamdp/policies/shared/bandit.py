@@ -7,7 +7,7 @@ their episodes.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 import torch
@@ -83,15 +83,11 @@ class RewardStatistics(nn.Module):
         """Whether an option has no known reward, bool `[num_options]`. Forgotten options are untried again."""
         return self.counts < 1e-9
 
-    def best(self, allowed: Tensor | None = None) -> int:
-        """Return the option with the highest mean reward.
-
-        Args:
-            allowed: the options that may be chosen, bool `[num_options]`. If None, all may.
-        """
+    @property
+    def known_means(self) -> Tensor:
+        """Mean reward of each option, `[num_options]`; the lowest finite number for untried options."""
         # Forbidden options have -inf, which is below the value of untried ones.
-        means = torch.where(self.is_untried, torch.finfo(torch.float64).min, self.means)
-        return int(masked_values(means, allowed).argmax())
+        return torch.where(self.is_untried, torch.finfo(torch.float64).min, self.means)
 
     def weights(self, num: int) -> Tensor:
         """Return the weights of the last `num` decisions, oldest first, `[num]`."""
@@ -150,26 +146,45 @@ class Bandit(Selector):
         """
         raise NotImplementedError
 
+    @property
+    def greedy_values(self) -> Tensor:
+        """The number of each option, `[num_options]`, of which the greedy choice takes the highest."""
+        return self.statistics.known_means
+
     def best(self, allowed: Tensor | None = None) -> int:
-        """Return the greedy choice."""
-        return self.statistics.best(allowed)
+        """Return the greedy choice.
+
+        Args:
+            allowed: the options that may be chosen, bool `[num_options]`. If None, all may.
+        """
+        return int(masked_values(self.greedy_values, allowed).argmax())
+
+    def greedy_choice(self) -> Callable[[TensorDictBase], Tensor]:
+        """Return the choice of the allowed option with the highest of the `greedy_values`."""
+        values = self.greedy_values
+
+        def choice(td: TensorDictBase) -> Tensor:
+            of_rows = values.expand(*td.get(keys.IS_DECISION).shape[:-1], -1)
+            return masked_values(of_rows, td.get(keys.OPTION_MASK, None)).argmax(-1)
+
+        return choice
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the choices `[*B]`: the best option if the policy is greedy, else a sample for each due decision."""
+        if is_greedy():
+            return self.greedy_choice()(td)
         is_decision = td.get(keys.IS_DECISION).squeeze(-1)
         mask = td.get(keys.OPTION_MASK, None)
         if mask is not None:
-            return self._select_allowed(is_decision, mask)
-        if is_greedy():
-            return torch.full_like(is_decision, self.best(), dtype=torch.long)
+            return self._sample_allowed(is_decision, mask)
         choices = torch.zeros_like(is_decision, dtype=torch.long)
         chosen = self.sample(int(is_decision.sum()))
         self.pending += torch.bincount(chosen, minlength=self.specs.num_options)
         choices[is_decision] = chosen
         return choices
 
-    def _select_allowed(self, is_decision: Tensor, mask: Tensor) -> Tensor:
-        """Return allowed choices `[*B]`. Environments that allow the same options are handled together.
+    def _sample_allowed(self, is_decision: Tensor, mask: Tensor) -> Tensor:
+        """Return allowed exploring choices `[*B]`. Environments that allow the same options are handled together.
 
         Args:
             is_decision: where a choice is due, bool `[*B]`. Elsewhere the choice is ignored.
@@ -178,9 +193,6 @@ class Bandit(Selector):
         choices = torch.zeros_like(is_decision, dtype=torch.long)
         for allowed in mask.flatten(0, -2).unique(dim=0):
             rows = is_decision & (mask == allowed).all(-1)
-            if is_greedy():
-                choices[rows] = self.best(allowed)
-                continue
             chosen = self.sample(int(rows.sum()), allowed)
             self.pending += torch.bincount(chosen, minlength=self.specs.num_options)
             choices[rows] = chosen

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -168,15 +169,25 @@ class LinearBandit(Selector):
 
     def select(self, td: TensorDictBase) -> Tensor:
         """Return the choices `[*B]`: the highest expected reward if the policy is greedy, else the highest sample."""
+        if is_greedy():
+            return self.greedy_choice()(td)
         observation = td.get(keys.OBSERVATION)
         mean, deviation = self.predict(observation.flatten(0, -2))
-        if not is_greedy():
-            # Untried options come first, in random order.
-            first = 1e9 + torch.rand_like(mean)
-            mean = torch.where(self.statistics.is_untried, first, self.sample(mean, deviation))
-        mask = td.get(keys.OPTION_MASK, None)
-        mean = masked_values(mean, None if mask is None else mask.flatten(0, -2))
-        return mean.argmax(-1).reshape(observation.shape[:-1])
+        # Untried options come first, in random order.
+        first = 1e9 + torch.rand_like(mean)
+        score = torch.where(self.statistics.is_untried, first, self.sample(mean, deviation))
+        score = score.reshape(*observation.shape[:-1], -1)
+        return masked_values(score, td.get(keys.OPTION_MASK, None)).argmax(-1)
+
+    def greedy_choice(self) -> Callable[[TensorDictBase], Tensor]:
+        """Return the choice of the allowed option with the highest expected reward."""
+        theta, _, _ = self._regression()
+
+        def choice(td: TensorDictBase) -> Tensor:
+            mean = self.features(td.get(keys.OBSERVATION)) @ theta.T
+            return masked_values(mean, td.get(keys.OPTION_MASK, None)).argmax(-1)
+
+        return choice
 
     def has_updated(self) -> bool:
         """Return whether any reward is known."""

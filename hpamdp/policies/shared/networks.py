@@ -276,7 +276,7 @@ class HybridCritics(nn.Module):
         if not self.is_multipass:
             return self.net(torch.cat([state, unit_parameters], -1))
         num_rows = max(1, _MAX_PASSES // self.num_discrete)
-        if len(state) <= num_rows:
+        if state.shape[0] <= num_rows:  # not len(), which would make the size of a traced batch a constant
             return self._passes(state, unit_parameters)
         pieces = zip(state.split(num_rows), unit_parameters.split(num_rows), strict=True)
         return torch.cat([self._passes(*piece) for piece in pieces], 1)

@@ -109,6 +109,7 @@ class DLPA(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_setting = "end_values"
     catches_up = True
+    export_refusal = "plans at every step"
 
     options: DLPAOptions
     policy: DLPAPolicy

@@ -79,6 +79,7 @@ class PETS(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     stores_own_parameters = True
     catches_up = True
+    export_refusal = "plans at every step"
 
     options: PETSOptions
     policy: PETSPolicy
