@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
 from hpamdp.api.arguments import problem_arguments
+from hpamdp.api.export import export_onnx
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.outside_jobs import composed
@@ -218,6 +219,30 @@ class Agent:
             OSError: the file cannot be written.
         """
         checkpoint.save_policy(Path(path), self._agent, self._env, self._progress)
+
+    def export(self, path: str | Path) -> None:
+        """Write the greedy policy to an ONNX file, which runs without torch; an existing file is replaced.
+
+        The inputs are `observation`, float32 `[N, observation_dim]`, the masks `action_mask` and `option_mask` if the
+        problem has them, and, if the agent chooses options, `held_option`, int64 `[N]`, and `is_decision`, bool `[N]`.
+        The outputs are `discrete`, int64 `[N]`, `parameters`, float32 `[N, num_parameters]`, and `option`, int64 `[N]`.
+        The file scales observations as the agent does. Its properties name the actions and hold the parameters' bounds.
+
+        Raises:
+            ConfigError: the agent has no greedy policy that can be exported, or `hpamdp[onnx]` is not installed.
+            OSError: the file cannot be written.
+
+        Example:
+            >>> import hpamdp
+            >>> agent = hpamdp.load("hppo_platform")
+            >>> agent.export("hppo_platform.onnx")  # doctest: +SKIP
+            >>> import numpy, onnxruntime  # doctest: +SKIP
+            >>> session = onnxruntime.InferenceSession("hppo_platform.onnx")  # doctest: +SKIP
+            >>> observation = numpy.zeros((1, 9), numpy.float32)
+            >>> discrete, parameters = session.run(None, {"observation": observation})  # doctest: +SKIP
+        """
+        about = {group: getattr(self._config, group).name for group in ("env", "high", "low")}
+        export_onnx(Path(path), self._agent, self._env, option_length(self._config), about)
 
 
 def _like(mask: torch.Tensor, value: torch.Tensor) -> torch.Tensor:

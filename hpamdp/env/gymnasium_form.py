@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,6 +20,23 @@ from hpamdp import keys
 
 if TYPE_CHECKING:
     from hpamdp.env.base import PAMDPEnv
+
+
+@dataclass(frozen=True)
+class VectorScaling:
+    """What a vector of numbers goes through before policies see it. All parts are float64 `[dim]`.
+
+    Attributes:
+        low, high: to which it is clipped first.
+        centre, width: of the linear map to (x - centre) / width.
+        limit: the largest size of what is left.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    centre: np.ndarray
+    width: np.ndarray
+    limit: np.ndarray
 
 
 class GymnasiumForm(ABC):
@@ -46,6 +64,10 @@ class GymnasiumForm(ABC):
     @abstractmethod
     def write(self, acted: TensorDictBase, *, is_batch: bool) -> Any:
         """Return the actions of rows `[N]` in Gymnasium's form; without `is_batch`, the action of the only row."""
+
+    def scaling(self) -> VectorScaling | None:
+        """Return how flattened observations are scaled; None if policies see them as they are."""
+        return None
 
 
 class VectorForm(GymnasiumForm):

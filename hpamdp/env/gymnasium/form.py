@@ -17,7 +17,7 @@ from hpamdp.env.gymnasium.copies import Copies
 from hpamdp.env.gymnasium.masks import Masks, MaskSource
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
-from hpamdp.env.gymnasium_form import GymnasiumForm
+from hpamdp.env.gymnasium_form import GymnasiumForm, VectorScaling
 
 
 class OwnForm(GymnasiumForm):
@@ -56,6 +56,10 @@ class OwnForm(GymnasiumForm):
             masks.keep(row, single, in_row if num else info or {})
         rows |= {name: torch.from_numpy(mask) for name, mask in masks.rows.items()}
         return TensorDict(rows, batch_size=[len(singles)]), num is not None
+
+    def scaling(self) -> VectorScaling:
+        """Return how flattened observations are scaled."""
+        return VectorScaling(*self._observations.clip_bounds(), *self._scaling.linear_map())
 
     def write(self, acted: TensorDictBase, *, is_batch: bool) -> Any:
         """Return the action of `GymnasiumForm.write`."""

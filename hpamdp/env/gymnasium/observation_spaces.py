@@ -138,6 +138,12 @@ class ObservationSpace:
                 vectors[:, own] = vectors[:, own].astype(leaf.rounding)
         return vectors
 
+    def clip_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the bounds to which `rounded` clips, float64 `[dim]` each; infinite if it does not clip."""
+        if self._is_clipped:
+            return self._clip_low, self._clip_high
+        return np.full(self.dim, -np.inf), np.full(self.dim, np.inf)
+
     def _cure(self, leaf: Leaf) -> str:
         """Return how to leave out the leaf's entry, as the end of a message; empty if there is no other entry."""
         others = [name for name in self._names if leaf.path and name != leaf.path[0]]

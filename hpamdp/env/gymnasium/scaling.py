@@ -73,6 +73,14 @@ class ObservationScaling:
             return ((vectors - self._centre) / self._half_width).astype(np.float32)
         return self.statistics.normalised(vectors).clip(-_CLIP, _CLIP).astype(np.float32)
 
+    def linear_map(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return what `rescaled` does now: the centre, the width to divide by and the limit, float64 `[dim]` each."""
+        centre, width, limit = self._centre, self._half_width, np.full(self.dim, np.inf)
+        if self.statistics is not None:
+            centre, width, limit = self.statistics.mean, self.statistics.unit(), np.full(self.dim, _CLIP)
+        is_raw = np.zeros(self.dim, bool) if self._is_raw is None else self._is_raw
+        return np.where(is_raw, 0.0, centre), np.where(is_raw, 1.0, width), np.where(is_raw, np.inf, limit)
+
     def share(self, other: ObservationScaling) -> None:
         """Scale by the statistics of `other`, now and later, without updating them.
 
@@ -143,8 +151,12 @@ class RunningStatistics(RunningMeanStd):
 
     def normalised(self, vectors: np.ndarray) -> np.ndarray:
         """Return vectors `[M, dim]` minus the mean, in standard deviations; constant entries keep their unit."""
+        return (vectors - self.mean) / self.unit()
+
+    def unit(self) -> np.ndarray:
+        """Return the standard deviations, `[dim]`; 1 for constant entries."""
         deviation = np.sqrt(self.var)
-        return (vectors - self.mean) / np.where(deviation > _SMALLEST, deviation, 1.0)
+        return np.where(deviation > _SMALLEST, deviation, 1.0)
 
     def columns(self) -> dict[str, Tensor]:
         """Return a copy of the statistics, for a checkpoint."""

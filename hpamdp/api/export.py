@@ -1,0 +1,262 @@
+"""Write an agent's greedy policy to an ONNX file, which runs without torch and without this package.
+
+The file holds one graph. It is traced from the modules that act in training and evaluation.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from hpamdp import __version__, keys
+from hpamdp.config.errors import ConfigError
+from hpamdp.env.base import PAMDPEnv
+from hpamdp.env.gymnasium_form import VectorScaling
+from hpamdp.files import replacing
+from hpamdp.policies.agent import HierarchicalAgent, OptionRouter, with_option
+from hpamdp.policies.base import Level, Selector
+from hpamdp.specs import PAMDPSpecs
+
+# An ONNX graph has each name once, so the option that comes in is not called as the one that goes out.
+HELD_OPTION = "held_option"
+_OUTPUTS = ("discrete", "parameters", keys.OPTION)
+_PACKAGES = ("onnx", "onnxscript")
+_EXAMPLE_ROWS = 4  # more than 1, which tracing would take for a constant
+
+
+class GreedyStep(nn.Module):
+    """A greedy step of an agent, from tensors to tensors.
+
+    Every learner acts in every row, because a graph cannot depend on which options occur in a batch.
+
+    Args:
+        agent: the agent.
+        scaling: how observations are scaled; None if they are not.
+        option_length: steps of an option, as in `DecisionTracker`.
+
+    Attributes:
+        names: of the inputs, in order.
+    """
+
+    def __init__(self, agent: HierarchicalAgent, scaling: VectorScaling | None, option_length: float | None) -> None:
+        super().__init__()
+        self.specs: PAMDPSpecs = agent.specs
+        self.selector: Selector | None = agent.selector
+        self.router: OptionRouter = agent.router
+        self.device = agent.frames.device
+        self.option_length = option_length
+        parts = {} if scaling is None else vars(scaling)
+        self.scaling = {name: torch.as_tensor(part, device=self.device) for name, part in parts.items()}
+        self.option_actions: Tensor | None = None
+        if self.specs.has_action_mask and self.specs.option_actions is not None:
+            self.option_actions = torch.tensor(self.specs.option_actions, device=self.device)
+        self.choice: Callable[[TensorDictBase], Tensor] | None = None
+        if self.selector is not None:
+            self.choice = self.selector.greedy_choice()
+        self.names = list(self.example())
+
+    def example(self) -> dict[str, Tensor]:
+        """Return inputs of the right shapes, by name."""
+        specs, num = self.specs, _EXAMPLE_ROWS
+        inputs = {keys.OBSERVATION: torch.zeros(num, specs.observation_dim)}
+        if specs.has_action_mask:
+            inputs[keys.ACTION_MASK] = torch.ones(num, specs.num_discrete, dtype=torch.bool)
+        if specs.has_option_mask and self.option_actions is None:
+            inputs[keys.OPTION_MASK] = torch.ones(num, specs.num_options, dtype=torch.bool)
+        if self.selector is not None:
+            inputs[HELD_OPTION] = torch.zeros(num, dtype=torch.long)
+            inputs[keys.IS_DECISION] = torch.ones(num, dtype=torch.bool)
+        return {name: value.to(self.device) for name, value in inputs.items()}
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """Return the discrete actions `[N]`, the parameters `[N, num_parameters]` and, if any, the options `[N]`.
+
+        Args:
+            inputs: as `names` says: the observation as a vector `[N, observation_dim]`; the masks, if the problem has
+                any; the held option `[N]`, and whether a new one is due, bool `[N]`, if the agent chooses options.
+        """
+        given = dict(zip(self.names, inputs, strict=True))
+        td = TensorDict({keys.OBSERVATION: self._scaled(given[keys.OBSERVATION])}, [inputs[0].shape[0]])
+        for name in (keys.ACTION_MASK, keys.OPTION_MASK):
+            if name in given:
+                td.set(name, given[name])
+        if self.option_actions is not None:
+            td.set(keys.OPTION_MASK, (self.option_actions & given[keys.ACTION_MASK].unsqueeze(-2)).any(-1))
+        if self.selector is not None:
+            td.set(keys.OPTION, self._option(td, given[HELD_OPTION], given[keys.IS_DECISION]))
+        discrete, parameters = self._action(td)
+        return (discrete, parameters) if self.selector is None else (discrete, parameters, td.get(keys.OPTION))
+
+    def _scaled(self, vectors: Tensor) -> Tensor:
+        if not self.scaling:
+            return vectors
+        scaling = self.scaling
+        vectors = vectors.double().clamp(scaling["low"], scaling["high"])
+        scaled = (vectors - scaling["centre"]) / scaling["width"]
+        return scaled.clamp(-scaling["limit"], scaling["limit"]).float()
+
+    def _option(self, td: TensorDictBase, held: Tensor, is_decision: Tensor) -> Tensor:
+        """Return the options `[N]`: new ones where a decision is due or the held option ends."""
+        assert self.selector is not None and self.choice is not None
+        td.set(keys.IS_DECISION, is_decision.unsqueeze(-1)).set(keys.OPTION, held)
+        if self.option_actions is not None and self.option_length is not None:
+            is_decision = is_decision | ~td.get(keys.OPTION_MASK).gather(-1, held.unsqueeze(-1)).squeeze(-1)
+        if self.selector.decides_ends:
+            is_decision = is_decision | self.selector.ends(td)
+        return torch.where(is_decision, self.choice(td), held)
+
+    def _action(self, td: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Return the discrete actions and the parameters of each row's own learner."""
+        seen = td.select(*self.router.in_keys, strict=False)
+        if self.router.is_shared:
+            seen = with_option(seen, self.specs.num_options)
+        acted = [policy(seen.copy()) for policy in self.router.policies]
+        discrete, parameters = acted[0].get(keys.DISCRETE), acted[0].get(keys.PARAMETERS)
+        for option, own in enumerate(acted[1:], 1):
+            rows = td.get(keys.OPTION) == option
+            discrete = torch.where(rows, own.get(keys.DISCRETE), discrete)
+            parameters = torch.where(rows.unsqueeze(-1), own.get(keys.PARAMETERS), parameters)
+        return discrete, parameters
+
+
+def export_onnx(
+    path: Path, agent: HierarchicalAgent, env: PAMDPEnv, option_length: float | None, about: Mapping[str, Any]
+) -> None:
+    """Write an agent's greedy policy to an ONNX file.
+
+    Args:
+        path: of the file; an existing one is replaced.
+        agent: the agent.
+        env: its problem.
+        option_length: steps of an option, as in `DecisionTracker`.
+        about: further properties of the file.
+
+    Raises:
+        ConfigError: a package is missing, or the agent cannot be exported.
+        OSError: the file cannot be written.
+    """
+    missing = [name for name in _PACKAGES if find_spec(name) is None]
+    if missing:
+        raise ConfigError(f"export: {' and '.join(missing)} not installed; pip install 'hpamdp[onnx]'")
+    _check_levels(agent)
+    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad(), _quiet():
+        step = GreedyStep(agent, env.gymnasium_form().scaling(), option_length)
+        try:
+            data = _traced(step, {**properties(agent.specs, env, option_length), **about})
+        except RuntimeError as error:
+            reason = str(error).strip().partition("\n")[0]
+            raise ConfigError(f"export: {_names(agent)} cannot be traced: {reason:.200}") from error
+    with replacing(path) as partial:
+        partial.write_bytes(data)
+
+
+def properties(specs: PAMDPSpecs, env: PAMDPEnv, option_length: float | None) -> dict[str, Any]:
+    """Return what a reader of the file needs to know of a problem, as values for JSON."""
+    return {
+        "discrete_names": [str(name) for name in env.discrete_names or range(specs.num_discrete)],
+        "option_names": specs.option_names,
+        "parameter_dims": specs.parameter_dims,
+        "parameter_low": specs.parameter_low,
+        "parameter_high": specs.parameter_high,
+        "option_length": None if option_length in (None, math.inf) else option_length,
+        "hpamdp_version": __version__,
+    }
+
+
+def _levels(agent: HierarchicalAgent) -> list[Level]:
+    return [level for level in (agent.selector, *agent.learners) if isinstance(level, Level)]
+
+
+def _names(agent: HierarchicalAgent) -> str:
+    return " with ".join(dict.fromkeys(type(level).__name__ for level in _levels(agent)))
+
+
+def _check_levels(agent: HierarchicalAgent) -> None:
+    """Refuse levels that are known to have no export.
+
+    Raises:
+        ConfigError: there is one.
+    """
+    for level in _levels(agent):
+        refusal = level.export_refusal
+        if refusal is None and level.needs:
+            refusal = f"reads {' and '.join(level.needs)} entries, which only the environment can write"
+        if refusal is not None:
+            raise ConfigError(f"export: {type(level).__name__} cannot be exported: it {refusal}")
+    if agent.router.state_keys:
+        raise ConfigError(f"export: {_names(agent)} cannot be exported: it remembers {agent.router.state_keys}")
+
+
+def _traced(step: GreedyStep, about: Mapping[str, Any]) -> bytes:
+    """Return the ONNX file of a step.
+
+    Raises:
+        ConfigError: the policy samples.
+        RuntimeError: it cannot be traced.
+    """
+    import onnx_ir
+    import onnx_ir.passes.common
+
+    example = tuple(step.example().values())
+    batch = {0: torch.export.Dim.DYNAMIC}
+    program = torch.export.export(step, example, dynamic_shapes=((batch,) * len(example),), strict=False)
+    for node in program.graph.nodes:
+        if torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ()):
+            raise ConfigError("export: the agent cannot be exported: it samples even if it acts greedily")
+    outputs = _OUTPUTS if step.selector is not None else _OUTPUTS[:2]
+    exported = torch.onnx.export(
+        program,
+        input_names=step.names,
+        output_names=outputs,
+        custom_translation_table={torch.ops.aten._cdist_forward.default: _distances},
+        verbose=False,
+    )
+    assert exported is not None
+    model = exported.model
+    # Without the lines of code that torch notes at each node.
+    onnx_ir.passes.common.ClearMetadataAndDocStringPass()(model)
+    model.metadata_props.update({name: json.dumps(value) for name, value in about.items()})
+    for value in (*model.graph.inputs, *model.graph.outputs):
+        assert value.shape is not None
+        value.shape = onnx_ir.Shape(["N", *value.shape[1:]])
+    data: bytes = onnx_ir.to_proto(model).SerializeToString()
+    return data
+
+
+def _distances(first: Any, second: Any, p: float, compute_mode: Any) -> Any:
+    """Return `torch.cdist` of matrices, which torch cannot convert, as ONNX."""
+    from onnxscript import opset18
+
+    assert p == 2.0
+    op: Any = opset18
+    difference = op.Sub(op.Unsqueeze(first, [-2]), op.Unsqueeze(second, [-3]))
+    return op.Sqrt(op.ReduceSumSquare(difference, [-1], keepdims=0))
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep back what torch says while it exports."""
+    loggers = [logging.getLogger(name) for name in ("torch", "onnxscript")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings(), redirect_stderr(io.StringIO()), redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

@@ -1,0 +1,317 @@
+"""`Agent.export`: the file acts as the agent does and holds no code; agents that cannot be exported are refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from itertools import pairwise
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import hpamdp
+from hpamdp import keys
+from hpamdp.api.agent import Agent
+from hpamdp.api.export import HELD_OPTION, GreedyStep
+from hpamdp.run.assemble import option_length
+from hpamdp.run.players import load_agent
+
+PLATFORM, DATA = ["env=platform", "high=none"], ["mode=offline", "data=human"]
+LEARNERS = {
+    "hppo": [*PLATFORM, "low=hppo"],
+    "pdqn": [*PLATFORM, "low=pdqn"],
+    "pdqn_published": [*PLATFORM, "low=pdqn_published"],
+    "pdqn_that_searches": [*PLATFORM, "low=pdqn", "low.greedy_samples=8"],
+    "paddpg": [*PLATFORM, "low=paddpg"],
+    "hsac": [*PLATFORM, "low=hsac"],
+    "hyar": [*PLATFORM, "low=hyar"],
+    "hyar_that_searches": [*PLATFORM, "low=hyar", "low.greedy_samples=8"],
+    "hyar_nearest": ["env=hard_move", "high=none", "low=hyar", "low.discrete=nearest"],
+    "qpamdp": [*PLATFORM, "low=qpamdp"],
+    "td3_bc": [*DATA, "high=meta_critic", "low=td3_bc"],
+    "bc": [*DATA, "high=linucb", "low=bc"],
+    "iql": [*DATA, "high=ucb", "low=iql"],
+}
+SELECTORS = {
+    "ucb": ["high=ucb", "low=hppo"],
+    "epsilon_greedy": ["high=epsilon_greedy", "low=hppo"],
+    "thompson": ["high=thompson", "low=hppo", "agent.sharing=shared"],
+    "exp3": ["high=exp3", "low=hsac"],
+    "linucb": ["high=linucb", "low=pdqn"],
+    "lin_thompson": ["high=lin_thompson", "high.features=random_fourier", "low=hppo"],
+    "meta_critic": ["high=meta_critic", "low=hyar"],
+    "actor": ["high=actor", "low=paddpg"],
+    "option_critic": ["env=rooms", "high=option_critic", "low=hsac", "agent.sharing=shared"],
+    "value": ["high=value", "low=hppo"],
+    "value_of_shared": ["high=value", "low=hppo", "agent.sharing=shared"],
+    "fixed": ["high=fixed", "high.option=congruent", "low=hppo"],
+}
+MASKED = ["env=gymnasium", "env.entry_point=toy_masked_gymnasium:Masked", "env.action_mask=info", "env.max_steps=9"]
+GROUPED = [*MASKED, "+env.grouping={first: [0], second: [1]}", "agent.termination=steps", "agent.option_length=3"]
+CASES = {
+    **LEARNERS,
+    **SELECTORS,
+    "termination": ["env=rooms", "high=meta_critic", "low=hppo", "agent.termination=learned"],
+    **{
+        f"masked_{name}": [*MASKED, "high=none", f"low={name}"]
+        for name in ("hppo", "pdqn", "paddpg", "hsac", "hyar", "qpamdp")
+    },
+    "grouped": [*GROUPED, "high=meta_critic", "low=hppo", "agent.sharing=shared"],
+    "grouped_actor": [*GROUPED, "high=actor", "low=pdqn"],
+    "grouped_value": [*GROUPED, "high=value", "low=hppo"],
+}
+# The others differ in their networks alone.
+QUICK = ["pdqn_that_searches", "hyar_nearest", "td3_bc", "exp3", "value_of_shared", "grouped"]
+
+
+class Own(gymnasium.Env):
+    """An option, a mask in the info, and observations of different scales."""
+
+    option_names = ("slow", "medium", "fast")
+    observation_space = spaces.Dict(far=spaces.Box(-900.0, 100.0, (2,), np.float64), kind=spaces.Discrete(3))
+    action_space = spaces.Dict(
+        option=spaces.Discrete(3),
+        action=spaces.Tuple(
+            [spaces.Discrete(2), spaces.Tuple([spaces.Box(-1.0, 3.0, (1,)), spaces.Box(0.0, 9.0, (2,))])]
+        ),
+    )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._observation(), {"action_mask": np.array([True, True])}
+
+    def step(self, action):
+        return self._observation(), 0.0, False, False, {"action_mask": np.array([True, False])}
+
+    def _observation(self):
+        return {"far": self.np_random.uniform(-900.0, 100.0, 2), "kind": int(self.np_random.integers(3))}
+
+
+def spread(agent: torch.nn.Module) -> None:
+    """Move all weights, and what bandits have learned, away from their values at the start, which are nearly alike."""
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for weight in (each for each in agent.parameters() if each.ndim):
+            weight += torch.randn(weight.shape, generator=generator) / weight.shape[-1] ** 0.5
+        for name, buffer in agent.named_buffers():
+            if name.endswith(("moment", "sums", "counts")):
+                buffer += torch.rand(buffer.shape, generator=generator)
+
+
+def fresh_agent(*words: str) -> Agent:
+    loaded = load_agent(None, words)
+    spread(loaded.agent)
+    return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress)
+
+
+def steps(agent: Agent, num_steps: int, num_rows: int):
+    """Yield random vectors and masks of steps, with at least one choice allowed everywhere."""
+    rng, specs = np.random.default_rng(0), agent.specs
+    for _ in range(num_steps):
+        low = 0.0 if specs.has_action_mask else -1.0  # bound of the problem with masks
+        vectors = rng.uniform(low, 1.0, (num_rows, specs.observation_dim)).astype(np.float32)
+        info = {}
+        if specs.has_action_mask:
+            info[keys.ACTION_MASK] = rng.random((num_rows, specs.num_discrete)) < 0.5
+            first = info[keys.ACTION_MASK][:, 0]
+            first |= ~info[keys.ACTION_MASK].any(-1)
+        yield vectors, info
+
+
+def differences(agent: Agent, run, num_steps: int = 6, num_rows: int = 64) -> float:
+    """Return the largest difference between the parameters of `act` and of `run`, as a fraction of their bounds.
+
+    Discrete actions and options must be the same.
+    """
+    width = np.array(agent.specs.parameter_high) - np.array(agent.specs.parameter_low)
+    length = option_length(agent._config) or np.inf
+    largest, held, age = 0.0, np.zeros(num_rows, np.int64), np.full(num_rows, np.inf)
+    agent.reset()
+    for vectors, info in steps(agent, num_steps, num_rows):
+        inputs = {keys.OBSERVATION: vectors, **info}
+        if num_rows == 1:
+            vectors, info = vectors[0], {name: mask[0] for name, mask in info.items()}
+        agent.act(vectors, info)
+        acted = agent._last
+        is_due = age == np.inf if length == np.inf else age >= length
+        if agent.specs.num_options:
+            inputs |= {HELD_OPTION: held, keys.IS_DECISION: is_due}
+        discrete, parameters, *option = run(inputs)
+        np.testing.assert_array_equal(discrete, acted[keys.DISCRETE].numpy())
+        if option:
+            np.testing.assert_array_equal(option[0], acted[keys.OPTION].numpy())
+            age = np.where(is_due | (option[0] != held), 1, age + 1)
+            held = option[0]
+        largest = max(largest, (np.abs(parameters - acted[keys.PARAMETERS].numpy()) / width).max())
+    return largest
+
+
+def traced_step(agent: Agent):
+    """Return the function that is traced for an export."""
+    step = GreedyStep(agent._agent, agent._form.scaling(), option_length(agent._config))
+
+    def run(inputs):
+        with torch.no_grad():
+            return [each.numpy() for each in step(*(torch.from_numpy(inputs[name]) for name in step.names))]
+
+    return run
+
+
+def session_of(path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture(scope="module")
+def own_agent() -> Agent:
+    own = ["env=gymnasium", "env.entry_point=test_export:Own", "env.max_steps=5", "env.action_mask=info"]
+    agent = fresh_agent(*own, "env.observation_scaling=running", "high=linucb", "low=hppo")
+    agent._env.scaling.statistics.update(np.random.default_rng(1).uniform(-500.0, 100.0, (50, 5)))
+    return agent
+
+
+@pytest.fixture(scope="module")
+def own_session(own_agent, tmp_path_factory):
+    path = tmp_path_factory.mktemp("onnx") / "own.onnx"
+    own_agent.export(path)
+    return session_of(path), path.read_bytes()
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_the_function_that_is_exported_acts_as_the_agent(name):
+    agent = fresh_agent(*CASES[name])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert differences(agent, traced_step(agent)) < 1e-5
+
+
+def test_options_end_where_the_selector_ends_them():
+    agent = fresh_agent(*CASES["termination"])
+    options = []
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        run = traced_step(agent)
+
+        def kept(inputs):
+            outputs = run(inputs)
+            options.append(outputs[2])
+            return outputs
+
+        assert differences(agent, kept) < 1e-5
+    assert any((first != second).any() for first, second in pairwise(options))
+
+
+def test_the_file_acts_as_the_agent_on_raw_observations_alone_and_in_a_batch(own_agent, own_session):
+    session, _ = own_session
+    rng = np.random.default_rng(0)
+    far, kind = rng.uniform(-900.0, 100.0, (64, 2)), rng.integers(0, 3, 64)
+    masks = rng.random((64, 2)) < 0.5
+    masks[:, 0] |= ~masks.any(1)
+    space = own_agent.observation_space
+    rows = [spaces.flatten(space, {"far": far[i], "kind": kind[i]}) for i in range(64)]
+    inputs = {
+        "observation": np.stack(rows).astype(np.float32),
+        "action_mask": masks,
+        "option_mask": np.ones((64, 3), bool),
+        "held_option": np.zeros(64, np.int64),
+        "is_decision": np.ones(64, bool),
+    }
+    outputs = session.run(None, inputs)
+    own_agent.reset()
+    own_agent.act({"far": far, "kind": kind}, {"action_mask": masks})
+    expected = [own_agent._last[key].numpy() for key in (keys.DISCRETE, keys.PARAMETERS, keys.OPTION)]
+    assert len({*expected[0]}) == 2 and len({*expected[2]}) > 1
+    for output, value in zip(outputs, expected, strict=True):
+        assert output.dtype == value.dtype
+        np.testing.assert_allclose(output, value, atol=1e-5)
+    for output, value in zip(
+        session.run(None, {name: each[:1] for name, each in inputs.items()}), expected, strict=True
+    ):
+        np.testing.assert_allclose(output, value[:1], atol=1e-5)
+
+
+def test_the_file_holds_an_option_until_a_decision_is_due(own_session):
+    session, _ = own_session
+    held = np.arange(8) % 3
+    inputs = {
+        "observation": np.zeros((8, 5), np.float32),
+        "action_mask": np.ones((8, 2), bool),
+        "option_mask": np.ones((8, 3), bool),
+        "held_option": held,
+        "is_decision": np.zeros(8, bool),
+    }
+    np.testing.assert_array_equal(session.run(["option"], inputs)[0], held)
+    chosen = session.run(["option"], {**inputs, "is_decision": np.arange(8) < 4})[0]
+    assert len({*chosen[:4]}) == 1
+    np.testing.assert_array_equal(chosen[4:], held[4:])
+
+
+def test_the_file_says_what_its_numbers_mean_and_holds_no_code(own_session):
+    session, data = own_session
+    about = {name: json.loads(value) for name, value in session.get_modelmeta().custom_metadata_map.items()}
+    assert about["option_names"] == ["slow", "medium", "fast"]
+    assert about["parameter_dims"] == [1, 2]
+    assert (about["parameter_low"], about["parameter_high"]) == ([-1.0, 0.0, 0.0], [3.0, 9.0, 9.0])
+    assert (about["high"], about["low"], about["env"]) == ("linucb", "hppo", "gymnasium")
+    assert about["hpamdp_version"] == hpamdp.__version__
+    shapes = {each.name: each.shape for each in (*session.get_inputs(), *session.get_outputs())}
+    assert shapes["observation"] == ["N", 5] and shapes["parameters"] == ["N", 3]
+    assert not [word for word in (b".py", b"import ", b"def ", b"site-packages") if word in data]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_the_file_acts_as_the_agent(name, tmp_path):
+    agent = fresh_agent(*CASES[name])
+    agent.export(tmp_path / "a.onnx")
+    session = session_of(tmp_path / "a.onnx")
+    assert differences(agent, lambda inputs: session.run(None, inputs)) < 1e-5
+    assert differences(agent, lambda inputs: session.run(None, inputs), num_rows=1) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([*PLATFORM, "low=dlpa"], "DLPA cannot be exported: it plans at every step"),
+        ([*PLATFORM, "low=pets"], "PETS cannot be exported: it plans at every step"),
+        (
+            ["env.controller=congruent", "high=none", "low=planner"],
+            "Planner cannot be exported: it plans at every step",
+        ),
+        (["high=human", "low=hppo"], "Human cannot be exported: it reads human entries"),
+        (["high=oracle", "low=hppo"], "Oracle cannot be exported: it reads oracle entries"),
+        (["high=uniform", "low=hppo"], "cannot be exported: it samples even if it acts greedily"),
+        ([*PLATFORM, "low=random"], "cannot be exported: it samples even if it acts greedily"),
+        ([*PLATFORM, "low=hppo", "low.greedy_discrete=sampled"], "it samples even if it acts greedily"),
+    ],
+)
+def test_an_agent_that_cannot_be_exported_is_refused_in_one_line(words, message, tmp_path):
+    agent = fresh_agent(*words)
+    with pytest.raises(hpamdp.ConfigError, match=message) as refusal:
+        agent.export(tmp_path / "a.onnx")
+    assert "\n" not in str(refusal.value) and not [*tmp_path.iterdir()]
+
+
+def test_a_learner_that_branches_on_numbers_is_refused_in_one_line(tmp_path, capfd):
+    class Branching(hpamdp.HPPO):
+        def __init__(self, specs, **settings):
+            super().__init__(specs, **settings)
+            forward = self.policy.forward
+            self.policy.forward = lambda td: forward(td) if td["observation"].sum() > 0.0 else forward(td.clone())
+
+    agent = fresh_agent(*PLATFORM, "low=hppo")
+    policy = Branching(agent.specs).policy
+    agent._agent.router.policies[0] = policy
+    with pytest.raises(hpamdp.ConfigError, match="HPPO cannot be traced: ") as refusal:
+        agent.export(tmp_path / "a.onnx")
+    assert "\n" not in str(refusal.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_missing_package_is_one_line_that_names_the_extra(own_agent, tmp_path, monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr("hpamdp.api.export.find_spec", lambda name: None if name == "onnxscript" else found(name))
+    with pytest.raises(hpamdp.ConfigError, match=r"onnxscript not installed; pip install 'hpamdp\[onnx\]'"):
+        own_agent.export(tmp_path / "a.onnx")
