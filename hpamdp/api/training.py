@@ -22,7 +22,7 @@ from hpamdp.run.capacity import memory_errors_explained
 from hpamdp.run.continuation import rest_of
 from hpamdp.run.folder import locked
 from hpamdp.run.players import load_agent
-from hpamdp.run.resume import resolve
+from hpamdp.run.resume import resolve, saved_words
 from hpamdp.run.stopping import exits_explained
 from hpamdp.run.train import begin, problems_explained
 from hpamdp.run_files import METRICS_NAME
@@ -70,8 +70,10 @@ def train(
         settings = {**settings, "resume": None}
     words = [*searching(config_dirs), *arguments.words, *settings_words(settings)]
     output_dir = None if folder is None else Path(folder)
+    resumed = settings.get("resume")
+    saved = [] if resumed is None else saved_words(str(resumed), "resume", words)
     with _threads_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
-        with composed(words) as cfg:
+        with composed([*saved, *words]) as cfg:
             config, source = resolve(cfg, words, arguments.objects)
             if output_dir is None and config.logger.name != "csv":
                 raise ConfigError(f"{config.logger}: writes files, so give the run a folder")

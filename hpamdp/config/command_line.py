@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp import __version__
 from hpamdp.config.components import CALLBACK, GROUPS
-from hpamdp.config.compose import beginning_of, choosing
+from hpamdp.config.compose import beginning_of
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import RESUME_AUTO, RunConfig
 from hpamdp.messages import first_line
@@ -208,13 +208,13 @@ def completed(line: CommandLine, conf: Path) -> CommandLine:
     Raises:
         ConfigError: there is no such run, or the experiments of a sweep have different folders.
     """
-    line = line.with_words(_saved_choices(line, conf))
+    line = line.with_words(_saved_words(line))
     line = _with_experiments_of_a_folder(line, conf)
     return line.with_words(_sweep_folder(line, conf))
 
 
-def _saved_choices(line: CommandLine, conf: Path) -> list[str]:
-    """Return the saved run's choices as words, except the choices that the command line makes."""
+def _saved_words(line: CommandLine) -> list[str]:
+    """Return the saved run's choices as words, except the choices that the command line makes, and its folders."""
     values = {o.key_or_group: o.value() for o in line.overrides if not o.is_sweep_override() and not o.is_delete()}
     where = "resume" if values.get("resume") else "checkpoint"
     source = values.get(where)
@@ -224,16 +224,9 @@ def _saved_choices(line: CommandLine, conf: Path) -> list[str]:
         return []  # which is refused
     if line.is_multirun or (where == "resume" and source == RESUME_AUTO):
         return []  # the command line alone describes the run
-    from hpamdp.run.resume import saved_choices  # takes seconds, which other commands need not wait for
+    from hpamdp.run.resume import saved_words  # takes seconds, which other commands need not wait for
 
-    given = line.given()
-    has_own_files = line.flags["config-dir"] is not None or "hydra.searchpath" in given
-    choices = saved_choices(_text(source), where, line.words)
-    return [
-        choosing(group, name)
-        for group, name in choices.items()
-        if group not in given and (has_own_files or os.path.isfile(conf / group / f"{name}.yaml"))
-    ]
+    return saved_words(_text(source), where, [*line.search_path, *line.words])
 
 
 def _with_experiments_of_a_folder(line: CommandLine, conf: Path) -> CommandLine:

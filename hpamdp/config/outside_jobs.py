@@ -15,7 +15,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, OverrideParseException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from hpamdp.config.command_line import parse
@@ -51,13 +51,33 @@ def composed(words: Sequence[str]) -> Iterator[DictConfig]:
     Raises:
         ConfigError: the words cannot be composed.
     """
+    with _own_hydra():
+        cfg = _compose(words, conf_dir())
+        HydraConfig.instance().set_config(cfg)  # `compose` takes the searched folders from it
+        yield cfg
+
+
+@contextmanager
+def searched(words: Sequence[str]) -> Iterator[None]:
+    """Search the folders that `hydra.searchpath` names among these words, if it does, inside the block.
+
+    This takes no time: nothing is composed. Other threads wait until the block ends.
+    """
+    with _own_hydra():
+        own = [each for each in words if each.startswith("hydra.searchpath=")]
+        node: Any = OmegaConf.create({"hydra": {"overrides": {"hydra": own}}})  # what `compose` reads
+        HydraConfig.instance().cfg = node
+        yield
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Let the block change Hydra's state. Afterwards the state from before comes back."""
     with _HYDRA:
         outer, outer_config = GlobalHydra.instance().hydra, HydraConfig.instance().cfg  # of a program that uses Hydra
         GlobalHydra.instance().clear()
         try:
-            cfg = _compose(words, conf_dir())
-            HydraConfig.instance().set_config(cfg)  # `compose` takes the searched folders from it
-            yield cfg
+            yield
         finally:
             GlobalHydra.instance().hydra, HydraConfig.instance().cfg = outer, outer_config
 
@@ -101,15 +121,19 @@ def _written(name: str, value: Any) -> str:
     raise ConfigError(f"{name}={value!r:.80}: must be a number, a text, or a list or mapping of these")
 
 
-def searching(folders: Sequence[str | Path]) -> list[str]:
+def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list[str]:
     """Return the word that adds folders of yaml files, if there are any.
+
+    Args:
+        folders: the folders.
+        where: the argument or flag that names them, for the error.
 
     Raises:
         ConfigError: a folder does not exist.
     """
     missing = [folder for folder in folders if not Path(folder).is_dir()]
     if missing:
-        raise ConfigError(f"config_dirs: there is no folder {missing[0]}")
+        raise ConfigError(f"{where}: there is no folder {missing[0]}")
     paths = [f"file://{Path(folder).resolve()}" for folder in folders]
     return [word("hydra.searchpath", paths)] if paths else []
 

@@ -16,16 +16,16 @@ import torch
 
 from hpamdp.config.compose import package_dir, read
 from hpamdp.config.errors import ConfigError
-from hpamdp.config.outside_jobs import composed
+from hpamdp.config.outside_jobs import composed, searched
 from hpamdp.config.saved import choices_of
 from hpamdp.config.schema import Config
 from hpamdp.env.play_page import EpisodeError, PlayPage
 from hpamdp.files import replacing
 from hpamdp.messages import file_and_reason, first_line, reason_of, say, warn
 from hpamdp.run.assemble import make_env
-from hpamdp.run.checkpoint import progress_of
+from hpamdp.run.checkpoint import find, progress_of
 from hpamdp.run.page_server import DATA_NAME, EpisodeFile, PageServer, as_script
-from hpamdp.run.players import Player, load_player, split_words, whole_number
+from hpamdp.run.players import Player, add_config_dir, load_player, split_words, whole_number, with_config_dirs
 from hpamdp.run.resume import saved_choices
 from hpamdp.run_files import POLICY_NAME, saved_summary
 
@@ -54,7 +54,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
         help="of the problem, such as env=NAME; trust=true trusts the files of agents",
     )
     parser.add_argument(
-        "--agent", action="append", metavar="FOLDER", help="an agent to play beside you; none: no agent"
+        "--agent", action="append", metavar="AGENT", help="folder or name of an agent beside you; none: no agent"
     )
     parser.add_argument("--to", type=Path, default=Path("played.jsonl"), help="file that episodes are added to")
     parser.add_argument("--seed", type=whole_number(0, 2**31 - 1), default=0, help="of the episodes that people get")
@@ -62,10 +62,12 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     parser.add_argument("--port", type=whole_number(0, 65535), default=8750, help="0: any that is free (8750)")
     parser.add_argument("--no-browser", action="store_true", help="do not open the browser")
     parser.add_argument("--export", type=Path, metavar="FOLDER", help="write the page as files and serve nothing")
+    add_config_dir(parser)
     options = parser.parse_intermixed_args(words)
     path, settings = split_words(options.settings)
     if path is not None:
         raise ConfigError(f"{path}: not SETTING=VALUE; give an agent as --agent {path}")
+    settings = with_config_dirs(settings, options.config_dir)
     with composed(settings) as cfg:
         config = read(cfg)
     page = _page(config, options.seed)
@@ -101,15 +103,15 @@ def own_agents(config: Config) -> list[dict[str, Any]]:
     files = sorted(folder.glob(f"*/{POLICY_NAME}"))
     # Most agents are for other problems, and building an agent takes half a second.
     folders = [file.parent for file in files if choices_of(progress_of(file)["config"])["env"] == config.env.name]
-    agents = [described(path, load_player(str(path), _ONE_EPISODE)) for path in folders]
+    agents = [described(each, load_player(str(each), _ONE_EPISODE)) for each in folders]
     return [agent for agent in agents if agent is not None]
 
 
 def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the agents in these folders in the page's form.
+    """Return these agents in the page's form.
 
     Args:
-        names: the folders; `none` stands for no agent.
+        names: folders or files of agents, or names of those that come with the package; `none` stands for no agent.
         config: the config of the page's problem.
         settings: the words of the command line that led to `config`.
 
@@ -121,7 +123,7 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
         if name == "none":
             continue
         player = load_player(name, [*_ONE_EPISODE, *permissions(name, config, settings)])
-        agent = described(Path(name), player)
+        agent = described(find(name, "--agent").parent, player)
         if agent is None:
             raise ConfigError(
                 f"--agent {name}: {player.config.high} over {player.config.low} cannot be taken into a page"
@@ -131,28 +133,29 @@ def given_agents(names: Sequence[str], config: Config, settings: Sequence[str]) 
 
 
 def permissions(name: str, config: Config, settings: Sequence[str]) -> list[str]:
-    """Return the user's permissions for an agent's config as words: guarded settings and `trust`."""
-    is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
+    """Return the user's words that an agent's config needs: guarded settings, `trust`, and folders of yaml files."""
+    with searched(settings):
+        is_same_problem = saved_choices(name, "checkpoint", [])["env"] == config.env.name
     given = [word.partition("=") for word in settings]
     return [
         f"{setting}={value}"
         for setting, _, value in given
-        if setting == "trust" or (is_same_problem and config.env.is_guarded(setting.removeprefix("env."), value))
+        if setting in ("trust", "hydra.searchpath")
+        or (is_same_problem and config.env.is_guarded(setting.removeprefix("env."), value))
     ]
 
 
-def described(path: Path, player: Player) -> dict[str, Any] | None:
-    """Return what the page needs of an agent; None if its networks cannot be exported."""
+def described(folder: Path, player: Player) -> dict[str, Any] | None:
+    """Return what the page needs of the agent in a folder; None if its networks cannot be exported."""
     form = player.agent.exported()
     if form is None:
         return None
     config = player.config
-    name = path.name if path.is_dir() else path.parent.name
     title = config.low.name if config.high.cls is None else f"{config.high.name} + {config.low.name}"
-    score: Any = saved_summary(path if path.is_dir() else path.parent).get("score")
+    score: Any = saved_summary(folder).get("score")
     options = json.loads(json.dumps(dict(config.env.settings)))
     return {
-        "name": name,
+        "name": folder.resolve().name,
         "title": title,
         "score": score if type(score) in (int, float) and math.isfinite(score) else None,
         "env": options,

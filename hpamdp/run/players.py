@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from hpamdp.config.compose import choosing, read
+from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching, word
 from hpamdp.config.schema import Config
@@ -19,7 +19,7 @@ from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import check_built, choose_selector, make_agent, make_env, make_evaluation
 from hpamdp.run.evaluate import Evaluation
-from hpamdp.run.resume import check_saved_options, resolve, saved_choices
+from hpamdp.run.resume import check_saved_options, resolve, saved_words
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -67,6 +67,24 @@ def split_words(words: Sequence[str]) -> tuple[str | None, list[str]]:
     return (paths[0] if paths else None), [word for word in words if word not in paths]
 
 
+def add_config_dir(parser: argparse.ArgumentParser) -> None:
+    """Add the flag `--config-dir`, as the main command has it, except that it can be given several times."""
+    parser.add_argument(
+        "--config-dir", "-cd", action="append", default=[], metavar="FOLDER", help="yaml files of your own"
+    )
+
+
+def with_config_dirs(settings: Sequence[str], folders: Sequence[str]) -> list[str]:
+    """Return settings with the word that adds the folders of `--config-dir`.
+
+    Raises:
+        ConfigError: a folder does not exist, or the settings name folders, too.
+    """
+    if folders and any(each.startswith("hydra.searchpath=") for each in settings):
+        raise ConfigError("--config-dir and hydra.searchpath: give all folders in one of them")
+    return [*searching(folders, "--config-dir"), *settings]
+
+
 def whole_number(least: int, most: int) -> Callable[[str], int]:
     """Return a function for `argparse` that reads a whole number in this range."""
 
@@ -108,7 +126,7 @@ def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, 
     """
     words = list(settings)
     if path is not None:
-        words = [*_saved_words(path, settings), *settings, "mode=eval", word("checkpoint", path)]
+        words = [*saved_words(path, "checkpoint", settings), *settings, "mode=eval", word("checkpoint", path)]
     with composed(words) as cfg:
         if path is None:
             config, source = choose_selector(read(cfg).with_objects(objects), settings), None
@@ -126,15 +144,3 @@ def load_agent(path: str | None, settings: Sequence[str], objects: Mapping[str, 
         saved = checkpoint.load(source, agent, device, with_training=False)
         saved.set_statistics(env)
         return LoadedAgent(config, agent, env, saved.progress)
-
-
-def _saved_words(path: str, settings: Sequence[str]) -> list[str]:
-    """Return the choices of a saved agent as words, and its folders of yaml files if the settings trust it."""
-    given = {each.partition("=")[0] for each in settings}
-    words = []
-    if "trust=true" in settings and "hydra.searchpath" not in given:
-        folders = checkpoint.progress_of(checkpoint.find(path, "checkpoint")).get("config_dirs") or []
-        words = searching([folder for folder in folders if os.path.isdir(folder)])
-    with composed(words or [each for each in settings if each.startswith("hydra.searchpath=")]):
-        chosen = saved_choices(path, "checkpoint", settings)
-    return [*words, *(choosing(group, name) for group, name in chosen.items() if group not in given)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,8 +13,9 @@ import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from hpamdp.config.components import GROUPS
-from hpamdp.config.compose import RECIPE, chosen_names, plain, read
-from hpamdp.config.errors import ConfigError, MissingChoiceError
+from hpamdp.config.compose import RECIPE, choosing, chosen_names, conf_dir, names_of, plain, read
+from hpamdp.config.errors import ConfigError, MissingChoiceError, as_json
+from hpamdp.config.outside_jobs import searched, searching
 from hpamdp.config.saved import choices_of, read_saved, upgraded
 from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
@@ -69,9 +71,7 @@ def resolve(
     try:
         resolved = read_saved(saved, values, names, trust=config.run.trust, file=file)
     except MissingChoiceError as error:
-        folders = checkpoint.progress_of(file).get("config_dirs")
-        made_with = f" The run was made with --config-dir {' '.join(folders)}" if folders else ""
-        raise ConfigError(f"{error}{made_with}") from error
+        raise _not_there(error, file) from error
     return replace(resolved, config_dirs=config.config_dirs).with_objects(objects), file
 
 
@@ -98,6 +98,42 @@ def saved_choices(source: str, where: str, overrides: Sequence[str]) -> dict[str
     _changes(overrides, saved, file, where)
     left_out = () if where == "resume" else _NOT_EVALUATED
     return {group: name for group, name in choices_of(saved).items() if group not in left_out}
+
+
+def saved_words(source: str, where: str, words: Sequence[str]) -> list[str]:
+    """Return the choices of a saved run as words, and its folders of yaml files if the words trust the run.
+
+    Nothing of these folders is read without `trust=true`, since somebody else may have written the file.
+
+    Args:
+        source: the run's output folder or its checkpoint.
+        where: the setting that names the source.
+        words: the words of the command line, whose choices and folders precede those of the saved run.
+
+    Raises:
+        ConfigError: the checkpoint does not exist, a word would change the saved agent, or a choice has no yaml file.
+    """
+    given = {_name(each): each.partition("=")[2] for each in words}
+    file = checkpoint.find(source, where)
+    folders = []
+    if given.get("trust", "").lower() == "true" and "hydra.searchpath" not in given:
+        known = checkpoint.progress_of(file).get("config_dirs") or []
+        folders = searching([folder for folder in known if os.path.isdir(folder)])
+    with searched([*folders, *words]):
+        choices = {group: name for group, name in saved_choices(source, where, words).items() if group not in given}
+        for group, name in choices.items():
+            if not (conf_dir() / group / f"{name}.yaml").is_file() and name not in names_of(group):
+                raise _not_there(MissingChoiceError(f"{group}/{name}", names_of(group)), file)
+    return [*folders, *(choosing(group, name) for group, name in choices.items())]
+
+
+def _not_there(error: MissingChoiceError, file: Path) -> ConfigError:
+    """Return a refusal that names the folders of yaml files that the saved run had."""
+    folders = checkpoint.progress_of(file).get("config_dirs")
+    if not folders:
+        return error
+    named = ", ".join(map(as_json, folders))
+    return ConfigError(f"{error} The run had {named}; give the folder again, or add trust=true if you trust {file}")
 
 
 def check_saved_options(config: Config, env: PAMDPEnv) -> None:

@@ -11,13 +11,14 @@ from torch import Tensor
 from hpamdp.analysis import film
 from hpamdp.config.errors import ConfigError
 from hpamdp.messages import reason_of, say
-from hpamdp.run.players import load_player, split_words, whole_number
+from hpamdp.run.players import add_config_dir, load_player, split_words, whole_number, with_config_dirs
 
 _DESCRIPTION = """\
 Film an agent at its problem.
 
   hpamdp watch outputs/2025-01-31/12-00-00                 a run's agent
-  hpamdp watch agents/linucb_hppo --to a.mp4 --episodes 9  one that comes with the code; .mp4 needs hpamdp[video]
+  hpamdp watch linucb_hppo --to a.mp4 --episodes 9         one that comes with the code; .mp4 needs hpamdp[video]
+  hpamdp watch --config-dir conf outputs/mine              one of a problem or a learner of your own
   hpamdp watch outputs/shared trust=true                   somebody else's, whose environment may run code
   hpamdp watch low=planner high=oracle                     the best plan
   hpamdp watch low=random high=none env=platform           random actions on another problem
@@ -39,6 +40,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     parser.add_argument(
         "--size", type=whole_number(20, 4096), default=320, help="px of an episode, from edge to edge (320)"
     )
+    add_config_dir(parser)
     options = parser.parse_intermixed_args(words)
     if options.to.suffix not in film.SUFFIXES:
         raise ConfigError(f"--to {options.to}: must end in {' or '.join(film.SUFFIXES)}")
@@ -48,7 +50,7 @@ def main(words: Sequence[str], parser: argparse.ArgumentParser) -> int:
     if path is None and not settings:
         raise ConfigError("watch: nobody to watch; give a run's folder, or a player such as low=planner high=oracle")
     episodes = [f"eval.layouts={options.episodes}", f"eval.seed={options.seed}", "film=true"]
-    player = load_player(path, [*settings, *episodes])
+    player = load_player(path, [*with_config_dirs(settings, options.config_dir), *episodes])
     evaluation = player.evaluation
     states: list[dict[str, Tensor]] = []
     played = evaluation.run(player.agent.policy, states)
