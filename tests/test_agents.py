@@ -1,14 +1,18 @@
 """The agents that come with the code: small, complete, and as good as their summaries say."""
 
 import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml
 from conftest import choices, compose_config, make_config
+from hydra._internal.hydra import Hydra
 
+import hpamdp
 from hpamdp.config.errors import ConfigError
+from hpamdp.config.saved import upgraded
 from hpamdp.run import checkpoint
 from hpamdp.run.play import described, own_agents
 from hpamdp.run.players import load_player
@@ -27,8 +31,8 @@ def config_of(name: str) -> dict:
 
 def test_there_is_an_agent_for_each_problem_each_boat_and_the_whole_task():
     configs = [config_of(name) for name in AGENTS]
-    assert {config["env"]["name"] for config in configs} >= PROBLEMS
-    controllers = {config["env"]["controller"] for config in configs if config["env"]["name"] == "boatdock"}
+    assert {config["choices"]["env"] for config in configs} >= PROBLEMS
+    controllers = {config["env"]["controller"] for config in configs if config["choices"]["env"] == "boatdock"}
     assert controllers == {"choose", "congruent", "incongruent"}
 
 
@@ -58,7 +62,7 @@ def test_those_on_boats_can_be_played_against_and_the_others_are_not_even_built(
         "hpamdp.run.play.load_player", lambda path, words: built.append(path) or load_player(path, words)
     )
     agents = own_agents(config)
-    on_boats = [name for name in AGENTS if config_of(name)["env"]["name"] == "boatdock"]
+    on_boats = [name for name in AGENTS if config_of(name)["choices"]["env"] == "boatdock"]
     assert [agent["name"] for agent in agents] == [Path(path).name for path in built] == on_boats
     assert all(agent["score"] > 3.0 for agent in agents)
 
@@ -76,6 +80,17 @@ def test_the_networks_of_an_agent_start_a_run(tmp_path):
     assert json.loads((tmp_path / "summary.json").read_text())["success"] > 0.6
 
 
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_file_of_an_agent_has_todays_form_which_loads_without_further_compositions(name, monkeypatch):
+    progress = checkpoint.progress_of(FOLDER / name / "policy.pt")
+    assert progress["config"] == config_of(name) == upgraded(progress["config"])
+    composing: list[object] = []
+    compose = Hydra.compose_config
+    monkeypatch.setattr(Hydra, "compose_config", lambda *args, **kw: composing.append(args) or compose(*args, **kw))
+    hpamdp.load(name)
+    assert len(composing) == 2
+
+
 def test_networks_alone_are_scored_but_not_resumed():
     folder = str(FOLDER / "linucb_hppo")
     assert checkpoint.find(folder, "checkpoint").name == "policy.pt"
@@ -89,6 +104,33 @@ def test_the_words_of_eval_take_the_agent_from_its_folder():
     config, file = resolve(compose_config(words), words)
     assert (config.high.name, config.low.name, config.run.eval.layouts) == ("linucb", "hppo", 7)
     assert file == FOLDER / "linucb_hppo" / "policy.pt"
+
+
+def test_an_agent_is_found_by_its_name_by_every_command(command, tmp_path):
+    assert command("watch", "hppo_platform", "--episodes=1", "--size=40", "--fps=5")[0] == 0
+    assert command("mode=eval", "checkpoint=hppo_platform", "eval.layouts=4", "film=false")[0] == 0
+    code, _, err = command("play", "--agent", "hppo_congruent", "--export", "site")
+    assert code == 0, err
+    assert '"name":"hppo_congruent","title":"hppo","score":3.257' in (tmp_path / "site/data.js").read_text()
+    file = checkpoint.find("pdqn_goal", "low.checkpoint")
+    assert file == FOLDER / "pdqn_goal/policy.pt"
+
+
+def test_an_existing_folder_precedes_the_agent_of_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pdqn_goal").mkdir()
+    shutil.copy(FOLDER / "hppo_platform/policy.pt", "pdqn_goal")
+    assert hpamdp.load("pdqn_goal").specs.num_discrete == 3
+    assert checkpoint.find("pdqn_goal", "checkpoint") == Path("pdqn_goal/policy.pt")
+
+
+@pytest.mark.parametrize(
+    "words", [["watch", "hppo_plat"], ["mode=eval", "checkpoint=hppo_plat"], ["play", "--agent", "hppo_plat"]]
+)
+def test_a_wrong_name_is_refused_in_one_line_with_all_names(words, command):
+    code, _, err = command(*words)
+    assert (code, err.count("\n")) == (2, 1)
+    assert all(name in err for name in AGENTS)
 
 
 def test_a_foreign_summary_gives_a_score_or_none(tmp_path):
