@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
-from hpamdp.config.components import Component, constructor_arguments
+from hpamdp.config.components import Component, constructor_arguments, is_passed
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.facts import ProblemFacts
+from hpamdp.pickling import why_unsendable
 
 # The choice that picks a selector automatically, and the selector that it picks if there are options.
 AUTO_SELECTOR, DEFAULT_SELECTOR = "auto", "ucb"
@@ -216,6 +217,24 @@ def collector_fits_the_run(config: Config) -> str | None:
     return None
 
 
+def workers_get_what_python_passed(config: Config) -> str | None:
+    """Require that objects and classes from Python code can be sent to a collector's workers."""
+    if config.run.mode == "eval" or not getattr(config.collector.cls, "has_workers", False):
+        return None
+    parts = (config.env, config.high, *config.learners)
+    passed: dict[str, object] = {str(part): part.cls for part in parts if part.cls is not None and is_passed(part.cls)}
+    if config.env.objects:
+        passed["env"] = config.env.objects
+    for what, value in passed.items():
+        why = why_unsendable(value)
+        if why is not None:
+            return (
+                f"{what}: cannot be sent to the workers of {config.collector} ({why}); create what it refers to in its "
+                "constructor or function, or use collector=single"
+            )
+    return None
+
+
 def shared_scaling_needs_one_process(config: Config, problem: ProblemFacts) -> str | None:
     """Require a single process for environments that learn a common scale or start processes themselves."""
     if config.run.mode == "eval" or config.collector.settings.get("num_workers", 1) == 1 or problem.is_shardable:
@@ -348,6 +367,7 @@ RULES: tuple[Rule, ...] = (
     n_step_fits_a_batch,
     compared_learners_have_values,
     collector_fits_the_run,
+    workers_get_what_python_passed,
     problem_provides_needs,
 )
 PROBLEM_RULES: tuple[ProblemRule, ...] = (

@@ -27,6 +27,7 @@ from hpamdp.env.gymnasium.masks import MaskSource
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
 from hpamdp.env.registration import register
+from hpamdp.pickling import why_unsendable
 from hpamdp.settings import PositiveFraction, SettingError, Settings
 
 _SUCCESS = "success"
@@ -155,6 +156,12 @@ class GymnasiumEnv(PAMDPEnv):
             return Copies(make, self.num_envs, self._reading(), self._name)
         if multiprocessing.current_process().daemon:
             raise SettingError(f"{self._name}: {num_workers=}: a worker process cannot start others; use 0")
+        why = why_unsendable(make)
+        if why is not None:
+            raise SettingError(
+                f"{self._name}: {num_workers=}: cannot be sent to processes ({why}); create what it refers to in its "
+                "constructor or function, or use 0"
+            )
         return ProcessCopies(make, self.num_envs, self._reading(), self._name, num_workers)
 
     def _reading(self) -> Reading:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+import multiprocessing
 import traceback
 from collections.abc import Callable
 from typing import Any
@@ -59,7 +60,12 @@ class Maker:
             else:
                 env = self._load(self._entry_point)(**kwargs)
         except (gymnasium.error.Error, ImportError) as error:
-            raise SettingError(f"{self.name}: {one_line(error)}") from error
+            cure = ""
+            if isinstance(error, gymnasium.error.NameNotFound) and multiprocessing.parent_process() is not None:
+                cure = (
+                    " This is a worker process; name the module that registers it, as module:Name-v0, or pass the class"
+                )
+            raise SettingError(f"{self.name}: {one_line(error)}{cure}") from error
         except (SettingError, ProblemError, MemoryError):
             raise
         except Exception as error:

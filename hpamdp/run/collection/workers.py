@@ -16,9 +16,11 @@ from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
+from hpamdp.config.errors import ConfigError
 from hpamdp.config.schema import Config
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError
+from hpamdp.messages import first_line
 from hpamdp.run.assemble import AssembledRun
 from hpamdp.run.collection.base import Collection, CollectionError, WorkerDiedError, checked_state
 from hpamdp.run.collection.limits import limit_of
@@ -145,9 +147,12 @@ class WorkerCollection(Collection):
         Raises:
             WorkerDiedError: the worker died.
             CollectionError: the machine reached a limit.
+            ConfigError: the environment cannot be made in a worker.
         """
         if isinstance(error, ProblemError | EnvironmentFaultError | MemoryError | RemoteError):
             raise error
+        if isinstance(error, ConfigError):  # a worker's, to which TorchRL adds the traceback
+            raise ConfigError(first_line(error)) from error
         limit = limit_of(error)
         if limit is not None:
             raise CollectionError(f"{self.name}: {limit}") from error
