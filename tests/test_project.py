@@ -83,6 +83,22 @@ def test_the_changelog_and_the_citation_have_this_version():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == hpamdp.__version__
 
 
+def test_the_package_has_the_authors_keywords_and_licence_of_the_citation():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert project["authors"] == citation["authors"]
+    assert project["keywords"] == citation["keywords"]
+    assert project["license"] == citation["license"]
+    assert all((ROOT / name).is_file() for name in [*project["license-files"], project["readme"]])
+
+
+def test_the_classifiers_name_the_python_versions_that_are_allowed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lowest, above = map(int, re.fullmatch(r">=3\.(\d+),<3\.(\d+)", project["requires-python"]).groups())
+    named = re.findall(r"Python :: 3\.(\d+)", "\n".join(project["classifiers"]))
+    assert [*map(int, named)] == [*range(lowest, above)]
+
+
 def test_every_dependency_has_a_lowest_version_that_is_pinned():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     ranges = dict(re.fullmatch(r"([\w-]+)>=([\d.]+),<[\d.]+", line).groups() for line in project["dependencies"])
