@@ -37,7 +37,7 @@ from hpamdp.specs import PAMDPSpecs
 def make_actor(specs: PAMDPSpecs) -> Actor:
     return Actor(
         specs,
-        CPU,
+        device=CPU,
         hidden_dims=[16],
         gamma=1.0,
         epochs=1,
