@@ -41,7 +41,7 @@ def test_a_fault_keeps_its_line_and_its_frames_between_processes():
 
 
 def test_a_bug_of_the_package_itself_is_no_fault_of_an_environment(monkeypatch):
-    monkeypatch.setattr(ObservationSpace, "write", None)
+    monkeypatch.setattr(ObservationSpace, "rounded", None)
     with pytest.raises(TypeError, match="not callable"):
         play("toy_environments:Toy")
 

@@ -28,7 +28,7 @@ PARTS = spaces.Dict(a=spaces.Box(-9, 9, (2,)), b=spaces.Dict(c=spaces.Box(-9, 9,
 def quickly(space: ObservationSpace, value) -> np.ndarray:
     """Return an observation as a vector, in the way of an environment with many copies."""
     vectors = np.zeros((1, space.dim))
-    if space.write(value, space.parts(vectors[0])) and space.unsettled(vectors):
+    if space.writer(vectors[0])(value) and space.unsettled(vectors):
         vectors[0] = space.settled(vectors[0])
     return space.rounded(vectors)[0]
 

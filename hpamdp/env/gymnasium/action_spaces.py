@@ -83,6 +83,8 @@ class ActionSpace:
             dtypes = {box.dtype for box in self._boxes}
             self._bounds_by_dtype = {dtype: (self._low.astype(dtype), self._high.astype(dtype)) for dtype in dtypes}
         self._is_unit = is_precise & ~_is_resolved(self._low, self._high)
+        self._has_units = bool(self._is_unit.any())
+        self._first = int(self._discrete.start)
         self.low = np.where(self._is_unit, -1.0, self._low).astype(np.float32)
         self.high = np.where(self._is_unit, 1.0, self._high).astype(np.float32)
 
@@ -94,16 +96,15 @@ class ActionSpace:
             parameters: of all discrete actions, `[M, sum(parameter_dims)]`. Values outside their bounds are clipped;
                 NaN becomes the lower bound.
         """
-        if self._is_unit.any():
+        if self._has_units:
             share = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
             parameters = np.where(self._is_unit, self._low + share * (self._high - self._low), parameters)
-        natives = list((self._discrete.start + discrete).astype(self._discrete.dtype))
+        natives = list((self._first + discrete if self._first else discrete).astype(self._discrete.dtype, copy=False))
         # Clipped in the box's own precision: its bounds may differ from the float32 ones by rounding. fmax skips NaN.
-        with np.errstate(over="ignore"):  # parameters of other boxes, in float16
-            clipped = {
-                dtype: np.fmin(np.fmax(parameters.astype(dtype), low), high)
-                for dtype, (low, high) in self._bounds_by_dtype.items()
-            }
+        clipped = {
+            dtype: np.fmin(np.fmax(self._cast(parameters, dtype), low), high)
+            for dtype, (low, high) in self._bounds_by_dtype.items()
+        }
         owned = zip(self._boxes, self._slices, strict=True)
         parts = [_by_row(clipped[box.dtype][:, own], box.shape) for box, own in owned]
         if self._has_one_box:
@@ -125,6 +126,12 @@ class ActionSpace:
         if self._is_flat:
             return [(native, *boxes) for native, boxes in zip(natives, values, strict=True)]
         return list(zip(natives, values, strict=True))
+
+    def _cast(self, parameters: np.ndarray, dtype: np.dtype) -> np.ndarray:
+        if dtype.itemsize >= 4:
+            return parameters.astype(dtype, copy=False)
+        with np.errstate(over="ignore"):  # parameters of other boxes
+            return parameters.astype(dtype)
 
     def _read_parts(self) -> tuple[spaces.Discrete, spaces.Space]:
         """Return the space of the discrete actions and that of the parameters, and note how the two are combined."""
@@ -276,6 +283,8 @@ def _in_order(names: list[str]) -> list[str]:
 
 def _by_row(values: np.ndarray, shape: tuple[int, ...]) -> list[np.ndarray]:
     """Return the rows of values `[M, size]` as arrays of this shape."""
+    if len(shape) == 1:  # as a rule
+        return list(values)
     rows = values.reshape(len(values), *shape)
     return list(rows) if shape else [rows[row, ...] for row in range(len(rows))]
 

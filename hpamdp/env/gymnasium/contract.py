@@ -40,26 +40,10 @@ class ContractCheck(gymnasium.Wrapper):
         """Take a step."""
         try:
             values: Any = self.env.step(action)
-        except TypeError as error:
-            if not _is_about_the_call(error):
-                raise
-            raise ProblemError(f"step must take an action: {one_line(error)}") from error
-        except SystemExit as error:
-            raise ProblemError(f"step called sys.exit({shown(error.code)})") from error
-        if not isinstance(values, tuple) or len(values) != 5:
-            given = f"{len(values)} values" if isinstance(values, tuple) else type(values).__name__
-            raise ProblemError(f"step returned {given}, not observation, reward, terminated, truncated and info")
-        observation, reward, terminated, truncated, info = values
-        if type(info) is not dict and not isinstance(info, Mapping):
-            raise ProblemError(f"step returned {shown(info)} as info, which must be a dictionary")
-        # The types that a step usually returns need no call, which takes longer than all of these comparisons.
-        if type(reward) is not float:
-            reward = number("reward", reward)
-        if type(terminated) is not bool:
-            terminated = flag("terminated", terminated)
-        if type(truncated) is not bool:
-            truncated = flag("truncated", truncated)
-        return observation, reward, terminated, truncated, info if type(info) is dict else dict(info)
+        except (TypeError, SystemExit) as error:
+            refuse_step(error)
+            raise
+        return checked_step(values)
 
     def close(self) -> None:
         """Close the environment; if it calls `sys.exit`, warn and let the run go on."""
@@ -67,6 +51,42 @@ class ContractCheck(gymnasium.Wrapper):
             self.env.close()
         except SystemExit as error:
             warn(f"{type(self.unwrapped).__name__}: close called sys.exit({shown(error.code)}); the run goes on")
+
+
+def refuse_step(error: TypeError | SystemExit) -> None:
+    """Explain an error of `step` if it breaks the contract; call this in the frame that called `step`.
+
+    Raises:
+        ProblemError: `step` does not take an action, or it ended the program.
+    """
+    if isinstance(error, SystemExit):
+        raise ProblemError(f"step called sys.exit({shown(error.code)})") from error
+    if _is_about_the_call(error):
+        raise ProblemError(f"step must take an action: {one_line(error)}") from error
+
+
+def checked_step(values: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    """Return what a step returned, after a check of its form; the reward is a float, and the flags are bool.
+
+    Raises:
+        ProblemError: the values break the contract.
+    """
+    if not isinstance(values, tuple) or len(values) != 5:
+        given = f"{len(values)} values" if isinstance(values, tuple) else type(values).__name__
+        raise ProblemError(f"step returned {given}, not observation, reward, terminated, truncated and info")
+    observation, reward, terminated, truncated, info = values
+    # The types that a step usually returns need no call, which takes longer than all of these comparisons.
+    if type(info) is not dict:
+        if not isinstance(info, Mapping):
+            raise ProblemError(f"step returned {shown(info)} as info, which must be a dictionary")
+        info = dict(info)
+    if type(reward) is not float:
+        reward = number("reward", reward)
+    if type(terminated) is not bool:
+        terminated = flag("terminated", terminated)
+    if type(truncated) is not bool:
+        truncated = flag("truncated", truncated)
+    return observation, reward, terminated, truncated, info
 
 
 def _is_about_the_call(error: TypeError) -> bool:

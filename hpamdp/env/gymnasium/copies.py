@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -14,10 +13,11 @@ import numpy as np
 from hpamdp import keys
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, fault_of
 from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
+from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_step
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.masks import Masks, MaskSource
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
-from hpamdp.env.gymnasium.time_limit import with_limit
+from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.gymnasium.values import flag
 from hpamdp.settings import SettingError
 
@@ -125,9 +125,9 @@ class Copies:
         self.envs = [make() for _ in range(num)]
         self._check_spaces()
         try:
-            self.envs, limits = map(list, zip(*[with_limit(env, reading.max_steps) for env in self.envs], strict=True))
             self.example = self.envs[0]
-            self.max_steps = max(limits)
+            self._limits = [limit_of(env, reading.max_steps) for env in self.envs]
+            self.max_steps = max(self._limits)
             space = self.envs[0].observation_space
             self.options = OptionSpace(self.envs[0].action_space, reading.option_key)
             self.actions = ActionSpace(self.options.rest, reading.parameter_dims)
@@ -150,9 +150,11 @@ class Copies:
         self.table = np.zeros((num, self.layout.num_result_columns))
         self.results = self.layout.results(self.table)
         # What each step needs, looked up once.
-        self._vectors = [self.observations.parts(row) for row in self.results.observation]
+        self._write = [self.observations.writer(row) for row in self.results.observation]
+        # Without the outer check, whose work `step` does in its loop.
+        self._unchecked = [env.env if isinstance(env, ContractCheck) else env for env in self.envs]
+        self._num_steps = [0] * num
         self._after = self.table[:, self.layout.dim : self.layout.dim + _NUM_AFTER]
-        self._write = self.observations.write
         self._has_masks = bool(mask_sizes)
 
     def _check_spaces(self) -> None:
@@ -175,15 +177,19 @@ class Copies:
             EnvironmentFaultError: its `reset` raised an error.
         """
         rows = np.array([*seeds], np.int64)
-        with self._explained("reset"):
-            to_check = []
+        settled: set[int] = set()
+        try:
             for self._row, seed in seeds.items():
                 env = self.envs[self._row]
                 observation, info = env.reset(seed=seed)
                 self._masks.check_attributes(env)
-                to_check.append(self._write(observation, self._vectors[self._row]))
+                if not self._write[self._row](observation):
+                    settled.add(self._row)
                 self._masks.keep(self._row, observation, info)
-            self._settle(rows, to_check)
+                self._num_steps[self._row] = 0
+            self._settle(rows, settled)
+        except Exception as error:
+            self._explain("reset", error)
         self._after[rows] = 0.0
 
     def step(self, rows: list[int], option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray) -> None:
@@ -204,35 +210,52 @@ class Copies:
         if option is not None:
             chosen = zip(natives, option[index].tolist(), strict=True)
             natives = [self.options.with_option(native, number) for native, number in chosen]
-        returned, to_check = [], []
-        with self._explained("step"):
+        unchecked, write, num_steps, limits = self._unchecked, self._write, self._num_steps, self._limits
+        rewards: list[float] = []
+        flags: dict[int, tuple[bool, ...]] = {}  # of the few copies that have one
+        settled: set[int] = set()
+        try:
             for row, action in zip(rows, natives, strict=True):
                 self._row = row
-                observation, reward, terminated, truncated, info = self.envs[row].step(action)
-                to_check.append(self._write(observation, self._vectors[row]))
-                is_success = has_success = False
+                try:
+                    values = unchecked[row].step(action)
+                except (TypeError, SystemExit) as error:
+                    refuse_step(error)
+                    raise
+                observation, reward, terminated, truncated, info = checked_step(values)
+                if not write[row](observation):
+                    settled.add(row)
+                rewards.append(reward)
+                num_steps[row] += 1
+                truncated = not terminated and (truncated or num_steps[row] >= limits[row])
+                success = None
                 if info or self._has_masks or type(observation) is not np.ndarray:
                     self._masks.keep(row, observation, info)
                     success = _success_in(info)
-                    is_success, has_success = bool(success), success is not None
-                returned.append((reward, terminated, truncated and not terminated, is_success, has_success))
+                if terminated or truncated or success is not None:
+                    flags[row] = (terminated, truncated, bool(success), success is not None)
             if rows:
-                self._settle(index, to_check)
-        if rows:
-            self._after[index] = returned
+                self._settle(index, settled)
+        except Exception as error:
+            self._explain("step", error)
+        self.results.flags[:, index] = 0.0
+        self.results.reward[index] = rewards
+        for row, of_row in flags.items():
+            self.results.flags[:, row] = of_row
 
-    def _settle(self, rows: Any, to_check: list[bool]) -> None:
+    def _settle(self, rows: Any, settled: set[int]) -> None:
         """Check the observations that these copies have written, and keep their masks.
 
         Args:
             rows: index of the copies' rows.
-            to_check: for each of them whether its numbers are still to be checked.
+            settled: rows whose numbers need no more check.
         """
         observations = self.results.observation
         vectors = observations[rows]
         for number in self.observations.unsettled(vectors):
-            if to_check[number]:
-                self._row = number if rows is _ALL else int(rows[number])
+            row = number if rows is _ALL else int(rows[number])
+            if row not in settled:
+                self._row = row
                 vectors[number] = self.observations.settled(vectors[number])
         observations[rows] = self.observations.rounded(vectors)
         for name, masks in self._masks.rows.items():
@@ -246,29 +269,28 @@ class Copies:
             EnvironmentFaultError: `render` raised an error.
         """
         pictures = []
-        with self._explained("render"):
+        try:
             for row in range(min(num, len(self.envs))):
                 self._row = row
                 picture: Any = self.envs[row].render()
                 if not (isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.shape[2:] == (3,)):
                     raise ProblemError(f"render returned {_kind(picture)}, not a picture, uint8 [height, width, 3]")
                 pictures.append(picture)
+        except Exception as error:
+            self._explain("render", error)
         return pictures
 
-    @contextmanager
-    def _explained(self, method: str) -> Iterator[None]:
-        """Say which copy broke its contract or raised an error."""
-        try:
-            yield
-        except ProblemError as error:
-            raise ProblemError(f"{self._name}: environment {self._first + self._row}: {error}") from error
-        except (EnvironmentFaultError, MemoryError):
-            raise
-        except Exception as error:
-            fault = fault_of(error, f"{self._name}: environment {self._first + self._row}: its {method}")
-            if fault is None:
-                raise
-            raise fault from error
+    def _explain(self, method: str, error: Exception) -> NoReturn:
+        """Raise the error of a method, and say which copy broke its contract or raised it."""
+        if isinstance(error, EnvironmentFaultError | MemoryError):
+            raise error
+        where = f"{self._name}: environment {self._first + self._row}"
+        if isinstance(error, ProblemError):
+            raise ProblemError(f"{where}: {error}") from error
+        fault = fault_of(error, f"{where}: its {method}")
+        if fault is None:
+            raise error
+        raise fault from error
 
     def close(self) -> None:
         """Close the copies."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -30,6 +31,7 @@ from hpamdp.env.registration import register
 from hpamdp.pickling import why_unsendable
 from hpamdp.settings import PositiveFraction, SettingError, Settings
 
+_CPU = torch.device("cpu")
 _SUCCESS = "success"
 _SEED = "seed"
 _PICTURE = "picture"
@@ -147,6 +149,8 @@ class GymnasiumEnv(PAMDPEnv):
         self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma)
         self._action_shapes = (self.batch_size, torch.Size((num_envs, sum(self.parameter_dims))))
         self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
+        self._is_over = np.zeros(num_envs, bool)
+        self._rows = [*range(num_envs)]
         self._reports_success = False
         self._set_seed(seed)
 
@@ -317,7 +321,7 @@ class GymnasiumEnv(PAMDPEnv):
         for row in rows:
             self._next_seeds[row] = None
         self._copies.reset(chosen)
-        self._scale(is_reset)
+        self._scale(is_reset, is_all=len(rows) == self.num_envs)
         if self._reward_scaling is not None:
             self._reward_scaling.begin(is_reset)
         return self._read()
@@ -325,13 +329,13 @@ class GymnasiumEnv(PAMDPEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         chosen, values = self._read_action(tensordict)
         option = self._read_option(tensordict)
-        results, is_stepped = self._copies.results, self._is_running()
+        results, is_stepped = self._copies.results, ~self._is_over
         if "_step" in tensordict.keys():
-            is_stepped &= tensordict.get("_step").reshape(-1).cpu().numpy()
-        self._copies.step(np.flatnonzero(is_stepped).tolist(), option, chosen, values)
-        self._reports_success |= bool(results.has_success.any())
-        self._scale(is_stepped)
-        rewards = np.where(is_stepped, results.reward, 0.0)
+            is_stepped &= tensordict.get("_step").reshape(-1).numpy(force=True)
+        is_all = bool(is_stepped.all())
+        self._copies.step(self._rows if is_all else np.flatnonzero(is_stepped).tolist(), option, chosen, values)
+        self._scale(is_stepped, is_all=is_all)
+        rewards = results.reward if is_all else np.where(is_stepped, results.reward, 0.0)
         if self._reward_scaling is not None:
             rewards = self._reward_scaling.scaled(rewards, is_stepped)
         return self._read(rewards.astype(np.float32))
@@ -340,17 +344,13 @@ class GymnasiumEnv(PAMDPEnv):
         # `_read` returns every entry in its final shape. TorchRL takes a quarter of its own time to check that.
         return next_tensordict_out
 
-    def _is_running(self) -> np.ndarray:
-        """Return which episodes go on, bool `[N]`."""
-        results = self._copies.results
-        return (results.terminated == 0.0) & (results.truncated == 0.0)
-
     def _read_action(self, tensordict: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
         """Return the discrete actions `[N]` and all parameters `[N, num_parameters]`, checked."""
         discrete, parameters = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
         # The quick way for what almost every step gets. Otherwise the full checks say what is wrong.
         is_usual = (
-            not self.has_choice
+            self._copies.options.num_options == 0
+            and self.option_actions is None
             and discrete is not None
             and parameters is not None
             and discrete.dtype == torch.int64
@@ -358,8 +358,12 @@ class GymnasiumEnv(PAMDPEnv):
         )
         if not is_usual:
             self.check_action(tensordict)
-        chosen, values = discrete.cpu().numpy(), parameters.detach().cpu().numpy()
-        if not (np.isfinite(values).all() and chosen.min() >= 0 and chosen.max() < len(self.parameter_dims)):
+        chosen, values = discrete.numpy(force=True), parameters.numpy(force=True)
+        numbers = chosen.tolist()
+        # Finite numbers have a finite sum of squares, or else the full check passes them.
+        if not (
+            math.isfinite(np.vdot(values, values)) and min(numbers) >= 0 and max(numbers) < len(self.parameter_dims)
+        ):
             check_action_values(discrete, parameters, self.parameter_dims)
         return chosen, values
 
@@ -375,11 +379,11 @@ class GymnasiumEnv(PAMDPEnv):
             raise invalid_action(row, {keys.OPTION: (int(option[row]), f"allowed 0 to {num_options - 1}")})
         return option
 
-    def _scale(self, is_new: np.ndarray) -> None:
-        """Scale the observations of these rows, bool `[N]`, and keep them."""
+    def _scale(self, is_new: np.ndarray, *, is_all: bool) -> None:
+        """Scale the observations of these rows, bool `[N]`, and keep them; `is_all` if these are all rows."""
         vectors = self._copies.results.observation
-        if is_new.all():
-            self._observation = self.scaling.scaled(vectors)
+        if is_all:
+            self._observation[:] = self.scaling.scaled(vectors)
         elif is_new.any():
             self._observation[is_new] = self.scaling.scaled(vectors[is_new])
 
@@ -388,20 +392,28 @@ class GymnasiumEnv(PAMDPEnv):
         results = self._copies.results
         # A new array of flags, so that the next step does not change what was returned.
         flags = results.flags != 0.0
-        np.logical_or(flags[0], flags[1], out=flags[3])
-        terminated, truncated, success, done = torch.from_numpy(flags[..., None]).unbind()
+        if flags.any():
+            if not self._reports_success and flags[3].any():
+                self._reports_success = True
+            np.logical_or(flags[0], flags[1], out=flags[3])
+        self._is_over[:] = flags[3]
+        columns = flags[..., None]
         leaves = {
             keys.OBSERVATION: torch.from_numpy(self._observation.copy()),
-            _SUCCESS: success.squeeze(-1),
-            keys.TERMINATED: terminated,
-            keys.TRUNCATED: truncated,
-            keys.DONE: done,
+            _SUCCESS: torch.from_numpy(flags[2]),
+            keys.TERMINATED: torch.from_numpy(columns[0]),
+            keys.TRUNCATED: torch.from_numpy(columns[1]),
+            keys.DONE: torch.from_numpy(columns[3]),
         }
         for name, mask in results.masks.items():
             leaves[name] = torch.from_numpy(mask != 0.0)
         if reward is not None:
             leaves[keys.REWARD] = torch.from_numpy(reward[:, None])
-        td = TensorDict(leaves, batch_size=self.batch_size, device=self.device)
+        device = self.device
+        if device is not None and device != _CPU:
+            leaves = {name: leaf.to(device) for name, leaf in leaves.items()}
+        # Every leaf has its final shape and device. TensorDict's own check of that takes several times as long.
+        td = TensorDict._new_unsafe(leaves, batch_size=self.batch_size, device=device)
         return self.check_masks(td) if results.masks else td
 
 

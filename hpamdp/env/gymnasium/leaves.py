@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -42,7 +42,7 @@ class Leaf:
     Attributes:
         what: the leaf in words, such as `entry a.b`.
         size: length of its vector.
-        lowest, highest: bounds `[size]` of what `write` leaves unchecked. Numbers within them need no `settled`.
+        lowest, highest: bounds `[size]` of what a `writer` leaves unchecked. Numbers within them need no `settled`.
         clip_low, clip_high: bounds `[size]` that numbers are moved to; infinite if they are kept or refused.
         rounding: dtype that the vector is rounded to; None if it needs no rounding.
     """
@@ -66,9 +66,7 @@ class Leaf:
         self.clip_high = np.full(self.size, np.inf)
         self.rounding: np.dtype | None = None
         self._plain_dtypes: frozenset[np.dtype] = frozenset()
-        self._is_scalar = isinstance(space, spaces.Discrete)
         self._first = int(space.start) if isinstance(space, spaces.Discrete) else 0
-        self._offsets: np.ndarray | None = None  # of a MultiDiscrete's one-hot vectors
         if isinstance(space, spaces.Box):
             self._read_bounds(space)
         elif isinstance(space, spaces.MultiBinary):
@@ -78,31 +76,44 @@ class Leaf:
             self._start, self._sizes = space.start, space.nvec
             self._offsets = np.cumsum(space.nvec.ravel()) - space.nvec.ravel()
 
-    def write(self, observation: Any, vector: np.ndarray) -> bool:
-        """Write the leaf's part of an observation into a vector, float64 `[size]`, if it is of a plain kind.
+    def writer(self, vector: np.ndarray) -> Callable[[Any], bool]:
+        """Return a function that writes the leaf's part of an observation into a vector, float64 `[size]`.
 
-        Plain are arrays of the space's shape whose dtype the space can hold, and whole numbers of a `Discrete`. This
-        is the quick way: numbers are compared with their bounds later, for all environments at once.
+        It writes only parts of a plain kind: arrays of the space's shape whose dtype the space can hold, and whole
+        numbers of a `Discrete`. This is the quick way. Numbers are compared with their bounds later, for all
+        environments at once.
 
-        Returns:
-            Whether the part is plain. Otherwise use `flat`, which also checks it.
-
-        Raises:
-            ProblemError: the part is missing.
+        The function returns whether the part is plain. Otherwise use `flat`, which also checks it. It raises a
+        ProblemError if the part is missing.
         """
-        value = self._find(observation) if self.path else observation
-        if self._is_scalar:
-            index = int(value) - self._first if type(value) in _INTEGERS else -1
-            if not 0 <= index < self.size:
+        find = self._find
+        if isinstance(self.space, spaces.Discrete):
+            return lambda observation: self._write_discrete(find(observation), vector)
+        if isinstance(self.space, spaces.MultiDiscrete):
+            return lambda observation: self._write_multi_discrete(find(observation), vector)
+        shape, dtypes, has_path = self.space.shape, self._plain_dtypes, bool(self.path)
+        shaped = vector.reshape(shape or ())
+
+        def write(observation: Any) -> bool:
+            value = find(observation) if has_path else observation
+            if type(value) is not np.ndarray or value.dtype not in dtypes or value.shape != shape:
                 return False
-            vector[:] = 0.0
-            vector[index] = 1.0
+            shaped[...] = value
             return True
+
+        return write
+
+    def _write_discrete(self, value: Any, vector: np.ndarray) -> bool:
+        index = int(value) - self._first if type(value) in _INTEGERS else -1
+        if not 0 <= index < self.size:
+            return False
+        vector[:] = 0.0
+        vector[index] = 1.0
+        return True
+
+    def _write_multi_discrete(self, value: Any, vector: np.ndarray) -> bool:
         if type(value) is not np.ndarray or value.dtype not in self._plain_dtypes or value.shape != self.space.shape:
             return False
-        if self._offsets is None:
-            vector[:] = value if value.ndim == 1 else value.ravel()
-            return True
         whole = value.astype(np.int64) - self._start
         is_inside = bool(((whole >= 0) & (whole < self._sizes)).all())
         if is_inside:
@@ -111,7 +122,7 @@ class Leaf:
         return is_inside
 
     def settled(self, vector: np.ndarray, cure: str = "") -> np.ndarray:
-        """Return a vector that `write` wrote, after a full check.
+        """Return a vector that a `writer` wrote, after a full check.
 
         Raises:
             ProblemError: a number is not in the space.

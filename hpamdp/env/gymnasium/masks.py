@@ -138,7 +138,7 @@ def _is_plain(values: Any) -> bool:
     for entry, value in values.items():
         if type(value) not in _NO_MAPPINGS and isinstance(value, Mapping):
             return False
-        if isinstance(entry, str) and _meaning(entry) is not None:
+        if type(entry) is str and _meaning(entry) is not None:
             return False
     return True
 

@@ -6,7 +6,7 @@ Accepted are `Box`, `Discrete`, `MultiDiscrete`, `MultiBinary` and `Tuple` and `
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -92,36 +92,30 @@ class ObservationSpace:
             [leaf.flat(observation, cure) for leaf, cure in zip(self.leaves, self._cures, strict=True)]
         )
 
-    def parts(self, vector: np.ndarray) -> list[tuple[Leaf, np.ndarray]]:
-        """Return each leaf with the view of its part of a vector, for `write`."""
-        return [(leaf, vector[own]) for leaf, own in zip(self.leaves, self.slices, strict=True)]
+    def writer(self, vector: np.ndarray) -> Callable[[Any], bool]:
+        """Return a function that writes an observation into a vector, float64 `[dim]`.
 
-    def write(self, observation: Any, parts: list[tuple[Leaf, np.ndarray]]) -> bool:
-        """Write an observation into the `parts` of a vector, float64 `[dim]`.
-
-        Returns:
-            Whether the numbers are still to be checked, by `unsettled` and `settled`.
-
-        Raises:
-            ProblemError: an entry is missing, or a value that is not plain is not in its space.
+        The function returns whether the numbers are still to be checked, by `unsettled` and `settled`. It raises a
+        ProblemError if an entry is missing, or if a value that is not plain is not in its space.
         """
-        for leaf, part in parts:
-            if not leaf.write(observation, part):
-                break
-        else:
-            return True
-        flat = self.flat(observation)
-        for (_, part), own in zip(parts, self.slices, strict=True):
-            part[:] = flat[own]
-        return False
+        writers = [leaf.writer(vector[own]) for leaf, own in zip(self.leaves, self.slices, strict=True)]
+
+        def write_any(observation: Any) -> bool:
+            vector[:] = self.flat(observation)
+            return False
+
+        if len(writers) == 1:  # saves a call
+            (write_leaf,) = writers
+            return lambda observation: write_leaf(observation) or write_any(observation)
+        return lambda observation: all([write(observation) for write in writers]) or write_any(observation)
 
     def unsettled(self, vectors: np.ndarray) -> list[int]:
-        """Return which of the vectors `[M, dim]` that `write` wrote need a check by `settled`, one after another."""
+        """Return which of the vectors `[M, dim]` that a `writer` wrote need a check by `settled`, one after another."""
         is_inside = (vectors >= self._lowest) & (vectors <= self._highest)
-        return [] if is_inside.all() else np.flatnonzero(~is_inside.all(1)).tolist()
+        return [] if np.logical_and.reduce(is_inside, None) else np.flatnonzero(~is_inside.all(1)).tolist()
 
     def settled(self, vector: np.ndarray) -> np.ndarray:
-        """Return a vector that `write` wrote, after a full check.
+        """Return a vector that a `writer` wrote, after a full check.
 
         Raises:
             ProblemError: a number is not in its space.

@@ -49,6 +49,7 @@ class ObservationScaling:
         self._half_width = np.ones(self.dim)
         if scaling == "bounds":
             self._read_bounds(*space.bounds())
+        self._is_unscaled = bool((self._centre == 0.0).all() and (self._half_width == 1.0).all())
 
     def _read_bounds(self, low: np.ndarray, high: np.ndarray) -> None:
         has_both = np.isfinite(low) & np.isfinite(high)
@@ -69,6 +70,8 @@ class ObservationScaling:
         return scaled if self._is_raw is None else np.where(self._is_raw, vectors.astype(np.float32), scaled)
 
     def _all_scaled(self, vectors: np.ndarray) -> np.ndarray:
+        if self.statistics is None and self._is_unscaled:
+            return vectors.astype(np.float32)
         if self.statistics is None:
             return ((vectors - self._centre) / self._half_width).astype(np.float32)
         return self.statistics.normalised(vectors).clip(-_CLIP, _CLIP).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The time limit of a Gymnasium environment: its own or the one given, applied by Gymnasium's TimeLimit."""
+"""The time limit of a Gymnasium environment: its own or the one given."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hpamdp.env.gymnasium.values import shown
 from hpamdp.settings import SettingError
 
 
-def with_limit(env: gymnasium.Env, max_steps: int | None) -> tuple[gymnasium.Env, int]:
-    """Return the environment with its time limit applied, and the number of steps after which it truncates.
+def limit_of(env: gymnasium.Env, max_steps: int | None) -> int:
+    """Return the number of steps after which an episode of the environment is truncated.
 
     Args:
         env: its own limit is the lowest one of its TimeLimit wrappers. Without such a wrapper, its spec has the limit.
@@ -21,13 +21,12 @@ def with_limit(env: gymnasium.Env, max_steps: int | None) -> tuple[gymnasium.Env
     Raises:
         ValueError: the environment has no valid limit of its own, and none is given.
     """
-    applied = _applied_limits(env)
-    if max_steps is None and not applied:
+    limits = _applied_limits(env)
+    if max_steps is None and not limits:
         max_steps = _limit_of_spec(env)
-    if max_steps is not None and max_steps not in applied:
-        env = TimeLimit(env, max_steps)
-        applied.append(max_steps)
-    return env, min(applied)
+    if max_steps is not None:
+        limits.append(max_steps)
+    return min(limits)
 
 
 def _applied_limits(env: gymnasium.Env) -> list[int]:

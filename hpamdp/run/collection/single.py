@@ -31,6 +31,9 @@ class SingleCollection(Collection):
             parts.policy,
             frames_per_batch=config.run.num_envs * config.run.steps_per_batch,
             total_frames=-1,
+            # Otherwise TorchRL casts the whole tensordict twice at every step.
+            device=parts.device,
+            trust_policy=True,
             auto_register_policy_transforms=False,
         )
         if selector is not None and pending is not None:
