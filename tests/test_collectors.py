@@ -253,9 +253,13 @@ def test_a_frozen_presser_goes_with_the_share(tmp_path):
         (
             [
                 *("collector=multi", "high=none", "env=gymnasium", *GYMNASIUM),
-                "env.observation_scaling=running",
+                *("env.observation_scaling=running", "collector.ahead=true"),
             ],
-            "collector=multi: env=gymnasium learns the scale",
+            "collector.ahead=true: env=gymnasium learns the scale",
+        ),
+        (
+            ["collector=multi", "high=none", "env=gymnasium", *GYMNASIUM, "env.num_workers=2"],
+            "collector=multi: env=gymnasium starts processes itself; use collector=single",
         ),
     ],
 )

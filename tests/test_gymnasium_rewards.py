@@ -43,4 +43,3 @@ def test_the_statistics_of_rewards_are_saved_and_restored():
     other.set_env_state(one.env_state())
     assert len(one.env_state()) == 6
     assert all(torch.equal(column, one.env_state()[name]) for name, column in other.env_state().items())
-    assert not one.is_shardable

@@ -326,11 +326,18 @@ class PAMDPEnv(EnvBase):
         """
 
     def statistics(self) -> dict[str, Tensor]:
-        """Return the part of `env_state` that scales the observations, if their scale is learned; else empty."""
+        """Return the part of `env_state` that scales observations and rewards; empty if nothing is learned of it."""
         return {}
 
+    def take_new_statistics(self) -> dict[str, Tensor]:
+        """Return the statistics of the steps since the last call alone, as `statistics`."""
+        return {}
+
+    def add_statistics(self, columns: Mapping[str, Tensor]) -> None:
+        """Add what another process has taken by `take_new_statistics`."""
+
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
-        """Set only the scale of the observations, from `statistics` or a whole `env_state`, to use a saved agent."""
+        """Set only these scales, from `statistics` or a whole `env_state`, to use a saved agent."""
 
     def set_scaling_from(self, other: PAMDPEnv) -> None:
         """Scale observations as the other environment does, now and later, if their scale is learned."""

@@ -17,6 +17,7 @@ class ProblemFacts:
         can_change_option: whether an option may end before its episode.
         plans_change_options: whether the planned actions under `oracle` assume such changes.
         is_shardable: whether several processes can each step some of the environments.
+        has_statistics: whether the scale of observations or rewards is learned.
         default_options: options to begin with, as for `PAMDPEnv.group_actions`; empty if the problem suggests none.
         has_oracle: whether the constructor takes `oracle`.
         has_human: whether the constructor takes `human`.
@@ -28,6 +29,7 @@ class ProblemFacts:
     can_change_option: bool = True
     plans_change_options: bool = False
     is_shardable: bool = True
+    has_statistics: bool = False
     default_options: Mapping[str, Sequence[int | str]] = field(default_factory=dict)
     has_oracle: bool = False
     has_human: bool = False

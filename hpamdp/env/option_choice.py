@@ -83,6 +83,22 @@ class OptionChoiceEnv(PAMDPEnv):
         """Set the state of the wrapped environment."""
         self._inner_env.set_env_state(columns)
 
+    def statistics(self) -> dict[str, Tensor]:
+        """Return the statistics of the wrapped environment."""
+        return self._inner_env.statistics()
+
+    def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
+        """Set the statistics of the wrapped environment."""
+        self._inner_env.set_statistics(columns)
+
+    def take_new_statistics(self) -> dict[str, Tensor]:
+        """Return the new statistics of the wrapped environment."""
+        return self._inner_env.take_new_statistics()
+
+    def add_statistics(self, columns: Mapping[str, Tensor]) -> None:
+        """Add statistics to the wrapped environment."""
+        self._inner_env.add_statistics(columns)
+
     def _set_seed(self, seed: int | None) -> None:
         self._inner_env.set_seed(seed)
 

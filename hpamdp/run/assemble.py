@@ -131,6 +131,7 @@ def _facts_of_built(env: PAMDPEnv) -> ProblemFacts:
         can_change_option=env.can_change_option,
         plans_change_options=env.plans_change_options,
         is_shardable=env.is_shardable,
+        has_statistics=bool(env.statistics()),
         default_options=env.default_options,
     )
 

@@ -235,14 +235,19 @@ def workers_get_what_python_passed(config: Config) -> str | None:
     return None
 
 
-def shared_scaling_needs_one_process(config: Config, problem: ProblemFacts) -> str | None:
-    """Require a single process for environments that learn a common scale or start processes themselves."""
-    if config.run.mode == "eval" or config.collector.settings.get("num_workers", 1) == 1 or problem.is_shardable:
+def workers_fit_the_problem(config: Config, problem: ProblemFacts) -> str | None:
+    """Refuse workers for environments that start processes, and batches ahead if a scale is learned between them."""
+    settings = config.collector.settings
+    if config.run.mode == "eval" or not getattr(config.collector.cls, "has_workers", False):
         return None
-    return (
-        f"{config.collector}: {config.env} learns the scale of its observations or rewards from all environments "
-        "together, or starts processes itself; use collector=single"
-    )
+    if not problem.is_shardable:
+        return f"{config.collector}: {config.env} starts processes itself; use collector=single"
+    if problem.has_statistics and settings.get("ahead", False):
+        return (
+            f"collector.ahead=true: {config.env} learns the scale of its observations or rewards, which workers share "
+            "between batches; use collector.ahead=false"
+        )
+    return None
 
 
 # Rules about the problem and its options.
@@ -376,5 +381,5 @@ PROBLEM_RULES: tuple[ProblemRule, ...] = (
     plans_fit_the_termination,
     options_end_where_they_may,
     per_option_names_options,
-    shared_scaling_needs_one_process,
+    workers_fit_the_problem,
 )

@@ -186,8 +186,8 @@ class GymnasiumEnv(PAMDPEnv):
 
     @property
     def is_shardable(self) -> bool:
-        """Whether no running statistics are kept, which all environments must share, and no processes are started."""
-        return not self._statistics() and self.options.num_workers == 0
+        """Whether no processes are started, which a worker process may not do."""
+        return self.options.num_workers == 0
 
     @property
     def title(self) -> str:
@@ -254,6 +254,15 @@ class GymnasiumEnv(PAMDPEnv):
     def set_statistics(self, columns: Mapping[str, Tensor]) -> None:
         """Continue with saved running statistics: they are the whole `env_state`."""
         self.set_env_state(columns)
+
+    def take_new_statistics(self) -> dict[str, Tensor]:
+        """Return the statistics of what was observed since the last call alone."""
+        return {name: column for each in self._statistics() for name, column in each.take_new().items()}
+
+    def add_statistics(self, columns: Mapping[str, Tensor]) -> None:
+        """Add what another process has taken by `take_new_statistics`."""
+        for statistics in self._statistics():
+            statistics.add(columns)
 
     def film_state(self, num: int) -> dict[str, Tensor]:
         """Return what the first `num` copies draw, if their `render_mode` is `rgb_array`: uint8 `[num, H, W, 3]`."""

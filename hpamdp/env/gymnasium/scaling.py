@@ -151,6 +151,31 @@ class RunningStatistics(RunningMeanStd):
     def __init__(self, dim: int, name: str = "observation") -> None:
         self._name = name
         super().__init__(epsilon=0.0, shape=(dim,))
+        self._new: RunningMeanStd | None = None  # as long as all vectors are new
+
+    def update(self, x: np.ndarray) -> None:
+        """Add vectors `[M, dim]`."""
+        super().update(x)
+        if self._new is not None:
+            self._new.update(x)
+
+    def take_new(self) -> dict[str, Tensor]:
+        """Return the statistics of the vectors since the last call or `set_columns` alone, as `columns`."""
+        taken = self._as_columns(self if self._new is None else self._new)
+        self._begin_new()
+        return taken
+
+    def _begin_new(self) -> None:
+        self._new = RunningMeanStd(epsilon=0.0, shape=self.mean.shape)
+
+    def add(self, columns: Mapping[str, Tensor]) -> None:
+        """Add vectors of another process, given what its `take_new` returned.
+
+        Source: Chan, Golub and LeVeque 1983, *Algorithms for computing the sample variance*.
+        """
+        count, mean, variance = (columns[name].numpy() for name in self.columns())
+        if count > 0.0:
+            self.update_from_moments(mean, variance, count.item())
 
     def normalised(self, vectors: np.ndarray) -> np.ndarray:
         """Return vectors `[M, dim]` minus the mean, in standard deviations; constant entries keep their unit."""
@@ -163,10 +188,13 @@ class RunningStatistics(RunningMeanStd):
 
     def columns(self) -> dict[str, Tensor]:
         """Return a copy of the statistics, for a checkpoint."""
+        return self._as_columns(self)
+
+    def _as_columns(self, statistics: RunningMeanStd) -> dict[str, Tensor]:
         return {
-            f"{self._name}_count": torch.tensor(self.count, dtype=torch.float64),
-            f"{self._name}_mean": torch.tensor(self.mean, dtype=torch.float64),
-            f"{self._name}_variance": torch.tensor(self.var, dtype=torch.float64),
+            f"{self._name}_count": torch.tensor(statistics.count, dtype=torch.float64),
+            f"{self._name}_mean": torch.tensor(statistics.mean, dtype=torch.float64),
+            f"{self._name}_variance": torch.tensor(statistics.var, dtype=torch.float64),
         }
 
     def set_columns(self, columns: Mapping[str, Tensor]) -> None:
@@ -181,6 +209,7 @@ class RunningStatistics(RunningMeanStd):
             is_mean = name == f"{self._name}_mean"
             if not (columns[name].isfinite() & (is_mean | (columns[name] >= 0.0))).all():
                 raise ValueError(f"running statistics: {name} must be finite{'' if is_mean else ' and at least 0'}")
+        self._begin_new()
         self.count = columns[f"{self._name}_count"].item()
         self.mean = columns[f"{self._name}_mean"].to("cpu", torch.float64, copy=True).numpy()
         self.var = columns[f"{self._name}_variance"].to("cpu", torch.float64, copy=True).numpy()

@@ -9,8 +9,8 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -75,6 +75,21 @@ class RemoteError(RuntimeError):
     """Raised for an error in a worker, with its traceback in the text."""
 
 
+@dataclass(frozen=True)
+class Collected:
+    """What a worker returns with a batch.
+
+    Attributes:
+        cpu_s: CPU seconds of the process before the batch.
+        batch: `[num_envs, steps_per_batch]`; None if it lies in the memory of the last batch.
+        statistics: what the environments have taken by `take_new_statistics`.
+    """
+
+    cpu_s: float
+    batch: TensorDictBase | None
+    statistics: dict[str, Tensor]
+
+
 class ShardCollector(Collector):
     """TorchRL's collector of a worker's shard."""
 
@@ -82,11 +97,12 @@ class ShardCollector(Collector):
         """Return True. Without this method, Ray would ask for the length, which an endless collector lacks."""
         return True
 
-    def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
-        """Load the `packed` policy and collect a batch.
+    def take_new_statistics(self) -> dict[str, Tensor]:
+        """Return the statistics of the steps since the last call alone."""
+        return self.env.base_env.take_new_statistics()
 
-        Returns:
-            The CPU seconds of this process before the batch, and the batch `[num_envs, steps_per_batch]`.
+    def collect(self, policy: bytes, statistics: Mapping[str, Tensor]) -> Collected:
+        """Load the `packed` policy and the environments' common `statistics`, and collect a batch.
 
         Raises:
             ProblemError: the problem broke its contract.
@@ -95,7 +111,11 @@ class ShardCollector(Collector):
             RemoteError: the environment raised any other error.
         """
         try:
-            return self.policy.receive(policy), self.next()
+            cpu_s = self.policy.receive(policy)
+            if statistics:
+                self.env.base_env.set_statistics(statistics)
+            batch = self.next()
+            return Collected(cpu_s, batch, self.take_new_statistics())
         except (ProblemError, MemoryError) as error:
             raise type(error)(str(error)) from None
         except EnvironmentFaultError as error:
@@ -110,13 +130,13 @@ class SharedMemoryCollector(ShardCollector):
 
     _is_shared = False
 
-    def collect(self, policy: bytes) -> tuple[float, TensorDictBase | None]:
+    def collect(self, policy: bytes, statistics: Mapping[str, Tensor]) -> Collected:
         """Collect a batch; return it the first time, then None, since its memory holds all later batches."""
-        cpu_s, batch = super().collect(policy)
-        if self._is_shared or batch is None:
-            return cpu_s, None
+        collected = super().collect(policy, statistics)
+        if self._is_shared or collected.batch is None:
+            return replace(collected, batch=None)
         self._is_shared = True
-        return cpu_s, batch.share_memory_()
+        return replace(collected, batch=collected.batch.share_memory_())
 
 
 @dataclass(frozen=True)

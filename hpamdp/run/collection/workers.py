@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
@@ -81,6 +82,7 @@ class WorkerCollection(Collection):
         self._specs = parts.agent.specs
         self._frozen = packed(parts.agent.router) if config.run.low.freeze else None
         self._device = parts.device
+        self._problem = parts.env.base_env  # never stepped; it has the statistics of all workers
         self._keeps_episodes = parts.env.keeps_episodes
         self._num_envs = config.run.num_envs
         self._size = config.run.num_envs // num_workers
@@ -88,6 +90,7 @@ class WorkerCollection(Collection):
         self._is_idle = False
         self.workers: list[Any] = [None] * num_workers  # TorchRL's collector of each
         self._batches: list[TensorDictBase | None] = [None] * num_workers  # the memory that each writes to
+        self._new_statistics: list[dict[str, Tensor]] = [{}] * num_workers  # of each worker's last batch
         self._cpu_s = [0.0] * num_workers
         self._cpu_s_of_dead = 0.0
         self._coming: list[Future[TensorDictBase]] = []
@@ -95,6 +98,8 @@ class WorkerCollection(Collection):
         try:
             with modules_here_last():
                 self._on_all(self._start_first)
+            for new in self._on_all(lambda number: call_worker(self.workers[number], "take_new_statistics")):
+                self._problem.add_statistics(new)
         except BaseException:
             self.close()
             raise
@@ -219,23 +224,29 @@ class WorkerCollection(Collection):
         policy = packed(self._policy)
         self._coming = self._coming or self._begin(policy)
         batch = self._finished()
+        for number, new in enumerate(self._new_statistics):
+            if new:
+                self._problem.add_statistics(new)
+            self._new_statistics[number] = {}
         self._coming = self._begin(policy) if self.options.ahead else []
         self._is_idle = True
         return batch.to(self._device)
 
     def _begin(self, policy: bytes) -> list[Future[TensorDictBase]]:
         """Have all workers collect their part of a batch."""
-        return [self._threads.submit(self._collect, number, policy) for number in range(len(self.workers))]
+        statistics = self._problem.statistics()
+        return [self._threads.submit(self._collect, number, policy, statistics) for number in range(len(self.workers))]
 
     def _finished(self) -> TensorDictBase:
         """Wait for all parts of the batch, and return a copy of them in the workers' order."""
         return torch.cat([part.result() for part in self._coming])
 
-    def _collect(self, number: int, policy: bytes) -> TensorDictBase:
-        self._cpu_s[number], batch = self._on(number, lambda worker: call_worker(worker, "collect", policy))
+    def _collect(self, number: int, policy: bytes, statistics: Mapping[str, Tensor]) -> TensorDictBase:
+        result = self._on(number, lambda worker: call_worker(worker, "collect", policy, statistics))
+        self._cpu_s[number], self._new_statistics[number] = result.cpu_s, result.statistics
         self.cpu_s = self._cpu_s_of_dead + sum(self._cpu_s)
-        if batch is not None:
-            self._batches[number] = batch
+        if result.batch is not None:
+            self._batches[number] = result.batch
         collected = self._batches[number]
         assert collected is not None
         return collected
@@ -255,17 +266,17 @@ class WorkerCollection(Collection):
         state: dict[str, Any] = {"generators": [each["generator"] for each in states]}
         for name in states[0].keys() & {"env", "root"}:
             state[name] = _side_by_side([each[name] for each in states])
+        if not self._keeps_episodes:
+            state["env"] = self._problem.env_state()
         if self._coming:
             state["coming"] = self._finished().to_dict()
         self._state = state
         return self._state
 
     def _state_of(self, worker: Any) -> dict[str, Any]:
-        state = {
-            "env": call_worker(worker, "env.env_state"),
-            "generator": call_worker(worker, "policy.generator_state"),
-        }
+        state = {"generator": call_worker(worker, "policy.generator_state")}
         if self._keeps_episodes:
+            state["env"] = call_worker(worker, "env.env_state")
             state["root"] = _without_ids(call_worker(worker, "_carrier.to_dict"))
         return state
 
@@ -273,12 +284,14 @@ class WorkerCollection(Collection):
         """Continue from a `state` of any collection. Exploration is the same only with the same number of workers."""
         saved = checked_state(state, self._parts)
         self._state = dict(state)
+        if saved.env and not self._keeps_episodes:
+            self._problem.set_env_state(saved.env)
 
         def send(number: int) -> None:
             first = number * self._size
 
             def send_to(worker: Any) -> None:
-                if saved.env:  # otherwise the worker continues the episodes that it has just begun
+                if saved.env and self._keeps_episodes:  # otherwise it continues the episodes that it has just begun
                     call_worker(worker, "env.set_env_state", _sliced(saved.env, first, self._size))
                 if saved.root is not None and self._keeps_episodes:
                     call_worker(worker, "_carrier.update", _sliced(saved.root, first, self._size))
