@@ -11,20 +11,25 @@
   `<!-- csv experiments/domains/published.csv: domain=platform -->`: the rows of a csv file by a column;
   `<!-- runs experiments/domains/results.csv: learner=pdqn, pdqn_published -->`: a study's runs by a column. Runs that
   differ only in their seed become one row, mean ± standard deviation.
-  `experiments/report.py` also writes the tables of the last three kinds into the pages themselves, up to the next
-  `<!-- /table -->`, for readers of a clone. A test compares them with their sources.
-- Every module with a docstring gets a page in the API.
+  `<!-- public names of hpamdp/__init__.pyi -->`: the names with their docstrings.
+  `experiments/report.py` also writes the tables of `rows of`, `csv` and `runs` into the pages themselves, up to the
+  next `<!-- /table -->`, for readers of a clone. A test compares them with their sources.
+- Notebooks are executed in an empty folder, and become pages with their outputs. An error in a cell ends the build.
+- Every module with a docstring gets a page, which says that the module is internal.
 """
 
 from __future__ import annotations
 
 import ast
+import base64
 import csv
+import functools
 import json
 import logging
 import posixpath
 import re
 import statistics
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -37,7 +42,7 @@ log = logging.getLogger("mkdocs.hooks.pages")
 
 FENCE = re.compile(r"^ *```.*?^ *```[^\n]*$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"(?<=\]\()(?!https?:|mailto:|#)([^)\s#]+)(#[^)\s]*)?(?=\))")
-DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv|runs) (.+?) -->$", re.MULTILINE)
+DIRECTIVE = re.compile(r"^<!-- (settings of|docstring of|rows of|csv|runs|public names of) (.+?) -->$", re.MULTILINE)
 # A directive whose table is in the page itself.
 FILLED = re.compile(r"^(<!-- (rows of|csv|runs) (.+?) -->\n)(?:[^<\n].*\n)*<!-- /table -->\n", re.MULTILINE)
 TABLE_MARK = re.compile(r"^<!-- /?table.*-->\n", re.MULTILINE)
@@ -49,7 +54,18 @@ MEASURED = {"frames": "steps", "score": "score", "success": "success", "cpu_s": 
 KINDS = {"number": "number", "integer": "whole number", "string": "text", "boolean": "`true`, `false`"}
 KINDS |= {"null": "`null`", "array": "list", "object": "mapping"}
 BOUNDS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
-PAGES = ("*.md", "agents/README.md", "experiments/*/README.md", "docs/**/*.md")
+PAGES = ("*.md", "agents/README.md", "experiments/*/README.md", "docs/**/*.md", "docs/**/*.ipynb")
+PUBLIC_PAGE = "reference/api.md"
+# Kinds of public names by the beginnings of their modules.
+PUBLIC_KINDS = {
+    "Environments, training, agents": "hpamdp.api.",
+    "Learners": "hpamdp.policies.low_level.",
+    "Selectors": "hpamdp.policies.high_level.",
+    "Callbacks": "hpamdp.run.callbacks",
+    "Classes to build on, errors": "hpamdp.",
+}
+PAGES_OF_CHOICES = {"Learners": "learners", "Selectors": "selectors"}
+CELL_TIMEOUT = 600  # seconds
 
 
 class SiteError(Exception):
@@ -75,15 +91,15 @@ def page_of(path: str) -> str | None:
     study = re.fullmatch(r"experiments/(\w+)/README\.md", path)
     if study:
         return f"studies/{study[1]}.md"
-    if path.startswith(DOCS) and path.endswith(".md"):
-        return path.removeprefix(DOCS)
+    if path.startswith(DOCS) and path.endswith((".md", ".ipynb")):
+        return str(Path(path.removeprefix(DOCS)).with_suffix(".md"))
     if path.startswith("hpamdp/") and path.endswith(".py"):
         return api_page(path)
     return None
 
 
 def pages() -> list[str]:
-    """Return all Markdown files of the repository that are pages."""
+    """Return all Markdown files and notebooks of the repository that are pages."""
     files = [file for pattern in PAGES for file in ROOT.glob(pattern)]
     paths = (file.relative_to(ROOT).as_posix() for file in sorted(files))
     return [path for path in paths if page_of(path) is not None]
@@ -105,22 +121,75 @@ def api_page(path: str) -> str:
     return f"api/{path.removesuffix('.py').replace('__init__', 'index')}.md"
 
 
+def module_page(path: str) -> str:
+    """Return the page of a module, which says that the module is internal."""
+    name = dotted(path)
+    if name == "hpamdp":
+        return f"# {name}\n\n::: {name}\n"
+    link = posixpath.relpath(PUBLIC_PAGE, posixpath.dirname(api_page(path)))
+    note = f"Internal: this module may change between versions. [Public names]({link}) lists what stays."
+    return f"# {name}\n\n{note}\n\n::: {name}\n"
+
+
+def public_names(path: str) -> str:
+    """Return the public names that a stub imports, by kind. Learners and selectors have pages of their own."""
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    names = {alias.name: f"hpamdp.{node.module}" for node in imports for alias in node.names}
+    parts = []
+    for title, start in PUBLIC_KINDS.items():
+        chosen = {name: module for name, module in names.items() if module.startswith(start)}
+        names = {name: module for name, module in names.items() if name not in chosen}
+        parts.append(f"## {title}")
+        if title in PAGES_OF_CHOICES:
+            parts.append(choices_table(chosen, PAGES_OF_CHOICES[title]))
+            continue
+        for name, module in chosen.items():
+            # Cross-references lead to the module's page, so that each object has one.
+            options = {
+                "show_root_heading": True,
+                "heading": f"hpamdp.{name}",
+                "heading_level": 3,
+                "skip_local_inventory": True,
+            }
+            parts.append(f"::: {module}.{name}\n    options: {json.dumps(options)}")
+    return "\n\n".join(parts)
+
+
+def choices_table(names: dict[str, str], folder: str) -> str:
+    """Return a table of learners or selectors: the name in Python, the choice on the command line, what it is."""
+    rows = ["| Python | command line | |", "|---|---|---|"]
+    for name, module in names.items():
+        path = f"{module.replace('.', '/')}.py"
+        choice = module.split(".")[3]
+        tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+        cls = next(node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name)
+        sentence = (ast.get_docstring(cls) or "").partition("\n")[0]
+        rows.append(f"| [`hpamdp.{name}`](../../{path}) | [`{choice}`](../{folder}/{choice}.md) | {cell(sentence)} |")
+    return "\n".join(rows)
+
+
 class Site:
     """The site's pages and what they need besides.
+
+    Args:
+        executes: whether to execute the notebooks. Otherwise their pages have no outputs.
 
     Attributes:
         pages: the text of each page, by its place in the site.
         pictures: the file of each picture, by its place in the site.
+        drawn: the bytes of each picture that a notebook draws, by its place in the site.
         problems: a line for each link or directive that leads nowhere.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, executes: bool = False) -> None:
         self.pages: dict[str, str] = {}
         self.pictures: dict[str, Path] = {}
+        self.drawn: dict[str, bytes] = {}
         self.problems: list[str] = []
+        self._executes = executes
         for path in modules():
-            name = dotted(path)
-            self.pages[api_page(path)] = f"# {name}\n\n::: {name}\n"
+            self.pages[api_page(path)] = module_page(path)
         for path in pages():
             self.pages[str(page_of(path))] = self.converted(path)
 
@@ -128,6 +197,8 @@ class Site:
         """Return the text of a page with its directives filled in and its links turned into the site's."""
         text = FILLED.sub(r"\1", (ROOT / path).read_text(encoding="utf-8"))
         text = TABLE_MARK.sub("", text)
+        if path.endswith(".ipynb"):
+            text = self._notebook(path, executed(text) if self._executes else text)
 
         def fill(found: re.Match[str]) -> str:
             try:
@@ -138,6 +209,24 @@ class Site:
 
         text = outside_code(text, lambda part: DIRECTIVE.sub(fill, part))
         return outside_code(text, lambda part: LINK.sub(lambda link: self._link(path, link), part))
+
+    def _notebook(self, path: str, text: str) -> str:
+        """Return a notebook as Markdown, with the outputs that it has."""
+        parts = []
+        for cell in json.loads(text)["cells"]:
+            source = "".join(cell["source"])
+            parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+            for output in cell.get("outputs", []):
+                data = output.get("data", {"text/plain": output.get("text", "")})
+                if "image/png" in data:
+                    name = f"{Path(path).stem}_{len(self.drawn)}.png"
+                    place = posixpath.join(posixpath.dirname(str(page_of(path))), name)
+                    self.drawn[place] = base64.b64decode(data["image/png"])
+                    parts.append(f'<img src="../{name}" alt="What the cell above draws">')
+                else:
+                    printed = "".join(data["text/plain"]).rstrip()
+                    parts.append(f"```text\n{printed}\n```")
+        return "\n\n".join(parts) + "\n"
 
     def _link(self, path: str, found: re.Match[str]) -> str:
         target = posixpath.normpath(posixpath.join(posixpath.dirname(path), found[1]))
@@ -169,6 +258,20 @@ class Site:
 def with_tables(text: str) -> str:
     """Return the text of a page with the tables of its directives filled in anew, as a clone shows it."""
     return FILLED.sub(lambda found: f"{found[1]}{DIRECTIVES[found[2]](found[3])}\n<!-- /table -->\n", text)
+
+
+@functools.cache
+def executed(text: str) -> str:
+    """Return a notebook with the outputs of its cells, which run in an empty folder."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    notebook = nbformat.reads(text, as_version=4)
+    with tempfile.TemporaryDirectory() as folder:
+        resources = {"metadata": {"path": folder}}
+        client = NotebookClient(notebook, timeout=CELL_TIMEOUT, resources=resources, coalesce_streams=True)
+        client.execute()
+    return nbformat.writes(notebook)
 
 
 def outside_code(text: str, change: Callable[[str], str]) -> str:
@@ -363,6 +466,7 @@ DIRECTIVES: dict[str, Callable[[str], str]] = {
     "rows of": rows_of,
     "csv": csv_table,
     "runs": runs_table,
+    "public names of": public_names,
 }
 
 
@@ -399,8 +503,8 @@ def on_config(config):
         if "Results" in item:
             item["Results"] += studies()
         for inner in item.get("Reference", []):
-            if "API" in inner:
-                inner["API"] = api_nav()
+            if "Internal modules" in inner:
+                inner["Internal modules"] = api_nav()
     return config
 
 
@@ -408,7 +512,7 @@ def on_files(files, config):
     """Replace the pages of docs/ by their converted text, and add those from elsewhere."""
     from mkdocs.structure.files import File
 
-    site = Site()
+    site = Site(executes=True)
     for line in site.problems:
         log.warning(line)
     for place, text in site.pages.items():
@@ -416,6 +520,8 @@ def on_files(files, config):
         if existing is not None:
             files.remove(existing)
         files.append(File.generated(config, place, content=text))
+    for place, content in site.drawn.items():
+        files.append(File.generated(config, place, content=content))
     for place, file in site.pictures.items():
         files.append(File.generated(config, place, abs_src_path=str(file)))
     return files

@@ -1,6 +1,8 @@
 """The pages of the site: one for each learner, selector and domain, made of the repository's own files."""
 
 import importlib.util
+import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -9,6 +11,7 @@ import pytest
 import yaml
 from conftest import TRAINED, choices, forked, make_config
 
+import hpamdp
 from hpamdp import cli
 from hpamdp.metrics_file import read_rows
 
@@ -66,7 +69,37 @@ def test_a_domains_page_names_its_actions_outcomes_and_observations(name):
 def test_no_link_and_no_directive_of_the_site_leads_nowhere(hooks):
     site = hooks.Site()
     assert not site.problems
-    assert {"index.md", "studies/table1.md", "changelog.md", "api/hpamdp/env/base.md"} <= site.pages.keys()
+    expected = {"index.md", "studies/table1.md", "changelog.md", "api/hpamdp/env/base.md", "tutorials/python.md"}
+    assert expected <= site.pages.keys()
+
+
+def test_the_first_page_of_the_reference_has_every_public_name_and_the_others_say_that_they_are_internal(hooks):
+    pages = hooks.Site().pages
+    for name in hpamdp.__all__:
+        assert re.search(rf"\bhpamdp\.{name}\b", pages[hooks.PUBLIC_PAGE]), name
+    internal = {place for place, text in pages.items() if "Internal: this module may change" in text}
+    assert internal == {place for place in pages if place.startswith("api/")} - {"api/hpamdp/index.md"}
+
+
+def test_a_notebook_becomes_a_page_with_what_its_cells_print_and_draw(hooks, tmp_path, monkeypatch):
+    printed = {"output_type": "stream", "name": "stdout", "text": ["2\n"]}
+    value = {"output_type": "execute_result", "data": {"text/plain": ["'x'"]}}
+    drawn = {"output_type": "display_data", "data": {"image/png": "iVBO", "text/plain": ["<Figure>"]}}
+    sources = [("markdown", ["See [a](other.md)."], []), ("code", ["print(2)\n", "f()"], [printed, value, drawn])]
+    cells = [{"cell_type": kind, "source": source, "outputs": outputs} for kind, source, outputs in sources]
+    folder = tmp_path / "docs/tutorials"
+    folder.mkdir(parents=True)
+    (tmp_path / "hpamdp").mkdir()
+    (folder / "other.md").write_text("# Other\n")
+    (folder / "n.ipynb").write_text(json.dumps({"cells": cells}))
+    monkeypatch.setattr(hooks, "ROOT", tmp_path)
+    site = hooks.Site()
+    assert not site.problems
+    assert site.pages["tutorials/n.md"] == (
+        "See [a](other.md).\n\n```python\nprint(2)\nf()\n```\n\n```text\n2\n```\n\n```text\n'x'\n```\n\n"
+        '<img src="../n_0.png" alt="What the cell above draws">\n'
+    )
+    assert site.drawn["tutorials/n_0.png"].startswith(b"\x89PN")
 
 
 def test_a_clone_shows_every_table_as_its_csv_file_has_it_or_says_where_to_look(hooks):
@@ -181,7 +214,20 @@ def test_the_pages_explain_every_scalar_that_is_logged(low, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["README.md", "docs/usage.md"])
-def test_the_python_of_a_front_page_runs(name):
-    for code in re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(), re.MULTILINE | re.DOTALL):
-        exec(compile(code, name, "exec"), {})
+@pytest.mark.parametrize("name", ["README.md", "docs/usage.md", "docs/coming-from.md"])
+def test_the_python_of_a_front_page_runs(name, tmp_path):
+    def follow() -> None:
+        os.chdir(tmp_path)
+        names: dict = {}
+        for code in re.findall(r"^```python\n(.*?)^```", (ROOT / name).read_text(), re.MULTILINE | re.DOTALL):
+            exec(compile(code, name, "exec"), names)
+        if name == "README.md":
+            assert names["info"]["score"] > 0.0
+            assert hpamdp.load("platform.pt").evaluate(episodes=100)["score"] > 0.9
+
+    assert forked(follow) == 0
+
+
+def test_the_python_of_the_readme_is_short():
+    (code,) = re.findall(r"^```python\n(.*?)^```", (ROOT / "README.md").read_text(), re.MULTILINE | re.DOTALL)
+    assert len(code.splitlines()) <= 12
