@@ -65,7 +65,7 @@ def test_a_broken_link_is_found(tmp_path):
 
 
 def test_the_readme_is_short():
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 155
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 140
 
 
 def test_the_page_of_the_architecture_is_short():
