@@ -12,7 +12,7 @@ The names below are all that a user needs. Everything else is internal and may c
 - Selectors: `Actor`, `EpsilonGreedy`, `Exp3`, `LinThompson`, `LinUCB`, `MetaCritic`, `OptionCritic`, `Thompson`, `UCB`.
 - `PAMDPEnv`, `Learner`, `Selector`: the bases of a problem, a learner and a selector of your own.
 - `ConfigError`: raised for a user's mistake, with one line that says what is allowed. `DivergedError`: raised if
-  training reaches numbers that are not finite.
+  training reaches numbers that are not finite. `EnvironmentFaultError`: raised if an environment's own code fails.
 
 Importing this package registers the Gymnasium ids of its problems. It loads neither torch nor TorchRL until one of the
 names is used.

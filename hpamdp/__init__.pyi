@@ -8,6 +8,7 @@ from .api.training import load as load
 from .api.training import train as train
 from .config.errors import ConfigError as ConfigError
 from .env.base import PAMDPEnv as PAMDPEnv
+from .env.errors import EnvironmentFaultError as EnvironmentFaultError
 from .policies.base import Learner as Learner
 from .policies.base import Selector as Selector
 from .policies.high_level.actor import Actor as Actor

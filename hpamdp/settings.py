@@ -23,7 +23,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, NonNegativeInt, PositiveInt
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    NonNegativeInt,
+    PositiveInt,
+    ValidationError,
+)
 from typing_extensions import Self
 
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -76,11 +85,23 @@ class Settings(BaseModel):
             settings: its other keyword arguments, by the names of settings.
 
         Raises:
-            ValueError: a setting does not exist, or has a wrong value.
+            SettingError: a setting does not exist, or has a wrong value.
             TypeError: the options are of another class.
         """
-        if options is None:
-            return cls(**settings)
-        if not isinstance(options, cls):
+        if options is not None and not isinstance(options, cls):
             raise TypeError(f"options: must be {cls.__name__}, not {type(options).__name__}")
-        return cls(**{**dict(options), **settings}) if settings else options
+        if options is not None and not settings:
+            return options
+        try:
+            return cls(**{**({} if options is None else dict(options)), **settings})
+        except ValidationError as error:
+            raise SettingError("; ".join(map(cls._complaint, error.errors()))) from error
+
+    @classmethod
+    def _complaint(cls, error: Mapping[str, Any]) -> str:
+        """Return what is wrong with one setting, in one line."""
+        name = ".".join(map(str, error["loc"])) or cls.__name__
+        if error["type"] == "extra_forbidden":
+            return f"{name}: no such setting of {cls.__name__}; it has {', '.join(cls.model_fields)}"
+        message = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+        return f"{name}={error['input']!r:.80}: {message}"

@@ -276,7 +276,7 @@ def test_an_evaluation_returns_means_or_one_entry_for_each_episode(platform_agen
         (np.zeros((0, 9)), r"shape \[0, 9\]"),
         (np.full(9, np.nan), "entry 0 of the observation is not finite"),
         ("left", "must hold 9 numbers, but is 'left'"),
-        (None, "must have"),
+        (None, "must hold 9 numbers"),
     ],
 )
 def test_a_wrong_observation_is_refused_with_its_shape(platform_agent, observation, message):
@@ -378,3 +378,207 @@ def test_acting_step_by_step_equals_the_evaluation_also_if_options_end_inside_ep
 def test_fewer_episodes_of_a_seed_are_the_first_of_more(platform_agent):
     few, more = (platform_agent.evaluate(episodes=num, per_episode=True)["return"] for num in (3, 6))
     np.testing.assert_array_equal(few, more[:3])
+
+
+# Mistakes that a hostile user found: each is one line, or has the effect that one would expect.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"folder": ""}, "folder='': must be a path"),
+        ({"folder": 3}, "folder=3: must be a path"),
+        ({"folder": "a\0b"}, "must be a path"),
+        ({"callbacks": None}, "must be a list of objects of subclasses"),
+        ({"callbacks": [hpamdp.BestAgent]}, "not BestAgent, a class"),
+        ({"hydra.run.dir": "other"}, "Hydra runs no job here"),
+        ({"resume": "auto", "folder": None}, "so give folder"),
+        ({"config_dirs": [3]}, r"config_dirs=\[3\]: must be a list of folders"),
+        ({"env": lambda: Reach}, "returned the class Reach, not an environment; call it"),
+        ({"env": gymnasium.Env}, "has no action_space"),
+        ({"env": {"name": Reach, "max_stepz": 5}}, "max_stepz"),
+    ],
+)
+def test_a_mistake_in_an_argument_leaves_no_file_and_no_open_environment(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    given = {"env": "platform", "low": "hppo", **TINY, "folder": "p/q/r", **arguments}
+    with pytest.raises(hpamdp.ConfigError, match=message):
+        hpamdp.train(given.pop("env"), **given)
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "x", tmp_path / ("n" * 300)):
+        with pytest.raises(hpamdp.ConfigError, match="folder="):
+            hpamdp.train("platform", low="hppo", folder=folder, **TINY)
+
+
+def test_a_factory_that_returns_the_same_environment_twice_is_refused():
+    same = Reach()
+    with pytest.raises(hpamdp.ConfigError, match="made the same environment twice"):
+        hpamdp.train(lambda: same, **OWN)
+
+
+def test_environments_of_a_refused_run_are_closed():
+    open_envs = []
+
+    class Counted(Reach):
+        def __init__(self):
+            open_envs.append(self)
+
+        def close(self):
+            open_envs.remove(self)
+
+    with pytest.raises(hpamdp.ConfigError, match="first update comes after"):
+        hpamdp.train(Counted, **{**OWN, "total_frames": 8, "num_envs": 4, "steps_per_batch": 2})
+    agent = hpamdp.train(Counted, **OWN)
+    agent.evaluate(episodes=3)
+    assert not open_envs
+
+
+def test_a_run_whose_end_failed_goes_on_with_the_same_call(tmp_path):
+    class Fails(hpamdp.Callback):
+        def on_end(self, trainer):
+            raise RuntimeError("once")
+
+    arguments = {**TINY, "low": "hppo", "folder": tmp_path / "run", "total_frames": 1000}
+    with pytest.raises(RuntimeError, match="once"):
+        hpamdp.train("platform", callbacks=Fails(), **arguments)
+    assert hpamdp.train("platform", resume="auto", **arguments).history[-1]["frames"] == 1024
+
+
+def test_torchs_random_numbers_stay_the_callers(platform_agent):
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    hpamdp.load("hppo_platform")
+    with torch.no_grad():
+        hpamdp.train("platform", low="hppo", **TINY)
+    torch.testing.assert_close(torch.rand(3), expected)
+
+
+def test_a_second_training_in_another_thread_is_told_of(capsys):
+    class Nested(hpamdp.Callback):
+        def on_end(self, trainer):
+            thread = threading.Thread(target=lambda: hpamdp.train("platform", low="hppo", **TINY))
+            thread.start()
+            thread.join()
+
+    hpamdp.train("platform", low="hppo", callbacks=[Nested()], **TINY)
+    assert "no seed repeats them" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("trust", ["false", 1, None])
+def test_trust_is_true_or_false_and_nothing_like_it(trust):
+    with pytest.raises(hpamdp.ConfigError, match="must be True or False"):
+        hpamdp.load("hppo_platform", trust=trust)
+
+
+@pytest.mark.parametrize("settings", [{"mode": "train"}, {"total_frames": 5}, {"checkpoint": "x"}, {"low": "hppo"}])
+def test_settings_without_effect_on_a_loaded_agent_are_refused(settings):
+    with pytest.raises(hpamdp.ConfigError, match="has no effect on a trained agent"):
+        hpamdp.load("hppo_platform", **settings)
+
+
+@pytest.mark.parametrize("source", ["", None, 3, ["a"]])
+def test_a_source_that_is_no_path_is_refused(source):
+    with pytest.raises(hpamdp.ConfigError, match="must be a path"):
+        hpamdp.load(source)
+
+
+def test_home_directories_are_written_and_read_by_the_same_rule(tmp_path, monkeypatch, platform_agent):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    platform_agent.save("~/a.pt")
+    hpamdp.train("platform", low="hppo", folder="~/run", **TINY)
+    assert {"a.pt", "run"} == {path.name for path in tmp_path.iterdir()}
+    assert hpamdp.load("~/a.pt").specs == hpamdp.load("~/run").specs
+
+
+def test_an_agent_that_holds_nothing_takes_the_mask_of_a_vector_loop(platform_agent):
+    observations = np.zeros((3, 9), np.float32)
+    platform_agent.act(observations)
+    platform_agent.reset(np.array([True, False, True]))
+    platform_agent.act(observations)
+    for junk in ("x", [0.5], np.zeros((2, 2), bool)):
+        with pytest.raises(ValueError, match="starts must be bool"):
+            platform_agent.reset(junk)
+
+
+@pytest.mark.parametrize(
+    ("observation", "more", "message"),
+    [
+        (np.zeros(9), {"greedy": "no"}, "must be True or False"),
+        (np.zeros(9), {"info": 3}, "must be a dict"),
+        (["1"] * 9, {}, "must hold 9 numbers"),
+        (np.zeros(9, complex), {}, "must hold 9 numbers"),
+    ],
+)
+def test_arguments_of_act_are_checked(platform_agent, observation, more, message):
+    with pytest.raises(ValueError, match=message):
+        platform_agent.act(observation, **more)
+
+
+class Masked(Reach):
+    """Reach with one of the actions forbidden, in the info."""
+
+    def reset(self, *, seed=None, options=None):
+        observation, _ = super().reset(seed=seed)
+        return observation, {"action_mask": np.array([1, 0])}
+
+    def step(self, action):
+        observation, reward, *flags, _ = super().step(action)
+        return observation, reward, *flags, {"action_mask": np.array([1, 0])}
+
+
+def test_masks_in_the_info_are_honoured_and_checked():
+    agent = hpamdp.train(Masked, **OWN, **{"env.action_mask": "info"})
+    observation = np.zeros(3, np.float32)
+    assert agent.act(observation, {"action_mask": [True, False]})[0] == 0
+    assert agent.act(observation, {"action_mask": [False, True]})[0] == 1
+    batch = agent.act(np.zeros((2, 3), np.float32), {"action_mask": np.array([[1, 0], [0, 1]])})
+    assert batch[0].tolist() == [0, 1]
+    for mask, message in (([False, False], "allows nothing"), ([True], "action_mask"), ([2, 0], "action_mask")):
+        with pytest.raises(ValueError, match=message):
+            agent.act(observation, {"action_mask": mask})
+    with pytest.raises(ValueError, match="give the info of the step"):
+        agent.act(observation)
+
+
+def test_an_evaluation_elsewhere_keeps_the_agents_settings_of_the_problem():
+    agent = hpamdp.train({"name": Reach, "max_steps": 5}, **TINY, low="hppo")
+    assert agent.evaluate(Reach, episodes=2)["steps"] == 5.0
+    assert agent.evaluate({"name": Reach, "max_steps": 7}, episodes=2)["steps"] == 7.0
+
+
+def test_numbers_of_an_evaluation_are_checked_by_their_names(platform_agent):
+    assert platform_agent.evaluate(episodes=np.int64(2), seed=np.int64(3))["steps"] > 0
+    for arguments in ({"episodes": 0}, {"episodes": 1.5}, {"episodes": "x"}, {"seed": -1}):
+        with pytest.raises(hpamdp.ConfigError, match=next(iter(arguments))):
+            platform_agent.evaluate(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: hpamdp.make("platform", 1.5), "num_envs"),
+        (lambda: hpamdp.make("platform", seed=-1), "seed"),
+        (lambda: hpamdp.make("platform", oracle="x"), "oracle"),
+        (lambda: hpamdp.make("platform", device="gpu"), "device"),
+        (lambda: hpamdp.make("platform", device="cuda:9"), "device"),
+        (lambda: hpamdp.make_gymnasium(None), "must be the name of a problem"),
+        (lambda: hpamdp.make_gymnasium("x-v3"), "x-v3"),
+        (lambda: hpamdp.make_gymnasium("platform", max_steps=-1), "max_steps=-1"),
+        (lambda: hpamdp.Patience(evaluations=0), "evaluations=0: must be greater than 0"),
+        (lambda: hpamdp.Patience(foo=1), "foo: no such setting of PatienceOptions; it has evaluations"),
+        (lambda: hpamdp.OwnMetrics(3), "must be a function"),
+    ],
+)
+def test_wrong_arguments_of_constructors_are_one_line(make, message):
+    with pytest.raises(ValueError, match=message) as raised:
+        make()
+    assert "\n" not in str(raised.value)
+
+
+def test_make_takes_what_train_takes():
+    assert hpamdp.make(lambda: Reach(), num_envs=2, max_steps=5).num_envs == 2

@@ -3,29 +3,41 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from pydantic import NonNegativeInt, PositiveInt
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hpamdp import keys
-from hpamdp.api.arguments import problem_arguments
+from hpamdp.api.arguments import path_argument, problem_arguments
 from hpamdp.api.export import export_onnx
 from hpamdp.config.compose import read
 from hpamdp.config.errors import ConfigError, validated
 from hpamdp.config.outside_jobs import composed
-from hpamdp.config.schema import Config, EvalConfig
+from hpamdp.config.schema import Config
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.decisions import DecisionTracker, decision_tracker
 from hpamdp.policies.agent import HierarchicalAgent
 from hpamdp.run import checkpoint
 from hpamdp.run.assemble import make_env, make_evaluation, option_length
+from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
+
+# Settings that say which environment it is.
+_SOURCES = ("id", "entry_point", "kwargs")
+
+
+class _Asked(Settings):
+    """The numbers that `Agent.evaluate` takes."""
+
+    episodes: PositiveInt
+    seed: NonNegativeInt
 
 
 class Agent:
@@ -87,8 +99,8 @@ class Agent:
             greedy: whether to take the best action. Otherwise the agent explores as in training.
 
         Raises:
-            ValueError: the observation is not in `observation_space`, the batch has another size than the last one, or
-                the running episode is longer than the problem allows, so that a `reset` is missing.
+            ValueError: an argument is wrong, the batch has another size than the last one, or the running episode is
+                longer than the problem allows, so that a `reset` is missing.
 
         Example:
             >>> import hpamdp
@@ -97,6 +109,10 @@ class Agent:
             >>> observation, info = env.reset(seed=0)
             >>> discrete, parameters = agent.act(observation)
         """
+        if not isinstance(greedy, bool):
+            raise ValueError(f"act: greedy={greedy!r:.80}: must be True or False")
+        if info is not None and not isinstance(info, Mapping):
+            raise ValueError(f"act: info={info!r:.80}: must be a dict")
         try:
             fresh, is_batch = self._form.read(observation, info)
         except ValueError as error:
@@ -121,11 +137,11 @@ class Agent:
             self._last = None
             return
         mask = np.asarray(starts)
-        if self._last is None:
-            return
-        if mask.dtype != bool or mask.shape != self._starts.shape:
-            raise ValueError(f"reset: starts must be bool {list(self._starts.shape)}, but is {starts!r:.80}")
-        self._starts |= mask
+        num = "N" if self._last is None else len(self._last)
+        if mask.dtype != bool or mask.ndim != 1 or num not in ("N", len(mask)):
+            raise ValueError(f"reset: starts must be bool [{num}], but is {starts!r:.80}")
+        if self._last is not None and self._kept:
+            self._starts |= mask
 
     def _seen(self, fresh: TensorDict) -> TensorDictBase:
         """Return what the policy reads: new rows `[N]`, and what stays from the last step."""
@@ -166,7 +182,8 @@ class Agent:
         """Play episodes greedily and return their means.
 
         Args:
-            env: another problem, as for `hpamdp.train`, with the same sizes. If None, the agent's own.
+            env: another problem, as for `hpamdp.train`, with the same sizes. If it has the class of the agent's own,
+                it takes over those of its settings that `env` does not give. If None, the agent's own.
             episodes: number of episodes.
             seed: of the episodes. If None, that of the agent's own evaluations, so 100 episodes are their first 100.
             per_episode: whether to return arrays with one entry for each episode instead of means.
@@ -178,17 +195,17 @@ class Agent:
             ConfigError: the problem has other sizes, or a number is wrong.
         """
         config = self._config if env is None else self._config_at(env)
-        values: dict[str, Any] = {**dict(config.run.eval), "layouts": episodes}
-        if seed is not None:
-            values["seed"] = seed
-        checked = validated(EvalConfig, values, "evaluate: eval.", "value of eval", "hpamdp.Agent.evaluate")
-        config = config.with_run(eval=checked, film=False)
-        evaluation = make_evaluation(config, self._env)
-        played = evaluation.run(self.policy)
-        evaluation.env.close()
-        if per_episode:
-            return played
-        return evaluation.measure(played)
+        seed = config.run.eval.seed if seed is None else seed
+        asked = {"episodes": episodes, "seed": seed}
+        numbers = {name: int(value) if isinstance(value, np.integer) else value for name, value in asked.items()}
+        checked = validated(_Asked, numbers, "", "argument", "hpamdp.Agent.evaluate")
+        told = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
+        evaluation = make_evaluation(config.with_run(eval=told, film=False), self._env)
+        try:
+            played = evaluation.run(self.policy)
+            return played if per_episode else evaluation.measure(played)
+        finally:
+            evaluation.env.close()
 
     def _config_at(self, env: Any) -> Config:
         """Return the agent's config at another problem.
@@ -199,6 +216,11 @@ class Agent:
         arguments = problem_arguments(env)
         with composed(arguments.words) as cfg:
             other = read(cfg).with_objects(arguments.objects)
+            own = self._config.env
+            if other.env.cls is own.cls:
+                given = {each.partition("=")[0].removeprefix("env.") for each in arguments.words}
+                kept = {name: value for name, value in own.settings.items() if name not in (*given, *_SOURCES)}
+                other = other.with_problem(replace(other.env, settings={**other.env.settings, **kept}))
         config = self._config.with_problem(other.env)
         built = make_env(config, 1, self._env.device, config.run.seed)
         specs = PAMDPSpecs.from_env(built)
@@ -216,9 +238,10 @@ class Agent:
         The file holds the networks and the settings, not the replay buffer. To continue training, train with a folder.
 
         Raises:
+            ConfigError: the path is none.
             OSError: the file cannot be written.
         """
-        checkpoint.save_policy(Path(path), self._agent, self._env, self._progress)
+        checkpoint.save_policy(path_argument("save", path), self._agent, self._env, self._progress)
 
     def export(self, path: str | Path) -> None:
         """Write the greedy policy to an ONNX file, which runs without torch; an existing file is replaced.

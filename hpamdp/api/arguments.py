@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -39,16 +40,29 @@ class Arguments:
     objects: Mapping[str, Any] = field(default_factory=dict)
 
 
+def path_argument(name: str, value: Any) -> Path:
+    """Return a path that Python code gives, with the home directory in place of `~`.
+
+    Raises:
+        ConfigError: the value is no path.
+    """
+    if not isinstance(value, str | Path) or not str(value) or "\0" in str(value):
+        raise ConfigError(f"{name}={value!r:.80}: must be a path")
+    return Path(value).expanduser()
+
+
 def settings_words(settings: Mapping[str, Any]) -> list[str]:
     """Return the words for settings by their names on the command line, such as `seed` and `low.lr`.
 
     The value of a group, such as `low`, is the name of a yaml file, a class, None, or a mapping of `name` and settings.
 
     Raises:
-        ConfigError: a value has no such form.
+        ConfigError: a value has no such form, or the setting is Hydra's.
     """
     words: list[str] = []
     for name, value in settings.items():
+        if name.partition(".")[0] == "hydra":
+            raise ConfigError(f"{name}: Hydra runs no job here; give folder or config_dirs instead")
         words += _group_words(name, value) if name in GROUPS else [word(name, value)]
     return words
 
@@ -80,10 +94,18 @@ def problem_arguments(env: Any) -> Arguments:
         return Arguments()
     if isinstance(env, str):
         return Arguments(_words_of_name(env))
+    if isinstance(env, Mapping) and "name" in env:
+        chosen = problem_arguments(env["name"])
+        own = [word(f"env.{name}", value) for name, value in env.items() if name != "name"]
+        return Arguments([*chosen.words, *own], chosen.objects)
     if isinstance(env, Mapping) or _is_problem_class(env):
         return Arguments(_group_words("env", env))
     if isinstance(env, PAMDPEnv):
         return Arguments(_words_of_built(env))
+    return _arguments_of_gymnasium(env)
+
+
+def _arguments_of_gymnasium(env: Any) -> Arguments:
     if isinstance(env, gymnasium.Env):
         return Arguments(["env=gymnasium"], {"make": _copier(env)})
     if callable(env) and not isinstance(env, EnvBase | VectorEnv):

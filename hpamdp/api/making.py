@@ -5,21 +5,33 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium
+from pydantic import NonNegativeInt, PositiveInt
 
 from hpamdp.api.arguments import plain_name, problem_arguments
 from hpamdp.config.components import SUPPLIED_ARGUMENTS
 from hpamdp.config.compose import read
-from hpamdp.config.errors import ConfigError, no_such
+from hpamdp.config.errors import ConfigError, no_such, validated
 from hpamdp.config.outside_jobs import composed, word
 from hpamdp.env.base import PAMDPEnv
 from hpamdp.env.registration import register
+from hpamdp.messages import first_line
+from hpamdp.settings import SettingError, Settings
 
 
-def make(name: str, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **settings: Any) -> PAMDPEnv:
+class _Sizes(Settings):
+    """The arguments of `make` that are no settings of the problem."""
+
+    num_envs: PositiveInt = 1
+    seed: NonNegativeInt = 0
+    oracle: bool = False
+    human: bool = False
+
+
+def make(name: Any, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **settings: Any) -> PAMDPEnv:
     """Make a problem as a batched TorchRL environment.
 
     Args:
-        name: a choice of `env` on the command line, such as `platform`, or a Gymnasium id.
+        name: a choice of `env` on the command line, such as `platform`, a Gymnasium id, or what else `train` takes.
         num_envs: number of environments in the batch.
         device: of the tensors.
         seed: of the episodes.
@@ -36,10 +48,13 @@ def make(name: str, num_envs: int = 1, *, device: Any = "cpu", seed: int = 0, **
         torch.Size([4, 3, 1])
     """
     supplied = {each: settings.pop(each) for each in SUPPLIED_ARGUMENTS["env"] if each in settings}
-    words = [*problem_arguments(name).words, *(word(f"env.{each}", value) for each, value in settings.items())]
-    with composed(words) as cfg:
-        component = read(cfg).env
-    return component.build(num_envs=num_envs, device=device, seed=seed, **supplied)
+    sizes = validated(_Sizes, {"num_envs": num_envs, "seed": seed, **supplied}, "", "argument", "hpamdp.make")
+    arguments = problem_arguments(name)
+    words = [*arguments.words, *(word(f"env.{each}", value) for each, value in settings.items())]
+    with composed([*words, word("device", str(device))]) as cfg:
+        config = read(cfg).with_objects(arguments.objects)
+    needs = {each: True for each in ("oracle", "human") if getattr(sizes, each)}
+    return config.env.build(num_envs=sizes.num_envs, device=config.run.resolve_device(), seed=sizes.seed, **needs)
 
 
 def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> Any:
@@ -55,7 +70,7 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         A `gymnasium.Env`, or a `gymnasium.vector.VectorEnv` if `num_envs` is given.
 
     Raises:
-        ConfigError: there is no such id.
+        ConfigError: there is no such id, or a setting is wrong.
 
     Example:
         >>> import hpamdp
@@ -64,13 +79,20 @@ def make_gymnasium(name: str, num_envs: int | None = None, **settings: Any) -> A
         (9,)
     """
     env_id = _id_of(name)
-    if num_envs is None:
-        return gymnasium.make(env_id, **settings)
-    return gymnasium.make_vec(env_id, num_envs=num_envs, **settings)
+    if num_envs is not None:
+        validated(_Sizes, {"num_envs": num_envs}, "", "argument", "hpamdp.make_gymnasium")
+    try:
+        if num_envs is None:
+            return gymnasium.make(env_id, **settings)
+        return gymnasium.make_vec(env_id, num_envs=num_envs, **settings)
+    except (gymnasium.error.Error, SettingError) as error:
+        raise ConfigError(f"{env_id}: {first_line(error)}") from error
 
 
 def _id_of(name: str) -> str:
     register()
+    if not isinstance(name, str):
+        raise ConfigError(f"make_gymnasium: {name!r:.80} must be the name of a problem, or a Gymnasium id")
     if name in gymnasium.registry or "-v" in name or ":" in name:
         return name
     ids = {plain_name(each): each for each in gymnasium.registry if each.startswith("hpamdp/")}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -10,11 +12,11 @@ from typing import Any
 import torch
 
 from hpamdp.api.agent import Agent
-from hpamdp.api.arguments import problem_arguments, settings_words
+from hpamdp.api.arguments import path_argument, problem_arguments, settings_words
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.outside_jobs import composed, searching
 from hpamdp.config.schema import RESUME_AUTO
-from hpamdp.messages import say
+from hpamdp.messages import reason_of, say, warn
 from hpamdp.metrics_file import read_rows
 from hpamdp.run import checkpoint
 from hpamdp.run.callbacks import Callback
@@ -24,7 +26,7 @@ from hpamdp.run.folder import locked
 from hpamdp.run.players import load_agent
 from hpamdp.run.resume import resolve, saved_words
 from hpamdp.run.stopping import exits_explained
-from hpamdp.run.train import begin, problems_explained
+from hpamdp.run.train import begin, check_callbacks, problems_explained
 from hpamdp.run_files import METRICS_NAME
 
 
@@ -39,7 +41,8 @@ def train(
 ) -> Agent:
     """Train an agent, as `hpamdp SETTING=VALUE ...` does, and return it.
 
-    Ctrl-C ends training after the current batch. Then the agent with what it has learned so far is returned.
+    Ctrl-C ends training after the current batch. Then the agent with what it has learned so far is returned. Trainings
+    in several threads at once share torch's random numbers. A warning says that no seed repeats them.
 
     Args:
         env: the problem: the name of a choice of `env`; a Gymnasium id; a function or a class that returns a Gymnasium
@@ -56,7 +59,8 @@ def train(
     Raises:
         ConfigError: a value is wrong, values do not go together, or the folder holds another run. Nothing is written.
         DivergedError: a reward, a loss or a weight is not finite.
-        CollectionError: a worker process died.
+        EnvironmentFaultError: the environment's own code raised an error, which is the cause.
+        RuntimeError: a worker process died, or somebody's code called `sys.exit`.
 
     Example:
         >>> import hpamdp
@@ -64,15 +68,19 @@ def train(
     """
     if settings.get("mode") == "eval":
         raise ConfigError("mode=eval: use hpamdp.load(...).evaluate()")
+    output_dir = None if folder is None else path_argument("folder", folder)
+    callbacks = _checked_callbacks(callbacks)
     arguments = problem_arguments(env)
     goes_on = settings.get("resume") == RESUME_AUTO
+    if goes_on and output_dir is None:
+        raise ConfigError("resume=auto: goes on with the run in a folder, so give folder")
     if goes_on:
         settings = {**settings, "resume": None}
     words = [*searching(config_dirs), *arguments.words, *settings_words(settings)]
-    output_dir = None if folder is None else Path(folder)
     resumed = settings.get("resume")
     saved = [] if resumed is None else saved_words(str(resumed), "resume", words)
-    with _threads_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
+    with _torch_restored(), exits_explained(), problems_explained(), ExitStack() as stack:
+        stack.enter_context(_counted())
         with composed([*saved, *words]) as cfg:
             config, source = resolve(cfg, words, arguments.objects)
             if output_dir is None and config.logger.name != "csv":
@@ -85,41 +93,78 @@ def train(
                 if score is not None:
                     return load(output_dir, env=env, config_dirs=config_dirs, trust=True)
             trainer = begin(config, source, output_dir, words, may_overwrite=goes_on, callbacks=callbacks)
+        stack.callback(trainer.parts.close)
         trainer.shows_progress = progress
         is_interrupted = trainer.train()
         table = trainer.finish(is_finished=not is_interrupted)
-    parts = trainer.parts
-    parts.env.close()
-    parts.evaluation.env.close()
     if progress:
         say(table)
         if is_interrupted:
             say(f"Stopped at {trainer.frames:,}{trainer.unit}")
+    parts = trainer.parts
     return Agent(config, parts.agent, parts.env.base_env, trainer.progress(), trainer.recorder.metrics.rows())
+
+
+def _checked_callbacks(given: Any) -> list[Callback]:
+    """Return the callbacks as a list; a single one counts as a list of one.
+
+    Raises:
+        ConfigError: it is none, or holds something else.
+    """
+    callbacks = [given] if isinstance(given, Callback) else given
+    if not isinstance(callbacks, list | tuple):
+        raise ConfigError(f"callbacks={given!r:.80}: must be a list of objects of subclasses of hpamdp.Callback")
+    check_callbacks(callbacks)
+    return [*callbacks]
+
+
+_running = threading.Lock()  # held while a training of this process runs
+
+
+@contextmanager
+def _counted() -> Iterator[None]:
+    """Warn if another training runs in this process."""
+    is_first = _running.acquire(blocking=False)
+    if not is_first:
+        warn("another training runs in this process; they share torch's random numbers, so no seed repeats them")
+    try:
+        yield
+    finally:
+        if is_first:
+            _running.release()
 
 
 @contextmanager
 def _own_folder(folder: Path) -> Iterator[None]:
-    """Keep other processes out of a folder, and leave no empty folder behind if the run is refused."""
-    is_new = not folder.exists()
+    """Keep other processes out of a folder, and leave no empty folder behind if the run fails before it writes.
+
+    Raises:
+        ConfigError: the folder cannot be made.
+    """
+    missing = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
     try:
-        with locked(folder):
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(locked(folder))
+            except OSError as error:
+                raise ConfigError(f"folder={folder}: {reason_of(error)}") from error
             yield
-    except ConfigError:
-        if is_new:
-            with suppress(OSError):
-                folder.rmdir()
-        raise
+    finally:
+        with suppress(OSError):  # at the first folder that is not empty
+            for each in missing:
+                each.rmdir()
 
 
 @contextmanager
-def _threads_restored() -> Iterator[None]:
-    """Give torch back its number of threads after a run, which sets its own."""
-    before = torch.get_num_threads()
+def _torch_restored() -> Iterator[None]:
+    """Compute gradients, and give torch back its threads and random numbers afterwards. A run sets its own."""
+    threads, generator = torch.get_num_threads(), torch.get_rng_state()
     try:
-        yield
+        with torch.inference_mode(False), torch.enable_grad():
+            yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(threads)
+        torch.set_rng_state(generator)
 
 
 def load(
@@ -140,7 +185,8 @@ def load(
         config_dirs: folders of yaml files of your own, if the training had them.
         trust: whether the file may name code to run, such as the entry point of an environment, and the folders of
             yaml files that the training had.
-        settings: other settings, such as `device="cpu"` or `**{"env.max_steps": 50}`.
+        settings: `device`, `threads`, and settings of the problem and of evaluations, such as
+            `**{"env.max_steps": 50}`.
 
     Raises:
         ConfigError: there is no such agent, it does not fit the problem, or it needs your trust.
@@ -150,13 +196,18 @@ def load(
         >>> hpamdp.load("hppo_platform").specs.parameter_dims
         (1, 1, 1)
     """
+    if trust is not True and trust is not False:
+        raise ConfigError(f"trust={trust!r:.80}: must be True or False")
+    for name in settings:
+        if name not in ("device", "threads") and name.partition(".")[0] not in ("env", "eval"):
+            raise ConfigError(f"{name}: has no effect on a trained agent; leave it out")
+    file = checkpoint.find(path_argument("load", source), "load")
     arguments = problem_arguments(env)
     words = [*searching(config_dirs), *arguments.words, *settings_words(settings), *(["trust=true"] if trust else [])]
-    file = checkpoint.find(source, "load")
     if env is None:
         _check_problem(file, settings)
-    with _threads_restored(), problems_explained():
-        loaded = load_agent(str(source), words, arguments.objects)
+    with _torch_restored(), problems_explained():
+        loaded = load_agent(str(file), words, arguments.objects)
     rows = read_rows(file.parent / METRICS_NAME)
     return Agent(loaded.config, loaded.agent, loaded.env, loaded.progress, rows)
 

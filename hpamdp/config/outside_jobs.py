@@ -131,6 +131,10 @@ def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list
     Raises:
         ConfigError: a folder does not exist.
     """
+    if isinstance(folders, str | Path):
+        folders = [folders]
+    if not isinstance(folders, list | tuple) or not all(isinstance(each, str | Path) and str(each) for each in folders):
+        raise ConfigError(f"config_dirs={folders!r:.80}: must be a list of folders")
     missing = [folder for folder in folders if not Path(folder).is_dir()]
     if missing:
         raise ConfigError(f"{where}: there is no folder {missing[0]}")
@@ -152,6 +156,9 @@ def choosing_class(group: str, cls: type) -> str:
     name = cls.__name__
     if name in files:
         raise ConfigError(f"{group}: {dotted} has the name of {file_of(group, name)}; rename the class")
+    stored = ConfigStore.instance().repo.get(group, {}).get(f"{name}.yaml")
+    if stored is not None and stored.node.get(TARGET) != dotted:
+        raise ConfigError(f"{group}: {dotted} has the name of another choice in Hydra's ConfigStore; rename the class")
     check_base_class(group, name, dotted)
     budget = {"budget": _BUDGET} if group == "low" else {}
     settings = defaults_of(settings_model(cls, SUPPLIED_ARGUMENTS[group]))

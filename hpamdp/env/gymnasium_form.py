@@ -84,7 +84,11 @@ class VectorForm(GymnasiumForm):
         self._has_option = env.has_choice and env.option_actions is None  # grouped actions need no option to be taken
         self._device = env.device
         self._ends = np.cumsum(env.parameter_dims)[:-1]
-        self._masks = [name for name in (keys.ACTION_MASK, keys.OPTION_MASK) if name in env.observation_spec.keys()]
+        self._mask_sizes = {
+            name: env.observation_spec[name].shape[-1]
+            for name in (keys.ACTION_MASK, keys.OPTION_MASK)
+            if name in env.observation_spec.keys()
+        }
         self.num_entries = env.observation_spec_unbatched[keys.OBSERVATION].shape[-1]
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.num_entries,), np.float32)
         bounds = env.full_action_spec_unbatched[keys.PARAMETERS].space
@@ -99,13 +103,16 @@ class VectorForm(GymnasiumForm):
         """Return the rows of `GymnasiumForm.read`."""
         vectors, is_batch = self._vectors(observation)
         rows = {keys.OBSERVATION: torch.from_numpy(vectors)}
-        for name in self._masks:
+        for name in self._mask_sizes:
             rows[name] = self._mask(name, info, len(vectors))
         return TensorDict(rows, batch_size=[len(vectors)]).to(self._device), is_batch
 
     def _vectors(self, observation: Any) -> tuple[np.ndarray, bool]:
         try:
-            vectors = np.array(observation, np.float32)
+            given = np.asarray(observation)
+            if given.dtype.kind not in "biuf":
+                raise TypeError("not made of real numbers")
+            vectors = np.array(given, np.float32)
         except (TypeError, ValueError) as error:
             raise ValueError(
                 f"the observation must hold {self.num_entries} numbers, but is {observation!r:.80}"
@@ -120,7 +127,11 @@ class VectorForm(GymnasiumForm):
     def _mask(self, name: str, info: Mapping[str, Any] | None, num: int) -> Tensor:
         if info is None or name not in info:
             raise ValueError(f"the problem forbids some choices, so give the info of the step with its {name}")
-        return torch.from_numpy(np.array(info[name], bool)).reshape(num, -1)
+        size = self._mask_sizes[name]
+        mask = np.asarray(info[name])
+        if mask.shape not in ((num, size), (size,) if num == 1 else (num, size)) or not np.isin(mask, (0, 1)).all():
+            raise ValueError(f"{name} must be 0 or 1 in shape [{num}, {size}], but is {info[name]!r:.80}")
+        return checked_mask(name, mask.reshape(num, size))
 
     def write(self, acted: TensorDictBase, *, is_batch: bool) -> Any:
         """Return the action of `GymnasiumForm.write`."""
@@ -132,3 +143,15 @@ class VectorForm(GymnasiumForm):
             return discrete, tuple(own)
         option = acted.get(keys.OPTION).cpu().numpy()
         return (option if is_batch else option[0]), discrete, tuple(own)
+
+
+def checked_mask(name: str, mask: np.ndarray) -> Tensor:
+    """Return a mask `[N, K]` as a bool tensor.
+
+    Raises:
+        ValueError: a row allows nothing.
+    """
+    is_empty = ~(mask != 0).any(-1)
+    if is_empty.any():
+        raise ValueError(f"{name} of row {int(is_empty.argmax())} allows nothing")
+    return torch.from_numpy(mask != 0)

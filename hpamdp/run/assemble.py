@@ -56,6 +56,12 @@ class AssembledRun:
     data: Demonstrations | None
     device: torch.device
 
+    def close(self) -> None:
+        """Close the environments."""
+        for env in (self.env, self.evaluation.env):
+            if not env.is_closed:
+                env.close()
+
 
 def assemble(config: Config) -> AssembledRun:
     """Build the parts of a run.
@@ -68,6 +74,16 @@ def assemble(config: Config) -> AssembledRun:
     device = run.resolve_device()
     capacity.check_run(run, device, lambda: make_env(config, 1, device, run.seed))
     env = make_env(config, run.num_envs, device, run.seed)
+    try:
+        return _assemble(config, env, device)
+    except BaseException:
+        env.close()
+        raise
+
+
+def _assemble(config: Config, env: PAMDPEnv, device: torch.device) -> AssembledRun:
+    """Build the parts of a run around its environments."""
+    run = config.run
     check_built(config, env)
     specs = PAMDPSpecs.from_env(env)
     capacity.check_agent(config, specs, learners_of(config, specs), device)

@@ -18,7 +18,7 @@ from hpamdp.config.errors import ConfigError
 from hpamdp.files import replacing
 from hpamdp.messages import first_line, warn
 from hpamdp.run_files import BEST_NAME
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 
 if TYPE_CHECKING:
     from hpamdp.run.train import Trainer
@@ -225,6 +225,8 @@ class OwnMetrics(Callback):
     """
 
     def __init__(self, function: Callable[[Trainer], Mapping[str, float]]) -> None:
+        if not callable(function):
+            raise SettingError(f"OwnMetrics: function={function!r:.80}: must be a function of the trainer")
         self._function = function
 
     def metrics(self, trainer: Trainer) -> Mapping[str, float]:

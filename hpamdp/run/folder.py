@@ -96,7 +96,7 @@ def check_unused(folder: Path, *, may_overwrite: bool = False) -> None:
     if marks and not may_overwrite:
         raise ConfigError(
             f"{folder}: holds the results of a run; continue it with {path_setting('resume', folder)}, "
-            "take another hydra.run.dir, or set overwrite=true"
+            "take another folder (hydra.run.dir), or set overwrite=true"
         )
     is_of_a_run = marks or {"mode", "seed", "env", "low"} <= saved_config(folder).keys() or _aside(folder).exists()
     if not is_of_a_run:

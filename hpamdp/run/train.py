@@ -19,7 +19,7 @@ from tqdm import tqdm
 from hpamdp import keys
 from hpamdp.config.errors import ConfigError
 from hpamdp.config.saved import needs_trust
-from hpamdp.config.schema import Config
+from hpamdp.config.schema import Config, RunConfig
 from hpamdp.env.base import ProblemError
 from hpamdp.env.errors import EnvironmentFaultError, fault_of
 from hpamdp.files import replacing
@@ -142,13 +142,17 @@ def begin(
     torch.set_num_threads(config.run.threads)
     torch.manual_seed(config.run.seed)
     parts = assemble(config)
-    check_saved_options(config, parts.env.base_env)
-    trainer = Trainer(config, parts, output_dir, _all_callbacks(config, callbacks) if is_training else ())
-    if source is not None:
-        trainer.restore(source)
-        if is_training:
-            check_more(overrides, trainer.frames, config.run.num_frames)
-    trainer.start(is_own=is_own)
+    try:
+        check_saved_options(config, parts.env.base_env)
+        trainer = Trainer(config, parts, output_dir, _all_callbacks(config, callbacks) if is_training else ())
+        if source is not None:
+            trainer.restore(source)
+            if is_training:
+                check_more(overrides, trainer.frames, config.run)
+        trainer.start(is_own=is_own)
+    except BaseException:
+        parts.close()
+        raise
     return trainer
 
 
@@ -158,14 +162,23 @@ def _all_callbacks(config: Config, given: Sequence[Callback]) -> list[Callback]:
     Raises:
         ConfigError: a given object is no callback.
     """
-    for each in given:
-        if not isinstance(each, Callback):
-            what = f"{each.__name__}, a class" if isinstance(each, type) else type(each).__name__
-            raise ConfigError(f"callbacks: must be objects of subclasses of Callback, not {what}")
+    check_callbacks(given)
     callbacks = [*(chosen.build() for chosen in config.callbacks), *given]
     if config.run.save_best and not any(isinstance(each, BestAgent) for each in callbacks):
         callbacks.insert(0, BestAgent())
     return callbacks
+
+
+def check_callbacks(given: Sequence[object]) -> None:
+    """Refuse objects that are no callbacks.
+
+    Raises:
+        ConfigError: the message says what one of them is.
+    """
+    for each in given:
+        if not isinstance(each, Callback):
+            what = f"{each.__name__}, a class" if isinstance(each, type) else type(each).__name__
+            raise ConfigError(f"callbacks: must be objects of subclasses of Callback, not {what}")
 
 
 def _is_in(source: Path | None, folder: Path | None) -> bool:
@@ -562,14 +575,16 @@ class Trainer:
         }
 
 
-def check_more(overrides: Sequence[str], frames: int, wanted: int) -> None:
-    """Refuse to continue a run for fewer frames than it has.
+def check_more(overrides: Sequence[str], frames: int, run: RunConfig) -> None:
+    """Refuse to continue a run for fewer frames than it has, counted in whole batches.
 
     Raises:
         ConfigError: the length is too small; the message names the frames so far.
     """
+    batch = 1 if run.mode == "offline" else run.num_envs * run.steps_per_batch
+    most = -(-run.num_frames // batch) * batch
     for word in overrides:
-        if word.startswith(("total_frames=", "offline.updates=")) and frames > wanted:
+        if word.startswith(("total_frames=", "offline.updates=")) and frames > most:
             raise ConfigError(f"{word}: the run that is continued has {frames:,} already; set more, or leave it out")
 
 

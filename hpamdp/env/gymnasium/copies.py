@@ -158,6 +158,8 @@ class Copies:
         self._has_masks = bool(mask_sizes)
 
     def _check_spaces(self) -> None:
+        if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
+            raise SettingError(f"{self._name}: made the same environment twice; each call must make a new one")
         first = self.envs[0]
         for row, env in enumerate(self.envs):
             for name in ("action_space", "observation_space"):

@@ -17,7 +17,7 @@ from hpamdp.env.gymnasium.copies import Copies
 from hpamdp.env.gymnasium.masks import Masks, MaskSource
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
-from hpamdp.env.gymnasium_form import GymnasiumForm, VectorScaling
+from hpamdp.env.gymnasium_form import GymnasiumForm, VectorScaling, checked_mask
 
 
 class OwnForm(GymnasiumForm):
@@ -54,7 +54,7 @@ class OwnForm(GymnasiumForm):
         for row, single in enumerate(singles if masks.rows else ()):
             in_row = {name: value[row] for name, value in (info or {}).items() if name in masks.rows and num}
             masks.keep(row, single, in_row if num else info or {})
-        rows |= {name: torch.from_numpy(mask) for name, mask in masks.rows.items()}
+        rows |= {name: checked_mask(name, mask) for name, mask in masks.rows.items()}
         return TensorDict(rows, batch_size=[len(singles)]), num is not None
 
     def scaling(self) -> VectorScaling:

@@ -37,7 +37,7 @@ class FourValueEnv(gymnasium.Env):
     def __init__(self, env: Any) -> None:
         missing = [name for name in ("reset", "step", "action_space", "observation_space") if not hasattr(env, name)]
         if missing:
-            raise SettingError(f"FourValueEnv: {_kind(env)} is no environment: it has no {', '.join(missing)}")
+            raise SettingError(f"{_kind(env)} is no environment: it has no {', '.join(missing)}")
         self.env = env
         self.spec = getattr(env, "spec", None)
         self.metadata = getattr(env, "metadata", {})

@@ -74,8 +74,17 @@ class Maker:
             if fault is None:
                 raise
             raise fault from error
+        return self._checked(env)
+
+    def _checked(self, env: Any) -> gymnasium.Env:
+        """Return what a class or function made as an environment that checks its contract."""
+        if isinstance(env, type):
+            raise SettingError(f"{self.name}: returned the class {env.__name__}, not an environment; call it")
         if not isinstance(env, gymnasium.Env):
             env = FourValueEnv(env)
+        for space in ("action_space", "observation_space"):
+            if not hasattr(env, space):
+                raise SettingError(f"{self.name}: {type(env).__name__} has no {space}")
         return checked(env)
 
     def _load(self, entry_point: str | Callable[..., Any]) -> Any:
