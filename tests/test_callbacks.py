@@ -302,7 +302,7 @@ def test_a_guarded_setting_of_a_callback_in_a_saved_config_needs_trust():
             ["callbacks=[{name:patience,evaluation:3}]"],
             "callbacks.0.evaluation: no such setting of Patience; did you mean ev",
         ),
-        (["callbacks=[{name:time_limit,minutes:0}]"], "callbacks.0.minutes=0: must be greater than 0 (TimeLimit, "),
+        (["callbacks=[{name:time_limit,minutes:0}]"], "callbacks.0.minutes=0: must be greater than 0 (TimeLimit)"),
         (["callbacks=[no_callback]"], "callback=no_callback: OrderedDict is no Callback (hpamdp.run.callbacks)"),
         (["callbacks=[no_class]"], "callbacks.0=no_class: conf/callback/no_class.yaml names no class as _target_"),
         (

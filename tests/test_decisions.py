@@ -190,13 +190,13 @@ def make_meta_critic() -> MetaCritic:
         ucb_width=2.0, gamma=GAMMA, buffer_size=5000, batch_size=64, updates_per_decision=0.15,
         max_updates=64, warmup_decisions=200, lr=3e-3, tau=0.05,
     )  # fmt: skip
-    return MetaCritic(PAMDPSpecs.from_env(Crossing()), torch.device("cpu"), **options)
+    return MetaCritic(PAMDPSpecs.from_env(Crossing()), device=torch.device("cpu"), **options)
 
 
 def make_actor() -> Actor:
     torch.manual_seed(0)
     options = dict(hidden_dims=[64], epochs=4, minibatch_size=128, clip=0.2, entropy=0.01, lr=3e-3, max_grad_norm=0.5)
-    return Actor(PAMDPSpecs.from_env(Crossing()), torch.device("cpu"), gamma=GAMMA, **options)
+    return Actor(PAMDPSpecs.from_env(Crossing()), device=torch.device("cpu"), gamma=GAMMA, **options)
 
 
 def test_meta_critic_chooses_options_of_a_fixed_length_optimally_and_better_than_for_whole_episodes():

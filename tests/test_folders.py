@@ -142,7 +142,7 @@ def test_an_evaluation_never_touches_the_record_of_a_run(tmp_path, command, caps
     code, _, err = command("mode=eval", "checkpoint=run", "hydra.run.dir=run", "hydra.output_subdir=.hydra")
     assert code == 2 and err.count("\n") == 1
     after = contents(tmp_path)
-    assert {name: after[name] for name in before} == before and {*after} - {*before} <= {"multirun.yaml"}
+    assert {name: after[name] for name in before} == before and {*after} - {*before} <= {"multirun.yaml", "report.csv"}
 
 
 def test_an_evaluation_may_replace_another_and_read_a_folder_that_it_cannot_write(tmp_path):

@@ -293,7 +293,9 @@ def test_the_middle_shots_are_no_slip_of_goal():
 
 def test_a_repair_of_the_middle_shots_is_refused_on_goal_in_one_line_and_made_on_hard_goal():
     words = ["high=none", "low=pdqn", "env.repaired=[middle_shots]"]
-    with pytest.raises(ConfigError, match=r'^env\.repaired\.0="middle_shots": must be .*goal\.yaml\)$'):
+    with pytest.raises(
+        ConfigError, match=r'^env\.repaired\.0="middle_shots": must be .* \(GoalEnv, given as an argument\)$'
+    ):
         make_config(["env=goal", *words])
     assert make_config(["env=hard_goal", *words]).env.build(num_envs=2).options.repaired == ("middle_shots",)
 

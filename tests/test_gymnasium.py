@@ -300,7 +300,10 @@ def mistake_in(**options) -> str:
         ({"id": "CartPole-v1"}, "CartPole-v1: action space Discrete(2): not of these forms; accepted are "),
         ({"id": "Toy-v0", "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
         ({"entry_point": TOY, "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
-        ({"id": "hpamdp/CatchPoint-v0", "kwargs": {"wide": 1}}, "hpamdp/CatchPoint-v0: wide=1: Extra inputs are not"),
+        (
+            {"id": "hpamdp/CatchPoint-v0", "kwargs": {"wide": 1}},
+            "hpamdp/CatchPoint-v0: wide: no such setting of CatchPointOptions",
+        ),
         ({"entry_point": "nowhere:Toy"}, "nowhere:Toy: No module named 'nowhere'"),
         ({"entry_point": "toy_environments:Nobody"}, "there is no class or function Nobody in toy_environments"),
         ({"entry_point": "toy_environments"}, "must be a class or function, as package.module:name"),

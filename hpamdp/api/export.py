@@ -71,7 +71,7 @@ class GreedyStep(nn.Module):
     def example(self) -> dict[str, Tensor]:
         """Return inputs of the right shapes, by name."""
         specs, num = self.specs, _EXAMPLE_ROWS
-        inputs = {keys.OBSERVATION: torch.zeros(num, specs.observation_dim)}
+        inputs = {keys.OBSERVATION: torch.zeros(num, specs.observation_dim, dtype=torch.float32)}
         if specs.has_action_mask:
             inputs[keys.ACTION_MASK] = torch.ones(num, specs.num_discrete, dtype=torch.bool)
         if specs.has_option_mask and self.option_actions is None:

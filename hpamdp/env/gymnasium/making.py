@@ -10,7 +10,6 @@ from collections.abc import Callable
 from typing import Any
 
 import gymnasium
-from pydantic import ValidationError
 
 from hpamdp.env.errors import ProblemError, fault_of
 from hpamdp.env.gymnasium.contract import checked
@@ -66,7 +65,9 @@ class Maker:
                     " This is a worker process; name the module that registers it, as module:Name-v0, or pass the class"
                 )
             raise SettingError(f"{self.name}: {one_line(error)}{cure}") from error
-        except (SettingError, ProblemError, MemoryError):
+        except SettingError as error:  # of a class with Options
+            raise SettingError(f"{self.name}: {error}") from error
+        except (ProblemError, MemoryError):
             raise
         except Exception as error:
             self._refuse_arguments(error, kwargs)
@@ -101,10 +102,6 @@ class Maker:
     def _refuse_arguments(self, error: Exception, kwargs: dict[str, Any]) -> None:
         """Raise a refusal if an error is about the arguments of the constructor."""
         cause = error.__cause__ or error  # Gymnasium raises a constructor's error again, from the original one
-        if isinstance(cause, ValidationError):  # a class with Options refuses a setting
-            wrong = cause.errors()[0]
-            given = "".join(f"{name}={wrong['input']}: " for name in wrong["loc"][:1])
-            raise SettingError(f"{self.name}: {given}{wrong['msg']}") from error
         # A constructor may pass unknown arguments on to another one, which then raises the error.
         is_unknown = any(f"unexpected keyword argument '{name}'" in str(cause) for name in kwargs)
         if isinstance(cause, TypeError | ValueError) and (is_unknown or _is_about_the_call(cause)):
