@@ -47,8 +47,8 @@ class PAMDPSpecs:
     has_option_mask: bool = False
     option_actions: tuple[tuple[bool, ...], ...] | None = None
     held_option: int | None = None
-    symmetries: Symmetries | None = field(default=None, compare=False)
-    geometry: PlaneGeometry | None = field(default=None, compare=False)
+    symmetries: Symmetries | None = field(default=None, compare=False, repr=False)
+    geometry: PlaneGeometry | None = field(default=None, compare=False, repr=False)
 
     @property
     def num_options(self) -> int:

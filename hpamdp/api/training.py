@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torchrl
 
 from hpamdp.api.agent import Agent
 from hpamdp.api.arguments import path_argument, problem_arguments, settings_words
@@ -157,14 +159,19 @@ def _own_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def _torch_restored() -> Iterator[None]:
-    """Compute gradients, and give torch back its threads and random numbers afterwards. A run sets its own."""
-    threads, generator = torch.get_num_threads(), torch.get_rng_state()
+    """Compute gradients, and give torch back its threads and random numbers afterwards. A run sets its own.
+
+    TorchRL would log every replay buffer that it fills.
+    """
+    threads, generator, level = torch.get_num_threads(), torch.get_rng_state(), torchrl.logger.level
+    torchrl.logger.setLevel(max(level, logging.WARNING))
     try:
         with torch.inference_mode(False), torch.enable_grad():
             yield
     finally:
         torch.set_num_threads(threads)
         torch.set_rng_state(generator)
+        torchrl.logger.setLevel(level)
 
 
 def load(
