@@ -199,8 +199,8 @@ class Agent:
         asked = {"episodes": episodes, "seed": seed}
         numbers = {name: int(value) if isinstance(value, np.integer) else value for name, value in asked.items()}
         checked = validated(_Asked, numbers, "", "argument", "hpamdp.Agent.evaluate")
-        told = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
-        evaluation = make_evaluation(config.with_run(eval=told, film=False), self._env)
+        numbers_of_evaluation = config.run.eval.model_copy(update={"layouts": checked.episodes, "seed": checked.seed})
+        evaluation = make_evaluation(config.with_run(eval=numbers_of_evaluation, film=False), self._env)
         try:
             played = evaluation.run(self.policy)
             return played if per_episode else evaluation.measure(played)
