@@ -256,7 +256,7 @@ class Site:
 
 
 def with_tables(text: str) -> str:
-    """Return the text of a page with the tables of its directives filled in anew, as a clone shows it."""
+    """Return the text of a page with the tables of its directives filled in, as a clone shows it."""
     return FILLED.sub(lambda found: f"{found[1]}{DIRECTIVES[found[2]](found[3])}\n<!-- /table -->\n", text)
 
 

@@ -88,10 +88,10 @@ def read(cfg: DictConfig, choices: Mapping[str, str] | None = None) -> Config:
 
 
 def _place_of(words: Sequence[str], names: Mapping[str, str], folders: Sequence[str], setting: str) -> str | None:
-    """Return where a setting was set: as an argument, or in the yaml file that comes last among those that name it.
+    """Return where a setting was set: as an argument, or in the last yaml file that names it.
 
     Args:
-        words: the words of the command line, or those that Python's arguments were turned into.
+        words: the words of the command line. Arguments of Python functions become such words, too.
         names: the name that was chosen for each group.
         folders: folders of yaml files besides conf/.
         setting: its name on the command line, such as `low.lr`.

@@ -134,7 +134,7 @@ def searching(folders: Sequence[str | Path], where: str = "config_dirs") -> list
     if isinstance(folders, str | Path):
         folders = [folders]
     if not isinstance(folders, list | tuple) or not all(isinstance(each, str | Path) and str(each) for each in folders):
-        raise ConfigError(f"config_dirs={folders!r:.80}: must be a list of folders")
+        raise ConfigError(f"{where}={folders!r:.80}: must be a list of folders")
     missing = [folder for folder in folders if not Path(folder).is_dir()]
     if missing:
         raise ConfigError(f"{where}: there is no folder {missing[0]}")

@@ -54,7 +54,7 @@ _ELSEWHERE: dict[str, tuple[str, ...]] = {
     "eval_freq": ("eval.every",),
     "n_eval_episodes": ("eval.layouts",),
 }
-# Those that are values of the run, which a group does not have.
+# Names that stand for values of the run, which a group does not have.
 _OF_RUN = ("steps_per_batch", "total_frames", "num_envs", "eval.every", "eval.layouts")
 # Old values whose meaning changed with the name.
 _NEW_VALUES: dict[tuple[str, Any], Any] = {("rl", "td3"): True, ("rl", "ddpg"): False}

@@ -302,7 +302,7 @@ class Trainer:
         self._saved = saved
 
     def _restore_callbacks(self, states: Mapping[str, Any]) -> None:
-        """Set the saved states of callbacks. A callback without a saved state starts anew.
+        """Set the saved states of callbacks. A callback without a saved state begins as in a new run.
 
         Raises:
             ValueError: a state is of another callback, or holds invalid numbers.
