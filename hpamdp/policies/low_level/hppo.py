@@ -38,6 +38,7 @@ from hpamdp.policies.shared.exported_policy import exported_actor
 from hpamdp.policies.shared.hybrid_actor import RAW, HybridActor, HybridDistribution, HybridPolicy, encoder
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
@@ -121,8 +122,9 @@ class HPPO(OnPolicy, Learner):
         super().__init__(specs)
         options = HPPOOptions.of(options, settings)
         self.options: HPPOOptions = options
+        self.perception = Perception(specs)
         self.actor = HybridActor(
-            specs,
+            self.perception.specs,
             options.hidden_dims,
             (options.min_scale, options.max_scale),
             options.initial_scale,
@@ -136,7 +138,9 @@ class HPPO(OnPolicy, Learner):
             nn.Linear(options.critic_hidden_dims[-1], 1, dtype=torch.float32),
         )
         samples = options.greedy_discrete == "sampled"
-        self.policy = HybridPolicy(self.actor, specs, writes_raw=True, samples_when_greedy=samples)
+        self.policy = HybridPolicy(
+            self.actor, specs, writes_raw=True, samples_when_greedy=samples, perception=self.perception
+        )
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.to(device)
         self.optimizer = torch.optim.Adam(self.parameters(), lr=options.lr, eps=1e-5, fused=True)
@@ -165,7 +169,8 @@ class HPPO(OnPolicy, Learner):
 
     def loss(self, rows: Mapping[str, Tensor], entropy_weight: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of actors and critic on a minibatch `[B]`, and scalars to log."""
-        distribution = self._distribution(rows)
+        features = self.features(rows)
+        distribution = self._distribution(features, rows)
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
         discrete_log_ratio = discrete_log_prob - rows["discrete_log_prob"]
         parameter_log_ratio = parameter_log_prob - rows["parameter_log_prob"]
@@ -173,7 +178,7 @@ class HPPO(OnPolicy, Learner):
         gain = (gain + self.surrogate(parameter_log_ratio, rows["advantage"])).mean()
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.options.discrete_entropy * discrete_entropy + self.options.parameter_entropy * parameter_entropy
-        critic_loss = F.mse_loss(self.critic(rows[keys.OBSERVATION]).squeeze(-1), rows["target"])
+        critic_loss = F.mse_loss(self.critic(features).squeeze(-1), rows["target"])
         loss = self.options.critic_weight * critic_loss - gain - entropy_weight * bonus
         return loss, {
             "critic": critic_loss,
@@ -203,7 +208,7 @@ class HPPO(OnPolicy, Learner):
         }
         if self.specs.has_action_mask:
             rows[keys.ACTION_MASK] = batch.get(keys.ACTION_MASK)[mask]
-        log_probs = self._distribution(rows).log_prob(rows["discrete"], rows[RAW])
+        log_probs = self._distribution(self.features(rows), rows).log_prob(rows["discrete"], rows[RAW])
         rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
         return TensorDict(rows, batch_size=[int(mask.sum())])
 
@@ -244,12 +249,17 @@ class HPPO(OnPolicy, Learner):
 
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return V(s), `[N]`."""
-        return self.critic(observation).squeeze(-1)
+        return self.critic(self.perception(observation)).squeeze(-1)
+
+    def features(self, rows: Mapping[str, Tensor]) -> Tensor:
+        """Return what actors and critic see of rows `[N]`, `[N, perception.specs.observation_dim]`."""
+        features: Tensor = self.perception(rows[keys.OBSERVATION])
+        return features
 
     def _own_values(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the values of the states and of the next states, `[*B, T, 1]`, 0 outside `mask`."""
         value = torch.zeros(*mask.shape, 1, device=mask.device, dtype=torch.float32)
-        value[mask] = self.critic(batch.get(keys.OBSERVATION)[mask])
+        value[mask] = self.value(batch.get(keys.OBSERVATION)[mask]).unsqueeze(-1)
         # The next state is that of the next row, except after the last row and where an episode is truncated.
         next_value = torch.zeros_like(value)
         next_value[..., :-1, :] = value[..., 1:, :]
@@ -257,7 +267,7 @@ class HPPO(OnPolicy, Learner):
         is_another = done.clone()
         is_another[..., -1] = True
         is_another &= mask & ~terminated
-        next_value[is_another] = self.critic(batch.get(("next", keys.OBSERVATION))[is_another])
+        next_value[is_another] = self.value(batch.get(("next", keys.OBSERVATION))[is_another]).unsqueeze(-1)
         return value, next_value
 
     def _value_under(self, option: Tensor, states: TensorDictBase) -> Tensor:
@@ -266,9 +276,9 @@ class HPPO(OnPolicy, Learner):
         masks = [states.get(keys.ACTION_MASK).flatten(0, -2)] if self.specs.has_action_mask else []
         return self.next_options.value(observation, option.flatten(), *masks).reshape(*option.shape, 1)
 
-    def _distribution(self, rows: Mapping[str, Tensor]) -> HybridDistribution:
+    def _distribution(self, features: Tensor, rows: Mapping[str, Tensor]) -> HybridDistribution:
         allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
-        distribution: HybridDistribution = self.actor(rows[keys.OBSERVATION], allowed)
+        distribution: HybridDistribution = self.actor(features, allowed)
         return distribution
 
     def compile_updates(self) -> None:
@@ -281,8 +291,10 @@ class HPPO(OnPolicy, Learner):
         self.descent.lower_precision()
 
     def exported(self) -> dict[str, Any] | None:
-        """Return the actor, unless it is to sample: see `hpamdp.policies.shared.exported_policy`."""
-        return None if self.policy.samples_when_greedy else exported_actor(self.policy.actor, self.specs)
+        """Return the actor, unless it samples or sees features: see `hpamdp.policies.shared.exported_policy`."""
+        if self.policy.samples_when_greedy or not self.perception.is_plain:
+            return None
+        return exported_actor(self.policy.actor, self.specs)
 
     def num_updates(self, steps: int) -> int:
         """Return the passes over this many steps, in minibatches."""

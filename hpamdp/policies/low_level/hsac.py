@@ -45,6 +45,7 @@ from hpamdp.policies.shared.networks import (
     mlp,
     polyak_update,
 )
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
@@ -113,10 +114,11 @@ class HSACPolicy(TensorDictModuleBase):
 
     is_random: Tensor
 
-    def __init__(self, actor: HSACActor, specs: PAMDPSpecs) -> None:
+    def __init__(self, actor: HSACActor, perception: Perception, specs: PAMDPSpecs) -> None:
         super().__init__()
-        self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
+        self.in_keys = perception.in_keys
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *perception.out_keys]
+        self.perception = perception
         self.actor = actor
         self.specs = specs
         self.register_buffer("is_random", torch.ones((), dtype=torch.bool))
@@ -124,9 +126,8 @@ class HSACPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
-        observation = td.get(keys.OBSERVATION)
-        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
-        distribution: HybridDistribution = self.actor(observation, allowed)
+        allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
+        distribution: HybridDistribution = self.actor(self.perception.see(td), allowed)
         if not is_greedy() and self.is_random:
             unit_parameters = 2.0 * torch.rand_like(distribution.mean) - 1.0
             discrete = random_choice(
@@ -160,8 +161,10 @@ class HSAC(ReplayLearner):
         super().__init__(specs, device, options)
         self.most_discrete_entropy = math.log(specs.num_discrete)
         self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
-        self.actor = HSACActor(specs, options)
-        self.critics = HybridCritics(specs, 2, options.hidden_dims, is_multipass=True)
+        self.perception = Perception(specs)
+        self.actor = HSACActor(self.perception.specs, options)
+        self.critics = HybridCritics(self.perception.specs, 2, options.hidden_dims, is_multipass=True)
+        self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_discrete_temperature = log_temperature(
             options.discrete_temperature, is_tuned=options.tune_discrete_temperature
@@ -169,13 +172,15 @@ class HSAC(ReplayLearner):
         self.log_parameter_temperature = log_temperature(
             options.parameter_temperature, is_tuned=options.tune_parameter_temperature
         )
-        self.policy = HSACPolicy(self.actor, specs)
+        self.policy = HSACPolicy(self.actor, self.perception, specs)
         self.to(device)
         temperatures = [self.log_discrete_temperature, self.log_parameter_temperature]
         self.tunes_temperatures = any(temperature.requires_grad for temperature in temperatures)
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
+            "critics": torch.optim.Adam(
+                [*self.critics.parameters(), *self.perception.parameters()], lr=options.critic_lr, fused=True
+            ),
             "temperatures": torch.optim.Adam(temperatures, lr=options.temperature_lr, fused=True),
         }
 
@@ -184,16 +189,17 @@ class HSAC(ReplayLearner):
         scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["discrete_temperature"], scalars["parameter_temperature"] = self.temperatures()
         if self.updates % self.options.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self.actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.gradient_step("actor", self.actor_loss, self.detached(sample), self.allowed(sample))
             if self.tunes_temperatures:
                 excesses = scalars["discrete_excess"], scalars["parameter_excess"]
                 self.gradient_step("temperatures", self.temperature_loss, *excesses)
         polyak_update(self.target_critics, self.critics, self.options.tau)
+        polyak_update(self.target_perception, self.perception, self.options.tau)
         return scalars
 
     def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the squared distance from r + discount V'(s'), and scalars."""
-        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
+        q = self.critics.of_discrete(self.features(sample), sample["discrete"], sample["unit"])
         loss = (q - self.target(sample)).square().mean(-1).sum()
         return loss, {"critic": loss, "q": q.mean()}
 
@@ -211,8 +217,9 @@ class HSAC(ReplayLearner):
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the soft value V'(s) by the target critics, `[B]`."""
-        value, _, _ = self.soft_value(self.target_critics, observation, self.specs.allowed(observation, action_mask))
+        """Return the soft value V'(s) by the target critics, `[B]`; the actor, too, sees the target's features."""
+        allowed = self.specs.allowed(observation, action_mask)
+        value, _, _ = self.soft_value(self.target_critics, self.target_perception(observation), allowed)
         return value
 
     def soft_value(
@@ -225,7 +232,7 @@ class HSAC(ReplayLearner):
 
         Args:
             critics: give Q.
-            state: `[B, observation_dim]`.
+            state: what actor and critics see, `[B, perception.specs.observation_dim]`.
             allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; if None, all.
         """
         discrete_weight, parameter_weight = self.temperatures()

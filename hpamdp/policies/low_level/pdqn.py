@@ -68,6 +68,7 @@ from hpamdp.policies.shared.networks import (
     unsquashed,
     with_clipped_noise,
 )
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import PositiveFraction
 from hpamdp.specs import PAMDPSpecs
@@ -161,10 +162,18 @@ class PDQNPolicy(TensorDictModuleBase):
     epsilon: Tensor
     variations: Tensor
 
-    def __init__(self, actor: ParameterActor, critics: HybridCritics, specs: PAMDPSpecs, options: PDQNOptions) -> None:
+    def __init__(
+        self,
+        actor: ParameterActor,
+        critics: HybridCritics,
+        perception: Perception,
+        specs: PAMDPSpecs,
+        options: PDQNOptions,
+    ) -> None:
         super().__init__()
-        self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.DISCRETE, keys.PARAMETERS]
+        self.in_keys = perception.in_keys
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *perception.out_keys]
+        self.perception = perception
         self.actor = actor
         self.critics = critics
         self.specs = specs
@@ -176,7 +185,7 @@ class PDQNPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
-        state = td.get(keys.OBSERVATION).reshape(-1, self.specs.observation_dim)
+        state = self.perception.see(td).reshape(-1, self.perception.specs.observation_dim)
         allowed = allowed_rows(self.specs, td)
         unit_parameters = self.actor(state)
         if is_greedy() and len(self.variations) > 0:
@@ -233,18 +242,23 @@ class PDQN(ReplayLearner):
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
 
         dims = options.hidden_dims
-        self.actor = ParameterActor(specs, dims, options.bounding, options.initial_parameters)
+        self.perception = Perception(specs)
+        seen = self.perception.specs
+        self.actor = ParameterActor(seen, dims, options.bounding, options.initial_parameters)
         self.critics = HybridCritics(
-            specs, 2 if options.twin else 1, dims, options.multipass, layer_norm=options.layer_norm
+            seen, 2 if options.twin else 1, dims, options.multipass, layer_norm=options.layer_norm
         )
+        self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
-        self.policy = PDQNPolicy(self.actor, self.critics, specs, options)
+        self.policy = PDQNPolicy(self.actor, self.critics, self.perception, specs, options)
         self.to(device)
         self.learning_rates = {"actor": options.actor_lr, "critics": options.critic_lr}
         self.optimizers = {
             "actor": torch.optim.Adam(self.actor.parameters(), lr=options.actor_lr, fused=True),
-            "critics": torch.optim.Adam(self.critics.parameters(), lr=options.critic_lr, fused=True),
+            "critics": torch.optim.Adam(
+                [*self.critics.parameters(), *self.perception.parameters()], lr=options.critic_lr, fused=True
+            ),
         }
 
     def update_once(self, sample: TensorDictBase) -> dict[str, Tensor]:
@@ -255,9 +269,10 @@ class PDQN(ReplayLearner):
         scalars = self.gradient_step("critics", self.critic_loss, sample)
         scalars["epsilon"] = self.policy.epsilon
         if self.updates % self.options.policy_delay == 0:
-            scalars |= self.gradient_step("actor", self.actor_loss, sample["state"], self.allowed(sample))
+            scalars |= self.gradient_step("actor", self.actor_loss, self.detached(sample), self.allowed(sample))
             polyak_update(self.target_actor, self.actor, self.options.actor_tau)
             polyak_update(self.target_critics, self.critics, self.options.critic_tau)
+            polyak_update(self.target_perception, self.perception, self.options.critic_tau)
         return scalars
 
     def critic_loss(self, sample: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
@@ -267,7 +282,7 @@ class PDQN(ReplayLearner):
         `[B]`, given a sample with `state`, `discrete`, `unit` (the executed parameters in [-1, 1]), `reward`,
         `next_state` and `discount`. `sample` also has the masks if the problem has any, and the options.
         """
-        q = self.critics.of_discrete(sample["state"], sample["discrete"], sample["unit"])
+        q = self.critics.of_discrete(self.features(sample), sample["discrete"], sample["unit"])
         loss = (q - self.target(sample)).square().mean(-1).sum()  # q is [num_critics, B]
         return loss, {"critic": loss, "q": q.mean()}
 
@@ -278,9 +293,12 @@ class PDQN(ReplayLearner):
         With `double_q`, the learned critics choose k instead of the target critics.
         """
         smoothing = self.options.target_smoothing, self.options.target_smoothing_clip
-        unit_parameters = with_clipped_noise(self.target_actor(observation), *smoothing)
-        q = self.target_critics(observation, unit_parameters).amin(0)
-        choosing_q = self.critics(observation, unit_parameters).amin(0) if self.options.double_q else q
+        state = self.target_perception(observation)
+        unit_parameters = with_clipped_noise(self.target_actor(state), *smoothing)
+        q = self.target_critics(state, unit_parameters).amin(0)
+        choosing_q = q
+        if self.options.double_q:
+            choosing_q = self.critics(self.perception(observation), unit_parameters).amin(0)
         choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
         return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
 
@@ -296,7 +314,7 @@ class PDQN(ReplayLearner):
         """Find for every discrete action the best of random parameters, by the critics.
 
         Args:
-            state: `[B, observation_dim]`.
+            state: what the networks see, `[B, perception.specs.observation_dim]`.
             raw: the actor's parameters there, before they are bounded, `[B, num_parameters]`.
             q: their values, `[B, num_discrete]`.
             allowed: the discrete actions that may be taken, bool `[B, num_discrete]`. If None, all.

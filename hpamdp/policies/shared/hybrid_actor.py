@@ -19,6 +19,7 @@ from hpamdp import keys
 from hpamdp.policies.base import is_greedy
 from hpamdp.policies.masks import masked_logits, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import Settings
 from hpamdp.specs import PAMDPSpecs
 
@@ -201,14 +202,22 @@ class HybridPolicy(TensorDictModuleBase):
         specs: sizes and bounds of the problem.
         writes_raw: whether to write the raw sample of the parameters as `RAW`, too.
         samples_when_greedy: whether to sample greedy discrete actions as well; their parameters are the means.
+        perception: what the actor sees of an observation. If None, the observation itself.
     """
 
     def __init__(
-        self, actor: HybridActor, specs: PAMDPSpecs, *, writes_raw: bool = False, samples_when_greedy: bool = False
+        self,
+        actor: HybridActor,
+        specs: PAMDPSpecs,
+        *,
+        writes_raw: bool = False,
+        samples_when_greedy: bool = False,
+        perception: Perception | None = None,
     ) -> None:
         super().__init__()
-        self.in_keys = [keys.OBSERVATION]
-        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *([RAW] if writes_raw else [])]
+        self.perception = Perception(specs) if perception is None else perception
+        self.in_keys = self.perception.in_keys
+        self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *([RAW] if writes_raw else []), *self.perception.out_keys]
         self.actor = actor
         self.specs = specs
         self.writes_raw = writes_raw
@@ -217,9 +226,8 @@ class HybridPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and maybe their raw sample, `[*B, num_parameters]` each."""
-        observation = td.get(keys.OBSERVATION)
-        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
-        distribution: HybridDistribution = self.actor(observation, allowed)
+        allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
+        distribution: HybridDistribution = self.actor(self.perception.see(td), allowed)
         if not is_greedy():
             discrete, raw = distribution.sample()
         elif self.samples_when_greedy:

@@ -125,8 +125,9 @@ def with_clipped_noise(unit_actions: Tensor, scale: float, clip: float) -> Tenso
 def polyak_update(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move a target network's parameters the fraction `tau` of the way towards the source network's."""
     targets, sources = tuple(target.parameters()), tuple(source.parameters())
-    with torch.no_grad():
-        torch._foreach_lerp_(targets, sources, tau)
+    if targets:  # a plain perception has none
+        with torch.no_grad():
+            torch._foreach_lerp_(targets, sources, tau)
 
 
 class VectorProducts(nn.Module):

@@ -17,6 +17,7 @@ from typing_extensions import Self
 from hpamdp import keys
 from hpamdp.policies.base import Learner
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
+from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.settings import PositiveFraction, Settings
 from hpamdp.specs import PAMDPSpecs
@@ -74,6 +75,8 @@ class ReplayLearner(Learner):
     The `target` of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
     Attributes:
+        perception: what the networks see of an observation. A learner whose networks see the observation itself need
+            not set it; others call `features` and `detached`.
         symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
         stores_own_parameters: true if the buffer holds only the parameters of the discrete action that was taken. This
             saves memory where there are many; samples then have 0 for the others.
@@ -92,6 +95,7 @@ class ReplayLearner(Learner):
 
     options: ReplayOptions
     optimizers: dict[str, torch.optim.Optimizer]
+    perception: Perception
     frames: Tensor
     updates: Tensor
     slots: Tensor
@@ -278,6 +282,16 @@ class ReplayLearner(Learner):
             option = self.next_options.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
             value[is_ended] = self.next_options.value(state, option, *(mask[is_ended] for mask in masks))
         return value
+
+    def features(self, sample: TensorDictBase) -> Tensor:
+        """Return what the networks see of a sample's states, `[B, perception.specs.observation_dim]`."""
+        features: Tensor = self.perception(sample["state"])
+        return features
+
+    @torch.no_grad()
+    def detached(self, sample: TensorDictBase) -> Tensor:
+        """Return `features` for an actor, whose loss does not train the perception."""
+        return self.features(sample)
 
     def allowed(self, sample: TensorDictBase) -> Tensor | None:
         """Return which discrete actions may be taken in a sample's states, bool `[B, num_discrete]`. If None, all."""
