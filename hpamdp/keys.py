@@ -11,7 +11,11 @@ OUTCOME = "outcome"  # how the episode ended, in an environment's own codes
 
 # Written by an environment that forbids some choices: the allowed choices in its current state.
 ACTION_MASK = "action_mask"  # discrete actions
+PAIR_MASK = "pair_mask"  # discrete actions of a later component, given one of an earlier component
 OPTION_MASK = "option_mask"  # options
+
+# Written by an environment whose parameters have other bounds in each state.
+PARAMETER_LOW, PARAMETER_HIGH = "parameter_low", "parameter_high"
 
 # Written by DecisionTracker.
 IS_DECISION = "is_decision"

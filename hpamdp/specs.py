@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TypeAlias
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.components import Components
 from hpamdp.geometry import PlaneGeometry, Symmetries
+
+# A step or a batch of steps, by name.
+Rows: TypeAlias = TensorDictBase | Mapping[str, Tensor]
 
 
 @dataclass(frozen=True)
@@ -22,10 +30,16 @@ class PAMDPSpecs:
         parameter_dims: number of parameters of each discrete action, `num_discrete` entries. The parameters of all
             actions lie side by side.
         parameter_low, parameter_high: bounds of all parameters, `sum(parameter_dims)` entries.
+        component_sizes: number of discrete actions of each component of the action, see `hpamdp.components`; empty if
+            the action is a single choice among all discrete actions.
+        integer_parameters: whether each parameter is a whole number; empty if none is.
+        has_parameter_bounds: whether the environment writes bounds of the current state, `parameter_low` and
+            `parameter_high`.
         initial_weight: rows `[num_parameters, observation_dim]` of the linear map from an observation to the published
             initial parameters in [-1, 1]; None if the problem has none.
         initial_bias: bias of this map, `num_parameters` entries.
         has_action_mask: whether the environment writes the allowed discrete actions, `action_mask`.
+        has_pair_mask: whether the environment writes which discrete actions go together, `pair_mask`.
         has_option_mask: whether the environment writes the allowed options, `option_mask`.
         option_actions: whether each option allows each discrete action, `num_options` rows of `num_discrete` entries;
             None if options are not sets of discrete actions.
@@ -41,9 +55,13 @@ class PAMDPSpecs:
     parameter_dims: tuple[int, ...]
     parameter_low: tuple[float, ...]
     parameter_high: tuple[float, ...]
+    component_sizes: tuple[int, ...] = ()
+    integer_parameters: tuple[bool, ...] = ()
+    has_parameter_bounds: bool = False
     initial_weight: tuple[tuple[float, ...], ...] | None = None
     initial_bias: tuple[float, ...] | None = None
     has_action_mask: bool = False
+    has_pair_mask: bool = False
     has_option_mask: bool = False
     option_actions: tuple[tuple[bool, ...], ...] | None = None
     held_option: int | None = None
@@ -57,8 +75,23 @@ class PAMDPSpecs:
 
     @property
     def num_discrete(self) -> int:
-        """Number of discrete actions."""
+        """Number of discrete actions, of all components together."""
         return len(self.parameter_dims)
+
+    @cached_property
+    def components(self) -> Components:
+        """The components of the action."""
+        return Components(self.component_sizes or (self.num_discrete,))
+
+    @property
+    def num_components(self) -> int:
+        """Number of components of the action."""
+        return len(self.components.sizes)
+
+    @property
+    def has_integers(self) -> bool:
+        """Whether a parameter is a whole number."""
+        return any(self.integer_parameters)
 
     @property
     def num_parameters(self) -> int:
@@ -83,16 +116,77 @@ class PAMDPSpecs:
         """
         return (~self.parameter_mask).to(torch.int8).argsort(dim=-1, stable=True)[:, : max(self.parameter_dims)]
 
-    def to_unit(self, parameters: Tensor) -> Tensor:
-        """Map parameters `[*B, num_parameters]` from their bounds to [-1, 1]."""
-        low, high = parameters.new_tensor(self.parameter_low), parameters.new_tensor(self.parameter_high)
-        return 2.0 * (parameters - low) / (high - low) - 1.0
+    def to_unit(self, parameters: Tensor, step: Rows | None = None) -> Tensor:
+        """Map parameters `[*B, num_parameters]` from their bounds to [-1, 1]; see `from_unit`.
 
-    def from_unit(self, unit_parameters: Tensor) -> Tensor:
-        """Map parameters `[*B, num_parameters]` from [-1, 1] to their bounds."""
-        low = unit_parameters.new_tensor(self.parameter_low)
-        high = unit_parameters.new_tensor(self.parameter_high)
-        return low + (unit_parameters + 1.0) * 0.5 * (high - low)
+        A parameter whose bounds are equal is mapped to 0.
+
+        Args:
+            parameters: the parameters.
+            step: holds the bounds of the state if `has_parameter_bounds`.
+        """
+        low, high = self._cell_bounds(parameters, step)
+        if not self.has_parameter_bounds:
+            return 2.0 * (parameters - low) / (high - low) - 1.0
+        is_free = high > low
+        width = torch.where(is_free, high - low, 1.0)
+        return torch.where(is_free, 2.0 * (parameters - low) / width - 1.0, 0.0).clamp(-1.0, 1.0)
+
+    def from_unit(self, unit_parameters: Tensor, step: Rows | None = None) -> Tensor:
+        """Map parameters `[*B, num_parameters]` from [-1, 1] to their bounds.
+
+        Whole numbers share [-1, 1] in cells of equal width, so that the smallest and the largest are as frequent as the
+        others; `to_unit` gives the middle of a cell.
+
+        Args:
+            unit_parameters: the parameters in [-1, 1].
+            step: holds the bounds of the state, `parameter_low` and `parameter_high`, if `has_parameter_bounds`. All
+                results lie within them.
+        """
+        low, high = self._cell_bounds(unit_parameters, step)
+        parameters = low + (unit_parameters + 1.0) * 0.5 * (high - low)
+        if not self.has_integers and not self.has_parameter_bounds:
+            return parameters
+        if self.has_integers:
+            parameters = torch.where(self._is_integer(parameters.device), parameters.round(), parameters)
+        return parameters.clamp(*self.bounds(unit_parameters, step))
+
+    def bounds(self, like: Tensor, step: Rows | None = None) -> tuple[Tensor, Tensor]:
+        """Return the smallest and the largest value of each parameter, `[num_parameters]`, or of a step, `[*B, ...]`.
+
+        Args:
+            like: a tensor of the type and on the device to use.
+            step: holds the bounds of the state if `has_parameter_bounds`.
+        """
+        if not self.has_parameter_bounds:
+            return like.new_tensor(self.parameter_low), like.new_tensor(self.parameter_high)
+        if step is None:
+            raise ValueError("the bounds of the parameters depend on the state: pass the step that holds them")
+        low, high = (step[name].to(like.dtype) for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH))
+        return low, high
+
+    def in_cells(self, unit_parameters: Tensor) -> Tensor:
+        """Return parameters `[*B, num_parameters]` in [-1, 1] with whole numbers in the middle of their cells.
+
+        The gradient passes as if nothing was changed (straight-through: Bengio, Leonard and Courville 2013, arXiv
+        1308.3432). If bounds depend on the state, the number of cells does, too, and nothing is changed.
+        """
+        if not self.has_integers or self.has_parameter_bounds:
+            return unit_parameters
+        centred = self.to_unit(self.from_unit(unit_parameters.detach()))
+        moved = torch.where(self._is_integer(centred.device), centred - unit_parameters.detach(), 0.0)
+        return unit_parameters + moved
+
+    def _cell_bounds(self, like: Tensor, step: Rows | None) -> tuple[Tensor, Tensor]:
+        """Return the bounds of the parameters, half a cell further apart on both sides for whole numbers."""
+        low, high = self.bounds(like, step)
+        if not self.has_integers:
+            return low, high
+        half = torch.where(self._is_integer(like.device), 0.5, 0.0).to(like.dtype)
+        return low - half, high + half
+
+    def _is_integer(self, device: torch.device) -> Tensor:
+        return torch.tensor(self.integer_parameters, device=device)
 
     def allowed(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor | None:
         """Return whether a learner may take each discrete action, bool `[*B, num_discrete]`; None if all are allowed.
@@ -184,19 +278,25 @@ class PAMDPSpecs:
         for name, misfit in misfits.items():
             if misfit:
                 raise ValueError(f"{name}: {misfit}")
-        has_action_mask = keys.ACTION_MASK in env.observation_spec_unbatched.keys()
-        if has_action_mask or env.option_actions is not None:
-            symmetries = None  # they do not say how masks, and options that are sets of actions, are mapped
+        observed = env.observation_spec_unbatched.keys()
+        has_action_mask = keys.ACTION_MASK in observed
+        has_parameter_bounds = keys.PARAMETER_LOW in observed
+        if has_action_mask or has_parameter_bounds or env.option_actions is not None or len(env.component_sizes) > 1:
+            symmetries = None  # they do not say how masks, bounds, components and sets of actions are mapped
         return cls(
             observation_dim=observation_dim,
             option_names=tuple(env.option_names) if keys.OPTION in action.keys() else (),
             parameter_dims=tuple(env.parameter_dims),
             parameter_low=tuple(parameters.space.low.flatten().tolist()),
             parameter_high=tuple(parameters.space.high.flatten().tolist()),
+            component_sizes=tuple(env.component_sizes) if len(env.component_sizes) > 1 else (),
+            integer_parameters=tuple(env.integer_parameters) if any(env.integer_parameters) else (),
+            has_parameter_bounds=has_parameter_bounds,
             initial_weight=weight,
             initial_bias=bias,
             has_action_mask=has_action_mask,
-            has_option_mask=keys.OPTION_MASK in env.observation_spec_unbatched.keys(),
+            has_pair_mask=keys.PAIR_MASK in observed,
+            has_option_mask=keys.OPTION_MASK in observed,
             option_actions=env.option_actions,
             symmetries=symmetries,
             geometry=geometry,

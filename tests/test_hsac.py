@@ -12,7 +12,7 @@ from toy_steps import SPECS, one_step_rows, sample, states
 
 from hpamdp import keys
 from hpamdp.policies.low_level.hsac import HSAC
-from hpamdp.policies.shared.hybrid_actor import HybridDistribution
+from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.specs import PAMDPSpecs
 
 OPTIONS = dict(
@@ -30,7 +30,7 @@ def make(specs: PAMDPSpecs = SPECS, **changes) -> HSAC:
 
 def soft_value_by_hand(learner: HSAC, critics: torch.nn.Module, state: torch.Tensor) -> float:
     """Return the value of a single state `[1, 4]` for the parameters sampled with the generator's current state."""
-    discrete_log_probs, mean, log_scale, _ = learner.actor(state)
+    discrete_log_probs, mean, log_scale, *_ = learner.actor(state)
     scale = log_scale.exp()
     raw = mean + scale * torch.randn_like(mean)
     pi, unit = discrete_log_probs.exp()[0], raw.tanh()[0].tolist()
@@ -60,10 +60,14 @@ def test_the_learner_finds_the_best_discrete_action_and_its_parameters():
 def test_densities_are_those_of_torchrls_squashed_gaussian_and_finite_at_the_bounds():
     mean, scale = torch.randn(64, 3), torch.rand(64, 3) + 0.1
     owner = SPECS.parameter_owner
-    unit, log_density = HybridDistribution(torch.zeros(64, 3), mean, scale.log(), owner).sample_squashed()
+    unit, log_density = HybridDistribution(
+        torch.zeros(64, 3), mean, scale.log(), owner, SPECS.components
+    ).sample_squashed()
     expected = TanhNormal(mean, scale, event_dims=0).log_prob(unit)
     torch.testing.assert_close(log_density, expected, rtol=1e-3, atol=1e-3)
-    far = HybridDistribution(torch.zeros(1, 3), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1).log(), owner)
+    far = HybridDistribution(
+        torch.zeros(1, 3), torch.full((1, 3), 50.0), torch.full((1, 3), 0.1).log(), owner, SPECS.components
+    )
     assert far.sample_squashed()[1].isfinite().all()
 
 

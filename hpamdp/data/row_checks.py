@@ -115,6 +115,9 @@ def check_actions(rows: TensorDictBase, specs: PAMDPSpecs) -> None:
     what = "the transitions"
     _check_length(what, rows, keys.PARAMETERS, specs.num_parameters)
     _check_lengths(what, rows, specs)
+    shape, expected = list(rows.get(keys.DISCRETE).shape[1:]), list(specs.components.shape)
+    if shape != expected:
+        raise DataError(f"{what}' {_dotted(keys.DISCRETE)} has shape {shape} a row, but must have {expected}")
     _check_rules(what, rows, _action_rules(rows, specs))
     if specs.num_options:
         check_options(what, rows, specs)
@@ -149,6 +152,8 @@ def _check_form(what: str, rows: TensorDict, required: dict[_Key, tuple[torch.dt
         if not isinstance(value, Tensor) or value.layout != torch.strided:
             raise DataError(f"{what}' {_dotted(name)} is of class {type(value).__name__}, but must be a tensor")
         shape = tuple(value.shape[1:])
+        if name == keys.DISCRETE and len(shape) == 1:  # an action of several components
+            rest = (None,)
         fits = len(shape) == len(rest) and all(size in (None, own) for size, own in zip(rest, shape, strict=True))
         if value.dtype != dtype or not fits:
             wanted = ", ".join(["N", *("D" if size is None else str(size) for size in rest)])
@@ -227,10 +232,15 @@ def _finite(rows: TensorDict, *names: _Key) -> Iterator[_Rule]:
 
 def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
     discrete = rows.get(keys.DISCRETE)
-    yield _Rule(keys.DISCRETE, _is_below(discrete, specs.num_discrete), f"0 to {specs.num_discrete - 1}")
+    components = specs.components
+    if components.is_single:
+        yield _Rule(keys.DISCRETE, _is_below(discrete, specs.num_discrete), f"0 to {specs.num_discrete - 1}")
+    else:
+        most = [f"0 to {size - 1}" for size in components.sizes]
+        yield _Rule(keys.DISCRETE, (discrete >= 0) & (discrete < discrete.new_tensor(components.sizes)), most)
     parameters = rows.get(keys.PARAMETERS)
     low, high = parameters.new_tensor(specs.parameter_low), parameters.new_tensor(specs.parameter_high)
-    is_own = specs.parameter_owner.to(discrete.device) == discrete.unsqueeze(-1)
+    is_own = components.is_chosen(discrete).index_select(-1, specs.parameter_owner.to(discrete.device))
     slack = 1e-5 * (high - low)  # for rounding
     is_inside = (parameters >= low - slack) & (parameters <= high + slack)
     bounds = [f"{low:.6g} to {high:.6g}" for low, high in zip(specs.parameter_low, specs.parameter_high, strict=True)]
@@ -239,11 +249,12 @@ def _action_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
     is_filled = is_inside | is_own | (parameters == 0.0)
     yield _Rule(keys.PARAMETERS, is_filled, [f"{each}, or 0 as it is another action's" for each in bounds])
     if specs.has_action_mask and keys.ACTION_MASK in rows.keys():
-        allowed = rows.get(keys.ACTION_MASK).gather(-1, discrete.unsqueeze(-1))
+        allowed = components.of_choice(rows.get(keys.ACTION_MASK), discrete)
+        allowed = allowed.unsqueeze(-1) if components.is_single else allowed
         yield _Rule(keys.DISCRETE, allowed, f"allowed by the row's {keys.ACTION_MASK}")
     if specs.has_action_mask and ("next", keys.ACTION_MASK) in rows.keys(True, True):
         mask = rows.get(("next", keys.ACTION_MASK))
-        has_one = mask.any(-1, keepdim=True) | rows.get(("next", keys.TERMINATED))
+        has_one = components.any_of_each(mask).unsqueeze(-1) | rows.get(("next", keys.TERMINATED))
         yield _Rule(("next", keys.ACTION_MASK), has_one.expand_as(mask), "true for at least one action")
 
 
@@ -252,7 +263,7 @@ def _option_rules(rows: TensorDictBase, specs: PAMDPSpecs) -> Iterator[_Rule]:
     yield _Rule(keys.OPTION, _is_below(option, specs.num_options), f"0 to {specs.num_options - 1}")
     if specs.option_actions is not None and keys.DISCRETE in rows.keys(True, True):
         of_options = torch.tensor(specs.option_actions, device=option.device)
-        allowed = of_options[option].gather(-1, rows.get(keys.DISCRETE).unsqueeze(-1))
+        allowed = of_options[option].gather(-1, specs.components.places(rows.get(keys.DISCRETE)))
         yield _Rule(keys.DISCRETE, allowed, "an action of the row's option")
     if specs.has_option_mask and keys.OPTION_MASK in rows.keys():
         is_free = rows.get(keys.OPTION_MASK).gather(-1, option.unsqueeze(-1))

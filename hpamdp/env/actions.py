@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from hpamdp.components import Components
 from hpamdp.messages import invalid_action
 
 
@@ -15,31 +16,37 @@ def check_action_values(
     parameters: Tensor,
     parameter_dims: Sequence[int],
     *,
+    components: Components | None = None,
     names: tuple[str, str] = ("discrete", "parameters"),
 ) -> None:
     """Check that each discrete action exists and that its own parameters are finite.
 
     Args:
-        discrete: integers `[N]`.
+        discrete: integers `[N]`, or `[N, num_components]`.
         parameters: float `[N, sum(parameter_dims)]`, the parameters of all discrete actions side by side.
         parameter_dims: number of parameters of each discrete action.
+        components: of the action; if None, there is one.
         names: what the error calls `discrete` and `parameters`.
 
     Raises:
         ValueError: an action is invalid; the message names the first such environment.
     """
-    num_discrete = len(parameter_dims)
-    indices = torch.arange(num_discrete, device=discrete.device)
-    owner = indices.repeat_interleave(torch.tensor(parameter_dims, device=discrete.device))
-    is_own = owner == discrete.unsqueeze(-1)
-    is_valid = (discrete >= 0) & (discrete < num_discrete) & (parameters.isfinite() | ~is_own).all(-1)
+    components = Components((len(parameter_dims),)) if components is None else components
+    device = discrete.device
+    owner = torch.arange(len(parameter_dims), device=device)
+    owner = owner.repeat_interleave(torch.tensor(parameter_dims, device=device))
+    sizes = components.sizes[0] if components.is_single else torch.tensor(components.sizes, device=device)
+    exists = ((discrete >= 0) & (discrete < sizes)).reshape(len(discrete), -1).all(-1)
+    is_own = components.is_chosen(discrete).index_select(-1, owner)
+    is_valid = exists & (parameters.isfinite() | ~is_own).all(-1)
     if not is_valid.all():
         row = int((~is_valid).nonzero()[0])
         discrete_name, parameters_name = names
+        allowed = " and ".join(f"0 to {size - 1}" for size in components.sizes)
         raise invalid_action(
             row,
             {
-                discrete_name: (discrete[row].item(), f"allowed 0 to {num_discrete - 1}"),
+                discrete_name: (discrete[row].tolist(), f"allowed {allowed}"),
                 parameters_name: (parameters[row].tolist(), "those of the chosen action must be finite"),
             },
         )

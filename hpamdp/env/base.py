@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Categorical, Composite
+from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategorical
 from torchrl.envs import EnvBase
 
 from hpamdp import keys
+from hpamdp.components import Components
 from hpamdp.env.errors import ProblemError as ProblemError  # part of what a problem may use
 from hpamdp.env.facts import ProblemFacts
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorForm
@@ -55,6 +56,11 @@ class PAMDPEnv(EnvBase):
     - if the agent chooses options, the action leaf `option` int64 `[N]`;
     - if some choices are forbidden at times, `action_mask` bool `[N, num_discrete]` and `option_mask` bool
       `[N, num_options]` beside the observation: what may be chosen in the current state;
+    - if the action has several components, see `hpamdp.components`: `("action", "discrete")` int64
+      `[N, num_components]`. If the choice in one forbids discrete actions of later ones, `pair_mask` bool
+      `[N, num_discrete, num_discrete]` beside the observation: whether the column's action may follow the row's;
+    - if parameters have other bounds in each state, `parameter_low` and `parameter_high` float32 `[N, num_parameters]`
+      beside the observation, within the bounds of the spec;
     - `reward`, `done`, `terminated`, `truncated` `[N, 1]`; a time limit is `truncated` only.
 
     A step does not change an episode that is over, and its reward is 0.
@@ -69,6 +75,8 @@ class PAMDPEnv(EnvBase):
     can_change_option: bool = True  # whether an option may end before its episode
     plans_change_options: bool = False  # whether the planned actions under `oracle` count on that
     parameter_dims: tuple[int, ...]  # number of parameters of each discrete action
+    component_sizes: tuple[int, ...] = ()  # number of discrete actions of each component; empty: one component
+    integer_parameters: tuple[bool, ...] = ()  # whether each parameter is a whole number; empty: none is
     max_steps: int  # steps of the longest episode
     result_keys: tuple[str, ...] = ()  # leaves of an episode's last step that `results` reads
 
@@ -134,7 +142,10 @@ class PAMDPEnv(EnvBase):
             if not actions:
                 raise ValueError(f"option {name} allows no action; name at least one")
             numbers = {self._number_of_action(action) for action in actions}
-            rows.append(tuple(number in numbers for number in range(num_discrete)))
+            row = [number in numbers for number in range(num_discrete)]
+            if not self.components.any_of_each(torch.tensor(row)):
+                raise ValueError(f"option {name} allows no action of some component; name at least one of each")
+            rows.append(tuple(row))
         self.option_names = tuple(options)
         self.option_actions = tuple(rows)
         n, device = self.batch_size, self.device
@@ -165,13 +176,18 @@ class PAMDPEnv(EnvBase):
             mask = tensordict.get(name, None)
             if mask is None:
                 continue
-            is_empty = ~mask.any(-1)
+            is_empty = ~(mask.any(-1) if name == keys.OPTION_MASK else self.components.any_of_each(mask))
             is_stuck = is_empty & ~tensordict.get(keys.DONE).squeeze(-1)
             if is_stuck.any():
                 row = int(is_stuck.nonzero()[0])
                 raise ProblemError(f"{self.title}: environment {row} gave an {name} that allows nothing")
             tensordict.set(name, mask | is_empty.unsqueeze(-1))
         return tensordict
+
+    @property
+    def components(self) -> Components:
+        """The components of the action."""
+        return Components(tuple(self.component_sizes) or (len(self.parameter_dims),))
 
     @property
     def has_choice(self) -> bool:
@@ -351,8 +367,11 @@ class PAMDPEnv(EnvBase):
         self.option_names = checked_option_names(self.option_names)
         n, device = self.batch_size, self.device
         low, high = (side.to(device, torch.float32).expand(*n, -1) for side in (low, high))
+        components = self.components
         action = Composite(
-            discrete=Categorical(len(self.parameter_dims), shape=n, device=device),
+            discrete=Categorical(components.sizes[0], shape=n, device=device)
+            if components.is_single
+            else MultiCategorical(components.sizes, shape=(*n, *components.shape), device=device),
             parameters=Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device),
             shape=n,
         )
@@ -381,7 +400,7 @@ class PAMDPEnv(EnvBase):
             ValueError: a leaf is missing, or has another shape or type.
         """
         size = self.batch_size
-        self._check_leaf(tensordict, keys.DISCRETE, size, is_integer=True)
+        self._check_leaf(tensordict, keys.DISCRETE, (*size, *self.components.shape), is_integer=True)
         self._check_leaf(tensordict, keys.PARAMETERS, (*size, sum(self.parameter_dims)), is_integer=False)
         if self.has_choice:
             self._check_leaf(tensordict, keys.OPTION, size, is_integer=True)
@@ -389,14 +408,18 @@ class PAMDPEnv(EnvBase):
             self._check_option(tensordict.get(keys.OPTION), tensordict.get(keys.DISCRETE))
 
     def _check_option(self, option: Tensor, discrete: Tensor) -> None:
-        """Refuse an option that does not exist, and an action that its option does not allow, `[N]` each."""
-        num_options, num_discrete = self._allowed_by_option.shape
-        exists = (option >= 0) & (option < num_options) & (discrete >= 0) & (discrete < num_discrete)
-        is_valid = exists & self._allowed_by_option[torch.where(exists, option, 0), torch.where(exists, discrete, 0)]
+        """Refuse an option that does not exist, `[N]`, and an action `[N, ...]` that its option does not allow."""
+        components = self.components
+        sizes = components.sizes[0] if components.is_single else torch.tensor(components.sizes, device=discrete.device)
+        is_action = ((discrete >= 0) & (discrete < sizes)).reshape(len(option), -1).all(-1)
+        exists = (option >= 0) & (option < len(self._allowed_by_option)) & is_action
+        places = components.places(torch.where(is_action.reshape(-1, *[1] * (discrete.ndim - 1)), discrete, 0))
+        allowed = self._allowed_by_option[torch.where(exists, option, 0)].gather(-1, places)
+        is_valid = exists & allowed.all(-1)
         if is_valid.all():
             return
         row = int((~is_valid).nonzero()[0])
-        given = f"option={option[row].item()}, discrete={discrete[row].item()}"
+        given = f"option={option[row].item()}, discrete={discrete[row].tolist()}"
         listed = (
             f"{name}: {[number for number, is_allowed in enumerate(allowed) if is_allowed]}"
             for name, allowed in zip(self.option_names, self._allowed_by_option.tolist(), strict=True)

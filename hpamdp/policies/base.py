@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from enum import Enum
 from typing import Any, ClassVar, Protocol
 
 import torch
@@ -15,7 +16,16 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from hpamdp import keys
 from hpamdp.policies.masks import random_choice
 from hpamdp.policies.stored_rows import check_stored_rows
+from hpamdp.settings import SettingError
 from hpamdp.specs import PAMDPSpecs
+
+
+class ActionFeature(Enum):
+    """What an action may have beyond one choice with bounded parameters, and how refusals call it."""
+
+    COMPONENTS = "an action of several components"
+    PAIR_MASK = "a pair_mask, which forbids pairs of discrete actions"
+    PARAMETER_BOUNDS = "bounds of the parameters that depend on the state"
 
 
 def is_greedy() -> bool:
@@ -387,6 +397,9 @@ class Learner(Level, nn.Module):
         policy: the module that acts.
         modes: what the learner can learn from: transitions that the agent collects (`train`), or a data set
             (`offline`, for `mode=offline` and for `data=...` with `mode=train`).
+        takes: what actions may have that the learner knows how to handle. Problems with anything else are refused. With
+            several components, see `hpamdp.components`; with `PARAMETER_BOUNDS`, hand the step to `specs.from_unit` and
+            `specs.to_unit`.
         value_setting: setting that must be true for `value` to work. If None, `value` always works.
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
             counters. They start afresh if a new run takes over the learner.
@@ -395,6 +408,7 @@ class Learner(Level, nn.Module):
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train",)
+    takes: ClassVar[frozenset[ActionFeature]] = frozenset()
     value_setting: ClassVar[str | None] = None
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 
@@ -405,6 +419,16 @@ class Learner(Level, nn.Module):
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.specs = specs
+        present = {
+            ActionFeature.COMPONENTS: not specs.components.is_single,
+            ActionFeature.PAIR_MASK: specs.has_pair_mask,
+            ActionFeature.PARAMETER_BOUNDS: specs.has_parameter_bounds,
+        }
+        for feature, is_present in present.items():
+            if is_present and feature not in self.takes:
+                raise SettingError(
+                    f"{type(self).__name__} cannot learn {feature.value}; hppo, for example, can (docs/spaces.md)"
+                )
 
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the values `[N]` of states `[N, observation_dim]` from which this learner would bootstrap.

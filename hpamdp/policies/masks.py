@@ -39,6 +39,23 @@ def random_choice(shape: torch.Size, num: int, mask: Tensor | None, device: torc
     return sample_index(masked_logits(torch.zeros_like(mask, dtype=torch.float32), mask))
 
 
+def random_discrete(specs: PAMDPSpecs, shape: torch.Size, mask: Tensor | None, device: torch.device) -> Tensor:
+    """Return uniformly random discrete actions, int64 `[*shape]`, or `[*shape, num_components]`.
+
+    Args:
+        specs: of the problem.
+        shape: of the states.
+        mask: the discrete actions that may be taken, bool `[*shape, num_discrete]`; if None, all.
+        device: where to draw.
+    """
+    components = specs.components
+    if components.is_single:
+        return random_choice(shape, specs.num_discrete, mask, device)
+    parts = [None] * len(components.sizes) if mask is None else mask.split(components.sizes, -1)
+    drawn = [random_choice(shape, size, part, device) for size, part in zip(components.sizes, parts, strict=True)]
+    return torch.stack(drawn, -1)
+
+
 def allowed_or_first(choice: Tensor, mask: Tensor) -> Tensor:
     """Return the choices `[*B]`, or the first allowed choice where one is forbidden."""
     is_allowed = mask.gather(-1, choice.unsqueeze(-1)).squeeze(-1)

@@ -15,13 +15,15 @@ from pydantic import Field, NonNegativeFloat, PositiveInt
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy, ScaleOptions
+from hpamdp.policies.base import ActionFeature
+from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
+from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, HybridPolicy, ScaleOptions
 from hpamdp.policies.shared.replay import BufferOptions, ReplayLearner, ReplayOptions
 from hpamdp.settings import LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
-class BCOptions(ScaleOptions, BufferOptions):
+class BCOptions(HeadOptions, ScaleOptions, BufferOptions):
     """Settings of `BC`."""
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
@@ -41,6 +43,7 @@ class BC(ReplayLearner):
 
     Options = BCOptions
     stores_own_parameters = True
+    takes = frozenset(ActionFeature)
     modes: ClassVar[tuple[str, ...]] = ("offline",)
 
     def __init__(
@@ -55,7 +58,9 @@ class BC(ReplayLearner):
         # A data set alone fills the buffer, so there is no warm-up.
         sizes = ReplayOptions(buffer_size=options.buffer_size, batch_size=options.batch_size, warmup_steps=0)
         super().__init__(specs, device, sizes)
-        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range)
+        self.actor = (AutoregressiveActor if options.autoregressive else HybridActor)(
+            specs, options.hidden_dims, options.scale_range
+        )
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
         optimizer = torch.optim.AdamW(
@@ -69,7 +74,9 @@ class BC(ReplayLearner):
 
     def loss(self, sample: TensorDictBase, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the negative log-likelihood of the data's actions, and scalars."""
-        distribution: HybridDistribution = self.actor(sample["state"], allowed)
-        discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
+        discrete, unit_parameters = sample["discrete"], sample["unit"]
+        distribution = self.actor.given(sample["state"], discrete, unit_parameters, allowed, self.pairs(sample))
+        log_probs = distribution.log_prob(discrete, unit_parameters)
+        discrete_log_prob, parameter_log_prob = (self.specs.components.total(each) for each in log_probs)
         scalars = {"discrete_log_prob": discrete_log_prob.mean(), "parameter_log_prob": parameter_log_prob.mean()}
         return -(discrete_log_prob + parameter_log_prob).mean(), scalars

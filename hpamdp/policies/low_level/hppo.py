@@ -32,10 +32,12 @@ from torchrl.objectives.value.functional import generalized_advantage_estimate
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
+from hpamdp.policies.base import ActionFeature, Learner
+from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.default_dtype import float32_by_default
 from hpamdp.policies.shared.exported_policy import exported_actor
-from hpamdp.policies.shared.hybrid_actor import RAW, HybridActor, HybridDistribution, HybridPolicy, encoder
+from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, HybridPolicy, encoder
+from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
 from hpamdp.policies.shared.perception import Perception
@@ -43,7 +45,7 @@ from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
-class HPPOOptions(OnPolicyOptions):
+class HPPOOptions(HeadOptions, OnPolicyOptions):
     """Settings of `HPPO`. Standard deviations are in units where the parameters' bounds are [-1, 1]."""
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
@@ -108,6 +110,7 @@ class HPPO(OnPolicy, Learner):
     """Clipped policy-gradient updates of both actors from the steps just collected."""
 
     Options = HPPOOptions
+    takes = frozenset(ActionFeature)
 
     frames: Tensor
 
@@ -123,7 +126,8 @@ class HPPO(OnPolicy, Learner):
         options = HPPOOptions.of(options, settings)
         self.options: HPPOOptions = options
         self.perception = Perception(specs)
-        self.actor = HybridActor(
+        actor = AutoregressiveActor if options.autoregressive else HybridActor
+        self.actor = actor(
             self.perception.specs,
             options.hidden_dims,
             (options.min_scale, options.max_scale),
@@ -174,8 +178,11 @@ class HPPO(OnPolicy, Learner):
         discrete_log_prob, parameter_log_prob = distribution.log_prob(rows["discrete"], rows[RAW])
         discrete_log_ratio = discrete_log_prob - rows["discrete_log_prob"]
         parameter_log_ratio = parameter_log_prob - rows["parameter_log_prob"]
-        gain = self.surrogate(discrete_log_ratio, rows["advantage"])
-        gain = (gain + self.surrogate(parameter_log_ratio, rows["advantage"])).mean()
+        advantage = rows["advantage"]
+        if not self.specs.components.is_single:
+            advantage = advantage.unsqueeze(-1)
+        gain = self.surrogate(discrete_log_ratio, advantage) + self.surrogate(parameter_log_ratio, advantage)
+        gain = self.specs.components.total(gain).mean()
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.options.discrete_entropy * discrete_entropy + self.options.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(features).squeeze(-1), rows["target"])
@@ -208,6 +215,8 @@ class HPPO(OnPolicy, Learner):
         }
         if self.specs.has_action_mask:
             rows[keys.ACTION_MASK] = batch.get(keys.ACTION_MASK)[mask]
+        if self.specs.has_pair_mask:
+            rows[keys.PAIR_MASK] = batch.get(keys.PAIR_MASK)[mask]
         log_probs = self._distribution(self.features(rows), rows).log_prob(rows["discrete"], rows[RAW])
         rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
         return TensorDict(rows, batch_size=[int(mask.sum())])
@@ -215,12 +224,15 @@ class HPPO(OnPolicy, Learner):
     def empty_rows(self) -> dict[str, Tensor]:
         """Return the columns of `rows`."""
         number = torch.zeros(0, dtype=torch.float32)
-        names = ("advantage", "target", "discrete_log_prob", "parameter_log_prob")
+        choice = torch.zeros(0, *self.specs.components.shape, dtype=torch.float32)
         columns = {keys.OBSERVATION: torch.zeros(0, self.specs.observation_dim, dtype=torch.float32)}
         columns[RAW] = torch.zeros(0, self.specs.num_parameters, dtype=torch.float32)
-        columns |= {"discrete": number.long(), **dict.fromkeys(names, number)}
+        columns |= {"discrete": choice.long(), "advantage": number, "target": number}
+        columns |= {"discrete_log_prob": choice, "parameter_log_prob": choice}
         if self.specs.has_action_mask:
             columns[keys.ACTION_MASK] = torch.zeros(0, self.specs.num_discrete, dtype=torch.bool)
+        if self.specs.has_pair_mask:
+            columns[keys.PAIR_MASK] = torch.zeros(0, *[self.specs.num_discrete] * 2, dtype=torch.bool)
         return columns
 
     @torch.no_grad()
@@ -278,8 +290,8 @@ class HPPO(OnPolicy, Learner):
 
     def _distribution(self, features: Tensor, rows: Mapping[str, Tensor]) -> HybridDistribution:
         allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
-        distribution: HybridDistribution = self.actor(features, allowed)
-        return distribution
+        pair_mask = rows.get(keys.PAIR_MASK, None)
+        return self.actor.given(features, rows["discrete"], rows[RAW], allowed, pair_mask)
 
     def compile_updates(self) -> None:
         """Compile the loss and its gradient, at the first update."""

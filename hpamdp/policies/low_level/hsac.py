@@ -13,6 +13,10 @@ Differs from the source:
 - Each temperature has a target entropy: a fraction of the uniform distribution's for the discrete action, and nats for
   each parameter of the executed action. So actions with more parameters, or none, need no target of their own.
 - The actor and the temperatures may be updated less often than the critics, as in TD3 (arXiv 1802.09477).
+- If an action has several components, the expectation over all discrete actions would be a sum over their products. The
+  soft value is then the mean of `component_samples` actions, whose values come from critics of the action as a whole.
+  The discrete heads get a policy gradient with the other samples' mean as its baseline (Kool, van Hoof and Welling
+  2019, *Buy 4 REINFORCE Samples, Get a Baseline for Free!*), the parameters a gradient through the critics.
 
 TorchRL's SACLoss does not fit: it sums the log-probabilities of all action leaves under one temperature. Its
 DiscreteSACLoss has no parameters, and the expectation over discrete actions here also weighs their log-densities.
@@ -33,14 +37,17 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
-from hpamdp.policies.masks import masked_logits, random_choice
+from hpamdp.policies.base import ActionFeature, is_greedy
+from hpamdp.policies.masks import masked_logits, random_discrete
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
-from hpamdp.policies.shared.hybrid_actor import HybridDistribution, ScaleOptions
+from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
+from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, ScaleOptions
+from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, log_slope_of_tanh
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
     InitialParameters,
+    JointCritics,
     as_preactivations,
     mlp,
     polyak_update,
@@ -51,7 +58,7 @@ from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 
-class HSACOptions(ActorCriticOptions, TargetRateOptions, ScaleOptions):
+class HSACOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOptions):
     """Settings of `HSAC`."""
 
     batch_size: PositiveInt = 256
@@ -79,6 +86,8 @@ class HSACOptions(ActorCriticOptions, TargetRateOptions, ScaleOptions):
     """Learning rate of the temperatures."""
     policy_delay: PositiveInt = 2
     """Critic updates for each update of the actor and the temperatures."""
+    component_samples: Annotated[int, Field(ge=2, le=64)] = 4
+    """Sampled actions in the soft value of a state, if an action has several components."""
 
 
 class HSACActor(nn.Module):
@@ -88,6 +97,7 @@ class HSACActor(nn.Module):
 
     def __init__(self, specs: PAMDPSpecs, options: HSACOptions) -> None:
         super().__init__()
+        self.components = specs.components
         self.sizes = [specs.num_discrete, specs.num_parameters, specs.num_parameters]
         self.log_min_scale, self.log_max_scale = (math.log(scale) for scale in options.scale_range)
         self.net = mlp(specs.observation_dim, options.hidden_dims, sum(self.sizes))
@@ -106,7 +116,15 @@ class HSACActor(nn.Module):
         logits, mean, raw_scale = as_preactivations(self.net(state)).split(self.sizes, -1)
         mean = mean + self.initial(state)
         log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
-        return HybridDistribution(masked_logits(logits, mask).log_softmax(-1), mean, log_scale, self.owner)
+        log_probs = masked_logits(logits, mask).log_softmax(-1)
+        return HybridDistribution(log_probs, mean, log_scale, self.owner, self.components)
+
+    def act(
+        self, draw: Draw, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor, HybridDistribution]:
+        """Return an action and the distribution that it comes from, as `HybridActor.act` does."""
+        distribution: HybridDistribution = self(observation, mask)
+        return *draw(distribution), distribution
 
 
 class HSACPolicy(TensorDictModuleBase):
@@ -114,7 +132,7 @@ class HSACPolicy(TensorDictModuleBase):
 
     is_random: Tensor
 
-    def __init__(self, actor: HSACActor, perception: Perception, specs: PAMDPSpecs) -> None:
+    def __init__(self, actor: HSACActor | HybridActor, perception: Perception, specs: PAMDPSpecs) -> None:
         super().__init__()
         self.in_keys = perception.in_keys
         self.out_keys = [keys.DISCRETE, keys.PARAMETERS, *perception.out_keys]
@@ -126,23 +144,27 @@ class HSACPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]` and the parameters `[*B, num_parameters]`."""
-        allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
-        distribution: HybridDistribution = self.actor(self.perception.see(td), allowed)
+        observation = td.get(keys.OBSERVATION)
+        allowed = self.specs.allowed(observation, td.get(keys.ACTION_MASK, None))
+        features = self.perception.see(td)
         if not is_greedy() and self.is_random:
-            unit_parameters = 2.0 * torch.rand_like(distribution.mean) - 1.0
-            discrete = random_choice(
-                unit_parameters.shape[:-1], self.specs.num_discrete, allowed, unit_parameters.device
-            )
+            shape, device = observation.shape[:-1], observation.device
+            unit_parameters = torch.rand(*shape, self.specs.num_parameters, device=device, dtype=torch.float32)
+            unit_parameters = 2.0 * unit_parameters - 1.0
+            discrete = random_discrete(self.specs, shape, allowed, device)
         else:
-            discrete, raw = distribution.mode() if is_greedy() else distribution.sample()
+            draw = HybridDistribution.mode if is_greedy() else HybridDistribution.sample
+            discrete, raw, _ = self.actor.act(draw, features, allowed, None)
             unit_parameters = raw.tanh()
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit_parameters)}})
+        parameters = self.specs.from_unit(unit_parameters, td)
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
 
 class HSAC(ReplayLearner):
     """Soft policy iteration over discrete actions and their parameters, from a replay buffer of its own."""
 
     Options = HSACOptions
+    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
     stores_own_parameters = True
 
     options: HSACOptions
@@ -159,11 +181,15 @@ class HSAC(ReplayLearner):
     ) -> None:
         options = HSACOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.most_discrete_entropy = math.log(specs.num_discrete)
+        self.most_discrete_entropy = sum(math.log(size) for size in specs.components.sizes)
         self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
         self.perception = Perception(specs)
-        self.actor = HSACActor(self.perception.specs, options)
-        self.critics = HybridCritics(self.perception.specs, 2, options.hidden_dims, is_multipass=True)
+        self.actor = make_actor(self.perception.specs, options)
+        self.critics: HybridCritics | JointCritics = (
+            HybridCritics(self.perception.specs, 2, options.hidden_dims, is_multipass=True)
+            if isinstance(self.actor, HSACActor)
+            else JointCritics(self.perception.specs, 2, options.hidden_dims)
+        )
         self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_discrete_temperature = log_temperature(
@@ -223,7 +249,7 @@ class HSAC(ReplayLearner):
         return value
 
     def soft_value(
-        self, critics: HybridCritics, state: Tensor, allowed: Tensor | None = None
+        self, critics: HybridCritics | JointCritics, state: Tensor, allowed: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the soft value V of states `[B, observation_dim]`, and both entropies minus their targets, each `[B]`.
 
@@ -235,6 +261,8 @@ class HSAC(ReplayLearner):
             state: what actor and critics see, `[B, perception.specs.observation_dim]`.
             allowed: the discrete actions that may be taken, bool `[B, num_discrete]`; if None, all.
         """
+        if isinstance(critics, JointCritics):
+            return self.sampled_soft_value(critics, state, allowed)
         discrete_weight, parameter_weight = self.temperatures()
         distribution: HybridDistribution = self.actor(state, allowed)
         unit_parameters, log_density = distribution.sample_squashed()
@@ -249,6 +277,38 @@ class HSAC(ReplayLearner):
         parameter_excess = -(probs * (own_log_density + own_target)).sum(-1)
         return (probs * q).sum(-1), discrete_excess, parameter_excess
 
+    def sampled_soft_value(
+        self, critics: JointCritics, state: Tensor, allowed: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the same as `soft_value`, from samples of actions with several components.
+
+        The gradient of the value is that of its expectation; its number is the mean of the samples.
+        """
+        num = self.options.component_samples
+        discrete_weight, parameter_weight = self.temperatures()
+        repeated = state.repeat_interleave(num, 0)
+        mask = None if allowed is None else allowed.repeat_interleave(num, 0)
+        discrete, raw, distribution = self.actor.act(HybridDistribution.sample, repeated, mask, None)
+        components = self.specs.components
+        discrete_log_prob, raw_log_prob = (components.total(each) for each in distribution.log_prob(discrete, raw))
+        is_own = components.is_chosen(discrete).index_select(-1, self.owner)
+        parameter_log_prob = raw_log_prob - (log_slope_of_tanh(raw) * is_own).sum(-1)
+        q = critics.of_discrete(repeated, discrete, raw.tanh()).amin(0)
+        value = q - discrete_weight * discrete_log_prob - parameter_weight * parameter_log_prob
+        each = value.detach().unflatten(0, (-1, num))
+        baseline = (each.sum(-1, keepdim=True) - each) / (num - 1)
+        score = discrete_log_prob * (each - baseline).flatten()
+        value = value + score - score.detach()
+        most_entropy: Tensor | float = self.most_discrete_entropy
+        if mask is not None:
+            most_entropy = torch.stack([part.sum(-1) for part in mask.split(components.sizes, -1)], -1).log().sum(-1)
+        num_own = (self.parameter_dims * components.is_chosen(discrete)).sum(-1)
+        discrete_excess = -discrete_log_prob - self.options.discrete_target_entropy * most_entropy
+        parameter_excess = -parameter_log_prob - self.options.parameter_target_entropy * num_own
+        parts = (part.unflatten(0, (-1, num)).mean(-1) for part in (value, discrete_excess, parameter_excess))
+        value, discrete_excess, parameter_excess = parts
+        return value, discrete_excess, parameter_excess
+
     def temperatures(self) -> tuple[Tensor, Tensor]:
         """Return the weights of the discrete entropy and of the parameters' entropy, without gradients."""
         return self.log_discrete_temperature.detach().exp(), self.log_parameter_temperature.detach().exp()
@@ -256,6 +316,16 @@ class HSAC(ReplayLearner):
     def on_progress(self, steps: int) -> None:
         """Explore with the actor from the end of the warm-up on."""
         self.policy.is_random.fill_(False)
+
+
+def make_actor(specs: PAMDPSpecs, options: HSACOptions) -> HSACActor | HybridActor:
+    """Return the actor for one component, or for several, which may see each other."""
+    if specs.components.is_single and not options.autoregressive:
+        return HSACActor(specs, options)
+    settings: dict[str, Any] = {"initial_parameters": options.initial_parameters, "has_values": False}
+    if options.autoregressive:
+        return AutoregressiveActor(specs, options.hidden_dims, options.scale_range, bound=torch.tanh, **settings)
+    return HybridActor(specs, options.hidden_dims, options.scale_range, **settings)
 
 
 def log_temperature(initial: float, *, is_tuned: bool) -> nn.Parameter:

@@ -54,7 +54,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.policies.base import ActionFeature, is_greedy
 from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
 from hpamdp.policies.shared.actor_critic import TargetRateOptions, set_learning_rates
 from hpamdp.policies.shared.actor_search import (
@@ -347,7 +347,8 @@ class HyARPolicy(TensorDictModuleBase):
             latent = torch.where(is_random, torch.nan, latent)
         td.set(LATENT, latent.reshape(*td.batch_size, -1))
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
-        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters).reshape(*td.batch_size, -1))
+        unit_parameters = unit_parameters.reshape((*td.batch_size, self.specs.num_parameters))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters, td))
 
     def _best_variations(self, state: Tensor, proposals: Tensor) -> tuple[Tensor, Tensor]:
         """Return the best of each proposal `[B, P, embedding_dim + latent_dim]` and its variations, and its value."""
@@ -377,6 +378,7 @@ class HyAR(ReplayLearner):
     """TD3 or DDPG over the latent actions of a HybridCodec, trained off-policy from a replay buffer of its own."""
 
     Options = HyAROptions
+    takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no latent actions
     may_be_nan: ClassVar[frozenset[str]] = frozenset({LATENT})
 

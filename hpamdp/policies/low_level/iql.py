@@ -25,16 +25,18 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 
+from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions
+from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.gradients import expectile_loss
-from hpamdp.policies.shared.hybrid_actor import HybridActor, HybridDistribution, HybridPolicy, ScaleOptions
-from hpamdp.policies.shared.networks import HybridCritics, mlp, polyak_update
+from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, HybridPolicy, ScaleOptions
+from hpamdp.policies.shared.networks import HybridCritics, JointCritics, mlp, polyak_update
 from hpamdp.policies.shared.replay import ReplayLearner
 from hpamdp.settings import Expectile, LearningRate, PositiveFraction, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
-class IQLOptions(ActorCriticOptions, TargetRateOptions, ScaleOptions):
+class IQLOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOptions):
     """Settings of `IQL`."""
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
@@ -59,6 +61,7 @@ class IQL(ReplayLearner):
     """Twin critics, a state value and an advantage-weighted policy, from a data set or a replay buffer."""
 
     Options = IQLOptions
+    takes = frozenset(ActionFeature)
     stores_own_parameters = True
 
     options: IQLOptions
@@ -73,9 +76,14 @@ class IQL(ReplayLearner):
     ) -> None:
         options = IQLOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.actor = HybridActor(specs, options.hidden_dims, options.scale_range)
+        actor = AutoregressiveActor if options.autoregressive else HybridActor
+        self.actor = actor(specs, options.hidden_dims, options.scale_range)
         self.state_value = mlp(specs.observation_dim, options.hidden_dims, 1)
-        self.critics = HybridCritics(specs, 2, options.hidden_dims, is_multipass=True)
+        self.critics = (
+            HybridCritics(specs, 2, options.hidden_dims, is_multipass=True)
+            if specs.components.is_single
+            else JointCritics(specs, 2, options.hidden_dims)
+        )
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = HybridPolicy(self.actor, specs)
         self.to(device)
@@ -111,8 +119,10 @@ class IQL(ReplayLearner):
         with torch.no_grad():
             advantage = q - self.value(sample["state"])
             weight = (self.options.temperature * advantage).exp().clamp(max=self.options.max_weight)
-        distribution: HybridDistribution = self.actor(sample["state"], allowed)
-        discrete_log_prob, parameter_log_prob = distribution.log_prob(sample["discrete"], sample["unit"])
+        discrete, unit_parameters = sample["discrete"], sample["unit"]
+        distribution = self.actor.given(sample["state"], discrete, unit_parameters, allowed, self.pairs(sample))
+        log_probs = distribution.log_prob(discrete, unit_parameters)
+        discrete_log_prob, parameter_log_prob = (self.specs.components.total(each) for each in log_probs)
         loss = -(weight * (discrete_log_prob + parameter_log_prob)).mean()
         return loss, {"advantage_weight": weight.mean()}
 

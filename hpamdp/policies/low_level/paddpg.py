@@ -31,7 +31,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.policies.base import ActionFeature, is_greedy
 from hpamdp.policies.masks import masked_values
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOptions, TwinCriticOptions
 from hpamdp.policies.shared.exploration import EpsilonOptions, linear_schedule, with_exploring_noise
@@ -80,6 +80,7 @@ class PADDPGActor(nn.Module):
 
     def __init__(self, specs: PAMDPSpecs, options: PADDPGOptions) -> None:
         super().__init__()
+        self.specs = specs
         self.num_discrete = specs.num_discrete
         self.net = mlp(specs.observation_dim, options.hidden_dims, specs.num_discrete + specs.num_parameters)
         self.initial = InitialLayer(specs, options.initial_parameters, is_squashed=False)
@@ -88,7 +89,11 @@ class PADDPGActor(nn.Module):
     def forward(self, state: Tensor) -> Tensor:
         """Return what the actor outputs, clipped; its gradients are inverted."""
         scores, parameters = self.net(state).tensor_split([self.num_discrete], -1)
-        return InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1))
+        output = InvertingGradients.apply(torch.cat([scores, parameters + self.initial(state)], -1))
+        if not self.specs.has_integers:
+            return output
+        scores, parameters = output.tensor_split([self.num_discrete], -1)
+        return torch.cat([scores, self.specs.in_cells(parameters)], -1)
 
 
 def with_lowest_scores(output: Tensor, allowed: Tensor | None) -> Tensor:
@@ -129,8 +134,8 @@ class PADDPGPolicy(TensorDictModuleBase):
             noisy = with_exploring_noise(output, self.noise)
             output = torch.where(is_random, 2.0 * torch.rand_like(output) - 1.0, noisy)
         scores, unit_parameters = with_lowest_scores(output, allowed).tensor_split([self.specs.num_discrete], -1)
-        discrete = masked_values(scores, allowed).argmax(-1)
-        action = {"discrete": discrete, "parameters": self.specs.from_unit(unit_parameters)}
+        discrete = self.specs.components.best(masked_values(scores, allowed))
+        action = {"discrete": discrete, "parameters": self.specs.from_unit(unit_parameters, td)}
         return td.update({keys.ACTION: action, SCORES: scores})
 
 
@@ -140,6 +145,7 @@ class PADDPG(ReplayLearner):
     modes: ClassVar[tuple[str, ...]] = ("train",)  # a data set holds no scores
 
     Options = PADDPGOptions
+    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
     options: PADDPGOptions
     policy: PADDPGPolicy
 

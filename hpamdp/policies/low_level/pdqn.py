@@ -46,8 +46,8 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy, option_ends
-from hpamdp.policies.masks import allowed_rows, masked_values, random_choice
+from hpamdp.policies.base import ActionFeature, is_greedy, option_ends
+from hpamdp.policies.masks import allowed_rows, masked_values, random_discrete
 from hpamdp.policies.shared.actor_critic import set_learning_rates
 from hpamdp.policies.shared.actor_search import (
     SearchingActorOptions,
@@ -191,16 +191,19 @@ class PDQNPolicy(TensorDictModuleBase):
         if is_greedy() and len(self.variations) > 0:
             discrete, unit_parameters = self._best_variation(state, unit_parameters, allowed)
         else:
-            discrete = masked_values(self.critics(state, unit_parameters).amin(0), allowed).argmax(-1)
+            values = masked_values(self.critics(state, unit_parameters).amin(0), allowed)
+            discrete = self.specs.components.best(values)
         if not is_greedy():
-            is_random = torch.rand(discrete.shape, device=discrete.device, dtype=torch.float32) < self.epsilon
+            is_random = torch.rand(len(discrete), device=discrete.device, dtype=torch.float32) < self.epsilon
             noisy = with_exploring_noise(unit_parameters, self.noise)
             random_parameters = 2.0 * torch.rand_like(unit_parameters) - 1.0
             unit_parameters = torch.where(is_random.unsqueeze(-1), random_parameters, noisy)
-            random_discrete = random_choice(discrete.shape, self.specs.num_discrete, allowed, discrete.device)
-            discrete = torch.where(is_random, random_discrete, discrete)
-        td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
-        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters).reshape(*td.batch_size, -1))
+            random_actions = random_discrete(self.specs, is_random.shape, allowed, discrete.device)
+            is_random = is_random.reshape(-1, *[1] * (discrete.ndim - 1))
+            discrete = torch.where(is_random, random_actions, discrete)
+        td.set(keys.DISCRETE, discrete.reshape((*td.batch_size, *discrete.shape[1:])))
+        unit_parameters = unit_parameters.reshape((*td.batch_size, self.specs.num_parameters))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters, td))
 
     def _best_variation(self, state: Tensor, unit_parameters: Tensor, allowed: Tensor | None) -> tuple[Tensor, Tensor]:
         """Return the discrete actions `[B]` and the parameters `[B, P]` that are best among x(s) and its variations."""
@@ -211,16 +214,21 @@ class PDQNPolicy(TensorDictModuleBase):
             return best_of_candidates(self.critics, some_states, with_variations(some_parameters, self.variations))
 
         best_values, best_indices = in_pieces(best_of, num_rows, state, unit_parameters)
-        discrete = masked_values(best_values, allowed).argmax(-1)
-        best_index = best_indices.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
-        no_variation = torch.zeros_like(self.variations[:1])
-        return discrete, (unit_parameters + torch.cat([no_variation, self.variations])[best_index]).clamp(-1.0, 1.0)
+        discrete = self.specs.components.best(masked_values(best_values, allowed))
+        variations = torch.cat([torch.zeros_like(self.variations[:1]), self.variations])
+        if self.specs.components.is_single:
+            best_index = best_indices.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
+            variation = variations[best_index]
+        else:  # each discrete action's parameters from its own best candidate
+            variation = variations.gather(0, best_indices.index_select(-1, self.critics.owner))
+        return discrete, (unit_parameters + variation).clamp(-1.0, 1.0)
 
 
 class PDQN(ReplayLearner):
     """Q-learning over discrete actions and gradient ascent on their parameters, from a replay buffer of its own."""
 
     Options = PDQNOptions
+    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
 
     options: PDQNOptions
     policy: PDQNPolicy
@@ -236,7 +244,7 @@ class PDQN(ReplayLearner):
     ) -> None:
         options = PDQNOptions.of(options, settings)
         super().__init__(specs, device, options)
-        self.stores_own_parameters = options.multipass
+        self.stores_own_parameters = options.multipass and specs.components.is_single
         self.reward_scale = options.reward_scale
         self.max_grad_norm = options.max_grad_norm
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
@@ -288,7 +296,7 @@ class PDQN(ReplayLearner):
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`.
+        """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`; the sum over the components.
 
         With `double_q`, the learned critics choose k instead of the target critics.
         """
@@ -300,7 +308,8 @@ class PDQN(ReplayLearner):
         if self.options.double_q:
             choosing_q = self.critics(self.perception(observation), unit_parameters).amin(0)
         choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
-        return q.gather(-1, choosing_q.argmax(-1, keepdim=True)).squeeze(-1)
+        components = self.specs.components
+        return components.total(components.of_choice(q, components.best(choosing_q)))
 
     def actor_loss(self, state: Tensor, allowed: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return minus the sum of the allowed discrete actions' values; only the actor gets its gradient."""

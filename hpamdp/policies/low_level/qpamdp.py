@@ -40,7 +40,7 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner, is_greedy, option_ends
+from hpamdp.policies.base import ActionFeature, Learner, is_greedy, option_ends
 from hpamdp.policies.low_level.qpamdp_features import FourierBasis, num_fourier_features
 from hpamdp.policies.masks import masked_logits, masked_values, sample_index
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters
@@ -202,7 +202,7 @@ class QPAMDPPolicy(TensorDictModuleBase, SizedByData):
         discrete = sample_index(q / self.temperature) if is_exploring and self.samples_discrete else q.argmax(-1)
         if is_exploring:
             raw = raw + self.sigma * torch.randn_like(raw)
-        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
+        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0), td)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}, RAW: raw})
 
 
@@ -391,6 +391,7 @@ class QPAMDP(Learner):
     """
 
     Options = QPAMDPOptions
+    takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     # A run from `low.checkpoint` goes on in the saved phase: a second warm-up would fit other bases under the weights.
     progress: ClassVar[frozenset[str]] = frozenset()
 

@@ -7,8 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from hpamdp import keys
-from hpamdp.policies.base import Learner
-from hpamdp.policies.masks import random_choice
+from hpamdp.policies.base import ActionFeature, Learner
+from hpamdp.policies.masks import random_discrete
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -28,12 +28,15 @@ class RandomPolicy(TensorDictModuleBase):
             2.0 * torch.rand(*td.batch_size, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
         )
         allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
-        discrete = random_choice(td.batch_size, self.specs.num_discrete, allowed, device)
-        return td.update({keys.ACTION: {"discrete": discrete, "parameters": self.specs.from_unit(unit_parameters)}})
+        discrete = random_discrete(self.specs, td.batch_size, allowed, device)
+        parameters = self.specs.from_unit(unit_parameters, td)
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
 
 class Random(Learner):
     """Acts at random and learns nothing."""
+
+    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
 
     def __init__(self, specs: PAMDPSpecs) -> None:
         super().__init__(specs)

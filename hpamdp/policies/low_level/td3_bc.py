@@ -29,7 +29,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy
+from hpamdp.policies.base import ActionFeature, is_greedy
 from hpamdp.policies.masks import allowed_rows, masked_logits
 from hpamdp.policies.shared.actor_critic import ActorCriticOptions, SmoothedTargetOptions, TargetRateOptions
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
@@ -120,13 +120,15 @@ class TD3BCPolicy(TensorDictModuleBase):
         if not is_greedy():
             unit_parameters = with_exploring_noise(unit_parameters, self.parameter_noise)
         td.set(keys.DISCRETE, discrete.reshape(td.batch_size))
-        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters).reshape(*td.batch_size, -1))
+        unit_parameters = unit_parameters.reshape((*td.batch_size, self.specs.num_parameters))
+        return td.set(keys.PARAMETERS, self.specs.from_unit(unit_parameters, td))
 
 
 class TD3BC(ReplayLearner):
     """Q-learning on the data's discrete actions with parameters near the data's, from a data set or a replay buffer."""
 
     Options = TD3BCOptions
+    takes = frozenset({ActionFeature.PARAMETER_BOUNDS})
     stores_own_parameters = True
 
     options: TD3BCOptions

@@ -24,8 +24,13 @@ from hpamdp.specs import PAMDPSpecs
 
 
 def exported_actor(actor: HybridActor, specs: PAMDPSpecs) -> dict[str, Any] | None:
-    """Return a `hybrid_actor`; None if it has initial parameters or products of vectors, which the form lacks."""
-    if actor.initial.exists or actor.products is not None:
+    """Return a `hybrid_actor`; None if the actor has something that the form lacks.
+
+    The form lacks initial parameters, products of vectors, several components, whole numbers and bounds that depend on
+    the state.
+    """
+    lacks_action = not specs.components.is_single or specs.has_integers or specs.has_parameter_bounds
+    if lacks_action or actor.initial.exists or actor.products is not None or type(actor) is not HybridActor:
         return None
     num, head = specs.num_parameters, actor.parameter_head
     return {

@@ -5,105 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import ClassVar
 
 import torch
 from pydantic import PositiveFloat, model_validator
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torch.nn import functional as F
 from typing_extensions import Self
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.masks import masked_logits, sample_index
+from hpamdp.policies.masks import masked_logits
+from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, ValuePlaces
 from hpamdp.policies.shared.networks import InitialLayer, InitialParameters, VectorProducts
 from hpamdp.policies.shared.perception import Perception
-from hpamdp.settings import Settings
+from hpamdp.settings import SettingError, Settings
 from hpamdp.specs import PAMDPSpecs
 
 # The raw sample of the parameters, which a learner needs for its likelihood.
 RAW = "raw_parameters"
 
 
-class HybridDistribution(NamedTuple):
-    """A categorical over the discrete actions and a Gaussian for all their parameters.
+class HeadOptions(Settings):
+    """How the components of an action depend on each other."""
 
-    Raw parameters are samples of the Gaussian in units where the bounds are [-1, 1]. There are two ways to bring them
-    within the bounds:
-
-    - clipped: the learner keeps the raw sample, whose likelihood is `log_prob`, and clips it only for execution;
-    - squashed by tanh: `sample_squashed` returns parameters within the bounds and their log-densities, and gradients
-      flow through both.
-
-    Attributes:
-        discrete_log_probs: log-probabilities of the discrete actions, `[*B, num_discrete]`.
-        mean: of the raw parameters, `[*B, num_parameters]`.
-        log_scale: logarithm of their standard deviation, `[*B, num_parameters]`.
-        owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
-    """
-
-    discrete_log_probs: Tensor
-    mean: Tensor
-    log_scale: Tensor
-    owner: Tensor
-
-    def sample(self) -> tuple[Tensor, Tensor]:
-        """Sample discrete actions `[*B]` and the raw parameters of all of them, `[*B, num_parameters]`."""
-        discrete = sample_index(self.discrete_log_probs)
-        return discrete, self.mean + self.log_scale.exp() * torch.randn_like(self.mean)
-
-    def mode(self) -> tuple[Tensor, Tensor]:
-        """Return the most probable discrete action `[*B]` and the mean raw parameters `[*B, num_parameters]`."""
-        return self.discrete_log_probs.argmax(-1), self.mean
-
-    def sample_discrete(self) -> tuple[Tensor, Tensor]:
-        """Sample discrete actions `[*B]`, with the mean raw parameters `[*B, num_parameters]`."""
-        return sample_index(self.discrete_log_probs), self.mean
-
-    def sample_squashed(self) -> tuple[Tensor, Tensor]:
-        """Sample squashed parameters in [-1, 1]; return them and their log-densities, each `[*B, num_parameters]`.
-
-        The density is computed from the sample before squashing, which keeps it exact at the bounds.
-        """
-        scale = self.log_scale.exp()
-        noise = torch.randn_like(self.mean)
-        raw = self.mean + scale * noise
-        squashed = raw.tanh()
-        # log(1 - tanh(raw)^2), without loss of precision for large |raw|.
-        log_slope = 2.0 * (math.log(2.0) - raw - F.softplus(-2.0 * raw))
-        # scale.log(), not log_scale: the density of the scale as it was rounded for the sample.
-        return squashed, gaussian_log_density(noise, scale.log()) - log_slope
-
-    def log_prob(self, discrete: Tensor, raw: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the log-likelihoods of the discrete actions and of their own raw parameters.
-
-        Args:
-            discrete: `[*B]`.
-            raw: `[*B, num_parameters]`; the parameters of the other discrete actions are ignored.
-
-        Returns:
-            Two tensors `[*B]`; the second is 0 for a discrete action without parameters.
-        """
-        discrete_log_prob = self.discrete_log_probs.gather(-1, discrete.unsqueeze(-1)).squeeze(-1)
-        log_density = gaussian_log_density((raw - self.mean) / self.log_scale.exp(), self.log_scale)
-        return discrete_log_prob, (log_density * (self.owner == discrete.unsqueeze(-1))).sum(-1)
-
-    def entropy(self) -> tuple[Tensor, Tensor]:
-        """Return the entropy of the discrete action and the expected entropy of its own raw parameters, each `[*B]`."""
-        probs = self.discrete_log_probs.exp()
-        discrete_entropy = -(probs * self.discrete_log_probs).sum(-1)
-        gaussian_entropy = self.log_scale + 0.5 * math.log(2 * math.pi * math.e)
-        return discrete_entropy, (probs.index_select(-1, self.owner) * gaussian_entropy).sum(-1)
-
-    def sum_of_own(self, values: Tensor) -> Tensor:
-        """Return the sums over each discrete action's own parameters, `[*B, num_discrete]`, of values of all of them.
-
-        Args:
-            values: `[*B, num_parameters]`.
-        """
-        return torch.zeros_like(self.discrete_log_probs).index_add(-1, self.owner, values)
+    autoregressive: bool = False
+    """Let each component of an action see what the components before it chose; else they are independent in a state."""
 
 
 class ScaleOptions(Settings):
@@ -129,6 +57,8 @@ class ScaleOptions(Settings):
 class HybridActor(nn.Module):
     """A discrete head and a parameter head on one encoder, nearly uniform and centred at initialisation.
 
+    Given the state, the components of an action are independent.
+
     Args:
         specs: sizes and bounds of the problem.
         hidden_dims: sizes of the encoder's layers.
@@ -136,11 +66,19 @@ class HybridActor(nn.Module):
         initial_scale: standard deviation at initialisation, strictly within `scale_range`; if None, its geometric mean.
         initial_parameters: `domain`: the means start at the problem's initial parameters, if it has any.
         vector_products: whether the encoder also sees `VectorProducts`.
+        has_values: whether parameters with at most `MAX_VALUES` whole numbers have a categorical.
 
     Attributes:
         products: appends these products to observations; None if there are none.
         num_inputs: how many numbers the encoder sees.
+        values: places and numbers of values of the parameters with a categorical; None if there are none.
+        takes_pairs: whether it heeds a `pair_mask`.
+
+    Raises:
+        SettingError: the problem has a `pair_mask`, which the actor cannot heed.
     """
+
+    takes_pairs: ClassVar[bool] = False
 
     log_min_scale: Tensor
     owner: Tensor
@@ -154,26 +92,41 @@ class HybridActor(nn.Module):
         initial_parameters: InitialParameters = "none",
         *,
         vector_products: bool = False,
+        has_values: bool = True,
     ) -> None:
         super().__init__()
+        if specs.has_pair_mask and not self.takes_pairs:
+            raise SettingError(
+                "autoregressive=false: the problem forbids pairs of discrete actions (pair_mask), which independent "
+                "heads cannot heed; use autoregressive=true"
+            )
+        self.components = specs.components
         self.initial = InitialLayer(specs, initial_parameters, is_squashed=False)
         self.products = VectorProducts(specs) if vector_products else None
         self.num_inputs = specs.observation_dim if self.products is None else self.products.num_outputs
         self.encoder = encoder(self.num_inputs, hidden_dims)
-        self.discrete_head = nn.Linear(hidden_dims[-1], specs.num_discrete, dtype=torch.float32)
-        self.parameter_head = nn.Linear(hidden_dims[-1], 2 * specs.num_parameters, dtype=torch.float32)
         log_min_scale, log_max_scale = (math.log(scale) for scale in scale_range)
-        self.register_buffer("log_min_scale", torch.tensor(log_min_scale, dtype=torch.float32))
         self.log_max_scale = log_max_scale
+        self.values = ValuePlaces.of(specs) if has_values else None
         if initial_scale is None:
             initial_scale = (scale_range[0] * scale_range[1]) ** 0.5
         fraction = (math.log(initial_scale) - log_min_scale) / (log_max_scale - log_min_scale)
-        with torch.no_grad():
-            for head in (self.discrete_head, self.parameter_head):
-                head.weight.mul_(0.01)
-                head.bias.zero_()
-            self.parameter_head.bias[specs.num_parameters :] = math.log(fraction / (1.0 - fraction))
+        self.make_heads(specs, hidden_dims[-1], math.log(fraction / (1.0 - fraction)))
+        self.register_buffer("log_min_scale", torch.tensor(log_min_scale, dtype=torch.float32))
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
+
+    def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
+        """Make the heads on an encoder's output of this width; their deviations start at sigmoid(raw_scale)."""
+        self.discrete_head = nn.Linear(width, specs.num_discrete, dtype=torch.float32)
+        self.parameter_head = nn.Linear(width, 2 * specs.num_parameters, dtype=torch.float32)
+        heads = [self.discrete_head, self.parameter_head]
+        if self.values is not None:
+            self.value_head = nn.Linear(width, self.values.num_logits, dtype=torch.float32)
+            heads.append(self.value_head)
+        for head in heads:
+            make_small(head)
+        with torch.no_grad():
+            self.parameter_head.bias[specs.num_parameters :] = raw_scale
 
     def forward(self, observation: Tensor, mask: Tensor | None = None) -> HybridDistribution:
         """Return the distribution of the action for observations `[*B, observation_dim]`.
@@ -182,12 +135,50 @@ class HybridActor(nn.Module):
             observation: of the states.
             mask: the discrete actions that may be taken, bool `[*B, num_discrete]`; if None, all.
         """
-        hidden = self.encoder(observation if self.products is None else self.products(observation))
+        hidden = self.hidden(observation)
         mean, raw_scale = self.parameter_head(hidden).chunk(2, -1)
         mean = mean + self.initial(observation)
-        log_scale = self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
         logits = masked_logits(self.discrete_head(hidden), mask)
-        return HybridDistribution(logits.log_softmax(-1), mean, log_scale, self.owner)
+        values = None if self.values is None else self.values.distribution(self.value_head(hidden))
+        log_probs = self.components.log_softmax(logits)
+        return HybridDistribution(log_probs, mean, self.log_scale(raw_scale), self.owner, self.components, values)
+
+    def hidden(self, observation: Tensor) -> Tensor:
+        """Return the encoder's output for observations `[*B, observation_dim]`."""
+        return self.encoder(observation if self.products is None else self.products(observation))
+
+    def log_scale(self, raw_scale: Tensor) -> Tensor:
+        """Return the logarithms of standard deviations, of a head's outputs."""
+        return self.log_min_scale + (self.log_max_scale - self.log_min_scale) * raw_scale.sigmoid()
+
+    def given(
+        self, observation: Tensor, discrete: Tensor, raw: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> HybridDistribution:
+        """Return the distribution whose `log_prob` is that of an action in a state; arguments as for `act`.
+
+        Args:
+            observation: of the states.
+            discrete: the chosen discrete actions.
+            raw: raw parameters.
+            mask: the discrete actions that may be taken.
+            pair_mask: the discrete actions that go together.
+        """
+        return self(observation, mask)
+
+    def act(
+        self, draw: Draw, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor, HybridDistribution]:
+        """Return discrete actions, raw parameters `[*B, num_parameters]` and the distribution that they come from.
+
+        Args:
+            draw: maps a distribution to discrete actions and raw parameters.
+            observation: of the states, `[*B, observation_dim]`.
+            mask: the discrete actions that may be taken, bool `[*B, num_discrete]`. If None, all.
+            pair_mask: whether the column's discrete action may follow the row's, bool `[*B, num_discrete,
+                num_discrete]`. If None, all pairs. Only an `AutoregressiveActor` takes it.
+        """
+        distribution: HybridDistribution = self(observation, mask)
+        return *draw(distribution), distribution
 
     def set_min_scale(self, min_scale: float) -> None:
         """Set the smallest standard deviation."""
@@ -227,17 +218,24 @@ class HybridPolicy(TensorDictModuleBase):
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action `[*B]`, the parameters and maybe their raw sample, `[*B, num_parameters]` each."""
         allowed = self.specs.allowed(td.get(keys.OBSERVATION), td.get(keys.ACTION_MASK, None))
-        distribution: HybridDistribution = self.actor(self.perception.see(td), allowed)
         if not is_greedy():
-            discrete, raw = distribution.sample()
+            draw = HybridDistribution.sample
         elif self.samples_when_greedy:
-            discrete, raw = distribution.sample_discrete()
+            draw = HybridDistribution.sample_discrete
         else:
-            discrete, raw = distribution.mode()
+            draw = HybridDistribution.mode
+        discrete, raw, _ = self.actor.act(draw, self.perception.see(td), allowed, td.get(keys.PAIR_MASK, None))
         if self.writes_raw:
             td.set(RAW, raw)
-        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0))
+        parameters = self.specs.from_unit(raw.clamp(-1.0, 1.0), td)
         return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
+
+
+def make_small(head: nn.Linear) -> None:
+    """Bring a head's outputs near 0."""
+    with torch.no_grad():
+        head.weight.mul_(0.01)
+        head.bias.zero_()
 
 
 def encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
@@ -249,8 +247,3 @@ def encoder(in_dim: int, hidden_dims: Sequence[int]) -> nn.Sequential:
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.ReLU(inplace=True)]
     return nn.Sequential(*layers)
-
-
-def gaussian_log_density(standardised: Tensor, log_scale: Tensor) -> Tensor:
-    """Return the log-density of Gaussian samples, given (x - mean) / scale and log(scale)."""
-    return -0.5 * standardised.square() - log_scale - 0.5 * math.log(2 * math.pi)

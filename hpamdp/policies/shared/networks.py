@@ -243,6 +243,12 @@ class HybridCritics(nn.Module):
     0. The passes of a state share their first layer but for the columns of x_k, and pass k computes only output k. So K
     passes of H units take memory `[B, K, H]`, and never `[B, K, K]`.
 
+    If an action has several components, its value is the sum of the values of what each component chose (Sunehag et al.
+    2018, *Value-Decomposition Networks for Cooperative Multi-Agent Learning*, arXiv 1706.05296). So the best choice of
+    each component is the best action. Values in which components depend on each other cannot be represented.
+
+    Parameters that are whole numbers are moved to the middle of their cells, see `PAMDPSpecs.in_cells`.
+
     Shapes: states `[B, observation_dim]`, parameters `[B, num_parameters]` in [-1, 1].
     """
 
@@ -261,6 +267,8 @@ class HybridCritics(nn.Module):
     ) -> None:
         super().__init__()
         self.is_multipass = is_multipass
+        self.components = specs.components
+        self.in_cells = specs.in_cells
         self.num_discrete = specs.num_discrete
         self.observation_dim = specs.observation_dim
         input_dim = specs.observation_dim + specs.num_parameters
@@ -274,6 +282,7 @@ class HybridCritics(nn.Module):
 
     def forward(self, state: Tensor, unit_parameters: Tensor) -> Tensor:
         """Return the values of all discrete actions, `[E, B, num_discrete]`."""
+        unit_parameters = self.in_cells(unit_parameters)
         if not self.is_multipass:
             return self.net(torch.cat([state, unit_parameters], -1))
         num_rows = max(1, _MAX_PASSES // self.num_discrete)
@@ -283,7 +292,10 @@ class HybridCritics(nn.Module):
         return torch.cat([self._passes(*piece) for piece in pieces], 1)
 
     def of_discrete(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
-        """Return the values `[E, B]` of the given discrete actions `[B]`."""
+        """Return the values `[E, B]` of the given discrete actions `[B]`, summed over several components."""
+        if not self.components.is_single:
+            q = self(state, unit_parameters)
+            return self.components.of_choice(q, discrete.expand(q.shape[0], *discrete.shape)).sum(-1)
         own = unit_parameters * (self.owner == discrete.unsqueeze(-1)) if self.is_multipass else unit_parameters
         q = self.net(torch.cat([state, own], -1))
         return q.gather(-1, discrete.expand(q.shape[0], -1).unsqueeze(-1)).squeeze(-1)
@@ -307,3 +319,29 @@ class HybridCritics(nn.Module):
             x = self.net.activated(layer(x))
         # One column for each pass, so no product either: see EnsembleLinear.
         return (x.unflatten(1, shape) * last.weight.mT.unsqueeze(1)).sum(-1) + last.bias
+
+
+class JointCritics(nn.Module):
+    """`num_members` independent networks for the value of an action of several components as a whole.
+
+    They see the state, what each component chose (one-hot), and the chosen parameters. So the value of a component's
+    choice may depend on the others.
+
+    Shapes: states `[B, observation_dim]`, choices `[B, num_components]`, parameters `[B, num_parameters]` in [-1, 1].
+    """
+
+    owner: Tensor
+
+    def __init__(self, specs: PAMDPSpecs, num_members: int, hidden_dims: Sequence[int]) -> None:
+        super().__init__()
+        self.components = specs.components
+        self.in_cells = specs.in_cells
+        num_inputs = specs.observation_dim + specs.num_discrete + specs.num_parameters
+        self.net = EnsembleMLP(num_members, num_inputs, hidden_dims, 1)
+        self.register_buffer("owner", specs.parameter_owner, persistent=False)
+
+    def of_discrete(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
+        """Return the values `[E, B]` of actions."""
+        is_chosen = self.components.is_chosen(discrete)
+        own = self.in_cells(unit_parameters) * is_chosen.index_select(-1, self.owner)
+        return self.net(torch.cat([state, is_chosen.to(state.dtype), own], -1)).squeeze(-1)

@@ -77,7 +77,7 @@ class PlanningPolicy(TensorDictModuleBase):
             mask = None if mask is None else mask[is_planned]
             discrete[is_planned], unit_parameters[is_planned] = self.first_action(td, observation, is_planned, mask)
         shape = td.batch_size
-        parameters = self.specs.from_unit(unit_parameters).reshape(*shape, self.specs.num_parameters)
+        parameters = self.specs.from_unit(unit_parameters.reshape(*shape, self.specs.num_parameters), td)
         return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": parameters}})
 
     def first_action(

@@ -79,7 +79,8 @@ class ReplayLearner(Learner):
             not set it; others call `features` and `detached`.
         symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
         stores_own_parameters: true if the buffer holds only the parameters of the discrete action that was taken. This
-            saves memory where there are many; samples then have 0 for the others.
+            saves memory where there are many; samples then have 0 for the others. With several components the buffer
+            holds all parameters.
         slots: for each discrete action the places of its parameters among all, int64 `[num_discrete, D]`.
         owner: the discrete action that each parameter belongs to, int64 `[num_parameters]`.
         catches_up: true if the first updates make up for the steps of the warm-up.
@@ -104,6 +105,7 @@ class ReplayLearner(Learner):
     def __init__(self, specs: PAMDPSpecs, device: torch.device | str, options: ReplayOptions) -> None:
         super().__init__(specs)
         self.options = options
+        self.stores_own_parameters = self.stores_own_parameters and specs.components.is_single
         augment = specs.symmetries is not None if options.augment == "auto" else options.augment
         self.symmetry = RandomSymmetry(specs, torch.device(device)) if augment else None
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
@@ -242,7 +244,7 @@ class ReplayLearner(Learner):
             {
                 "state": batch[keys.OBSERVATION],
                 "discrete": batch[keys.DISCRETE],
-                "unit": self.specs.to_unit(batch[keys.PARAMETERS]),
+                "unit": self.specs.to_unit(batch[keys.PARAMETERS], batch),
                 "reward": self.reward_scale * batch["next", keys.REWARD].squeeze(-1),
                 "next_state": batch["next", keys.OBSERVATION],
                 "discount": self.options.gamma * (~batch["next", keys.TERMINATED]).squeeze(-1).float(),
@@ -253,6 +255,8 @@ class ReplayLearner(Learner):
             everything = torch.ones(*batch.shape, self.specs.num_discrete, dtype=torch.bool, device=self.frames.device)
             rows["action_mask"] = batch.get(keys.ACTION_MASK, everything)
             rows["next_action_mask"] = batch.get(("next", keys.ACTION_MASK), everything)
+        if self.specs.has_pair_mask:
+            rows["pair_mask"] = batch[keys.PAIR_MASK]
         option_ended = batch.get(("next", keys.OPTION_ENDED), None)
         if option_ended is not None:
             rows["option_ended"] = option_ended.squeeze(-1)
@@ -296,6 +300,10 @@ class ReplayLearner(Learner):
     def allowed(self, sample: TensorDictBase) -> Tensor | None:
         """Return which discrete actions may be taken in a sample's states, bool `[B, num_discrete]`. If None, all."""
         return self.specs.allowed(sample["state"], sample.get("action_mask", None))
+
+    def pairs(self, sample: TensorDictBase) -> Tensor | None:
+        """Return which discrete actions go together in a sample's states, as in `pair_mask`. If None, all do."""
+        return sample.get("pair_mask", None)
 
 
 def first_multiple(updates_per_step: float) -> int:

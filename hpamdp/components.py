@@ -1,0 +1,86 @@
+"""Actions of several components: what lies side by side in logits, values and masks, and what was chosen of it.
+
+A component is one discrete choice, or a box: a choice with one discrete action, which owns the box's parameters. The
+discrete actions of all components lie side by side. What was chosen is numbered from 0 within each component.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import accumulate
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Components:
+    """The components of an action.
+
+    With one component, choices have the shape `[*B]`, with several `[*B, num_components]`.
+
+    Attributes:
+        sizes: number of discrete actions of each component.
+    """
+
+    sizes: tuple[int, ...]
+
+    @property
+    def is_single(self) -> bool:
+        """Whether there is one component."""
+        return len(self.sizes) == 1
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Place of each component's first discrete action."""
+        return (0, *accumulate(self.sizes[:-1]))
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one choice: empty, or the number of components."""
+        return () if self.is_single else (len(self.sizes),)
+
+    def component_of(self, device: torch.device | None = None) -> Tensor:
+        """Return int64 `[num_discrete]`: the component of each discrete action."""
+        numbers = torch.arange(len(self.sizes), device=device)
+        return numbers.repeat_interleave(torch.tensor(self.sizes, device=device), output_size=sum(self.sizes))
+
+    def best(self, values: Tensor) -> Tensor:
+        """Return the choice with the largest values `[*B, num_discrete]`."""
+        if self.is_single:
+            return values.argmax(-1)
+        return torch.stack([part.argmax(-1) for part in values.split(self.sizes, -1)], -1)
+
+    def places(self, choice: Tensor) -> Tensor:
+        """Return where the chosen discrete actions lie among all, int64 `[*B, num_components]`."""
+        if self.is_single:
+            return choice.unsqueeze(-1)
+        return choice + torch.tensor(self.starts, device=choice.device)
+
+    def of_choice(self, values: Tensor, choice: Tensor) -> Tensor:
+        """Return the entries of values `[*B, num_discrete]` that belong to a choice, in the choice's shape."""
+        entries = values.gather(-1, self.places(choice))
+        return entries.squeeze(-1) if self.is_single else entries
+
+    def is_chosen(self, choice: Tensor) -> Tensor:
+        """Return which discrete actions are chosen, bool `[*B, num_discrete]`."""
+        if self.is_single:
+            return torch.arange(self.sizes[0], device=choice.device) == choice.unsqueeze(-1)
+        numbers = torch.cat([torch.arange(size) for size in self.sizes]).to(choice.device)
+        return numbers == choice.index_select(-1, self.component_of(choice.device))
+
+    def log_softmax(self, logits: Tensor) -> Tensor:
+        """Return the log-probabilities of each component's discrete actions, of logits `[*B, num_discrete]`."""
+        if self.is_single:
+            return logits.log_softmax(-1)
+        return torch.cat([part.log_softmax(-1) for part in logits.split(self.sizes, -1)], -1)
+
+    def any_of_each(self, mask: Tensor) -> Tensor:
+        """Return whether a mask bool `[*B, num_discrete]` holds anything of every component, bool `[*B]`."""
+        if self.is_single:
+            return mask.any(-1)
+        return torch.stack([part.any(-1) for part in mask.split(self.sizes, -1)], -1).all(-1)
+
+    def total(self, each: Tensor) -> Tensor:
+        """Return the sum over components of numbers in a choice's shape, `[*B]`."""
+        return each if self.is_single else each.sum(-1)

@@ -1,0 +1,155 @@
+"""A hybrid actor whose components see what was chosen before them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hpamdp.components import Components
+from hpamdp.policies.masks import masked_logits
+from hpamdp.policies.shared.hybrid_actor import HybridActor, make_small
+from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution
+from hpamdp.specs import PAMDPSpecs
+
+
+def _clipped(raw: Tensor) -> Tensor:
+    return raw.clamp(-1.0, 1.0)
+
+
+class AutoregressiveActor(HybridActor):
+    """Heads in a row: each component sees what the components before it have chosen, and their own parameters.
+
+    Independent heads cannot represent that components depend on each other, as where two of them must match.
+
+    Source: Vinyals et al. 2017, *StarCraft II: A New Challenge for Reinforcement Learning*, arXiv 1708.04782, section
+    4.2. A head is a hidden layer and an output layer.
+
+    Args:
+        args: as for `HybridActor`.
+        bound: maps raw parameters to those that are executed, in [-1, 1], which later components see.
+        settings: as for `HybridActor`.
+    """
+
+    takes_pairs = True
+
+    def __init__(self, *args: Any, bound: Callable[[Tensor], Tensor] = _clipped, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self.bound = bound
+
+    def make_heads(self, specs: PAMDPSpecs, width: int, raw_scale: float) -> None:
+        """Make a head for each component on an encoder's output; deviations start at sigmoid(raw_scale)."""
+        sizes = self.components.sizes
+        dims = torch.tensor(specs.parameter_dims).split(sizes)
+        self.parameter_sizes = [int(part.sum()) for part in dims]
+        self.owners = [torch.arange(len(part)).repeat_interleave(part) for part in dims]
+        self.parts = [None] * len(sizes) if self.values is None else self.values.split(self.parameter_sizes)
+        self.heads = nn.ModuleList()
+        for size, num, part in zip(sizes, self.parameter_sizes, self.parts, strict=True):
+            num_values = 0 if part is None else part.num_logits
+            last = nn.Linear(width, size + 2 * num + num_values, dtype=torch.float32)
+            make_small(last)
+            with torch.no_grad():
+                last.bias[size + num : size + 2 * num] = raw_scale
+            first = nn.Linear(width + specs.num_discrete + specs.num_parameters, width, dtype=torch.float32)
+            nn.init.orthogonal_(first.weight, math.sqrt(2.0))
+            nn.init.zeros_(first.bias)
+            self.heads.append(nn.Sequential(first, nn.ReLU(inplace=True), last))
+
+    def forward(self, observation: Tensor, mask: Tensor | None = None) -> HybridDistribution:
+        """Refuse: the distribution of an action needs what was chosen before; see `given` and `act`."""
+        raise NotImplementedError("an autoregressive actor has no distribution without the earlier components' choices")
+
+    def given(
+        self, observation: Tensor, discrete: Tensor, raw: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> HybridDistribution:
+        """Return each component's distribution given the choices of the components before it."""
+        chosen = iter(zip(self._choices(discrete), raw.split(self.parameter_sizes, -1), strict=True))
+        _, _, distribution = self.act(lambda _: next(chosen), observation, mask, pair_mask)
+        return distribution
+
+    def act(
+        self, draw: Draw, observation: Tensor, mask: Tensor | None, pair_mask: Tensor | None
+    ) -> tuple[Tensor, Tensor, HybridDistribution]:
+        """Choose one component after another; `draw` gets the distribution of each."""
+        hidden, initial = self.hidden(observation), self.initial(observation)
+        is_chosen = hidden.new_zeros(*hidden.shape[:-1], sum(self.components.sizes))
+        own = hidden.new_zeros(*hidden.shape[:-1], len(self.owner))
+        first, first_parameter = 0, 0
+        choices, raws, distributions = [], [], []
+        for size, num, head, owner, part in zip(
+            self.components.sizes, self.parameter_sizes, self.heads, self.owners, self.parts, strict=True
+        ):
+            allowed = self._allowed(is_chosen, mask, pair_mask, first)
+            output = head(torch.cat([hidden, is_chosen, own], -1))
+            logits, mean, raw_scale, value_logits = output.split(
+                [size, num, num, output.shape[-1] - size - 2 * num], -1
+            )
+            if isinstance(initial, Tensor):
+                mean = mean + initial[..., first_parameter : first_parameter + num]
+            distribution = HybridDistribution(
+                masked_logits(logits, allowed).log_softmax(-1),
+                mean,
+                self.log_scale(raw_scale),
+                owner.to(mean.device),
+                Components((size,)),
+                None if part is None else part.distribution(value_logits),
+            )
+            choice, raw = draw(distribution)
+            choices.append(choice)
+            raws.append(raw)
+            distributions.append(distribution)
+            is_own = torch.arange(size, device=choice.device) == choice.unsqueeze(-1)
+            is_chosen = _with_part(is_chosen, first, is_own.to(is_chosen.dtype))
+            executed = self.bound(raw) * is_own.index_select(-1, distribution.owner)
+            own = _with_part(own, first_parameter, executed.to(own.dtype))
+            first, first_parameter = first + size, first_parameter + num
+        discrete = choices[0] if self.components.is_single else torch.stack(choices, -1)
+        return discrete, torch.cat(raws, -1), self._joined(distributions)
+
+    def _choices(self, discrete: Tensor) -> list[Tensor]:
+        return [discrete] if self.components.is_single else list(discrete.unbind(-1))
+
+    def _allowed(self, is_chosen: Tensor, mask: Tensor | None, pair_mask: Tensor | None, first: int) -> Tensor | None:
+        """Return which discrete actions the component that begins at `first` may choose, bool `[*B, size]`.
+
+        An action is left out if it would leave nothing to a later component.
+
+        Args:
+            is_chosen: what the components before have chosen, `[*B, num_discrete]`.
+            mask: the discrete actions that may be taken.
+            pair_mask: the discrete actions that go together.
+            first: the place of the component's first discrete action.
+        """
+        sizes, number = self.components.sizes, self.components.starts.index(first)
+        if pair_mask is None:
+            return None if mask is None else mask[..., first : first + sizes[number]]
+        allowed = (pair_mask | (is_chosen == 0.0).unsqueeze(-1)).all(-2)
+        if mask is not None:
+            allowed = allowed & mask
+        own = allowed[..., first : first + sizes[number]]
+        follows = pair_mask[..., first : first + sizes[number], :] & allowed.unsqueeze(-2)
+        for start, size in zip(self.components.starts[number + 1 :], sizes[number + 1 :], strict=True):
+            own = own & follows[..., start : start + size].any(-1)
+        return own
+
+    def _joined(self, parts: Sequence[HybridDistribution]) -> HybridDistribution:
+        """Return the distributions of the components as one."""
+        log_probs, mean, log_scale = (
+            torch.cat([part[column] for part in parts], -1)  # type: ignore[misc]
+            for column in range(3)
+        )
+        values = None
+        if self.values is not None:
+            known = [part.values.log_probs for part in parts if part.values is not None]
+            values = self.values.joined(torch.cat(known, -2))
+        return HybridDistribution(log_probs, mean, log_scale, self.owner, self.components, values)
+
+
+def _with_part(values: Tensor, start: int, part: Tensor) -> Tensor:
+    """Return values `[*B, n]` with a part `[*B, m]` in the places from `start` on."""
+    end = start + part.shape[-1]
+    return torch.cat([values[..., :start], part, values[..., end:]], -1)
