@@ -297,7 +297,10 @@ def mistake_in(**options) -> str:
         ({"id": "nowhere:Toy-v0"}, "nowhere:Toy-v0: No module named 'nowhere'"),
         ({"id": "not an id"}, "not an id: Malformed environment ID"),
         ({"id": "Endless-v0"}, "Endless-v0: has no time limit of its own; set env.max_steps"),
-        ({"id": "CartPole-v1"}, "CartPole-v1: action space Discrete(2): not of these forms; accepted are "),
+        (
+            {"entry_point": "toy_environments:Texting", "max_steps": 5},
+            "Texting: action space Tuple(Discrete(2), Text(1, 5, ",
+        ),
         ({"id": "Toy-v0", "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
         ({"entry_point": TOY, "kwargs": {"wide": 1}}, "got an unexpected keyword argument 'wide'"),
         (

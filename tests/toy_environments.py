@@ -114,6 +114,14 @@ class Mixed(Toy):
         return self.observation_space.sample()
 
 
+class Texting(Toy):
+    """Asks for a text in its actions."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Tuple([spaces.Discrete(2), spaces.Text(5)])
+
+
 class Wrong(Toy):
     """Observe what its observation space does not contain."""
 

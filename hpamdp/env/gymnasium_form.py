@@ -6,7 +6,7 @@ An agent that acts in a Gymnasium environment reads its observations and writes 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -145,13 +145,22 @@ class VectorForm(GymnasiumForm):
         return (option if is_batch else option[0]), discrete, tuple(own)
 
 
-def checked_mask(name: str, mask: np.ndarray) -> Tensor:
+def checked_mask(name: str, mask: np.ndarray, component_sizes: Sequence[int] = ()) -> Tensor:
     """Return a mask `[N, K]` as a bool tensor.
 
+    Args:
+        name: of the mask.
+        mask: 0 or 1 for each choice.
+        component_sizes: numbers of choices of which something must be allowed each; empty: of all together.
+
     Raises:
-        ValueError: a row allows nothing.
+        ValueError: a row allows nothing, or nothing of one component.
     """
-    is_empty = ~(mask != 0).any(-1)
+    allowed = torch.from_numpy(mask != 0)
+    parts = allowed.split([*component_sizes] or allowed.shape[-1], -1)
+    is_empty = ~torch.stack([part.any(-1) for part in parts], -1)
     if is_empty.any():
-        raise ValueError(f"{name} of row {int(is_empty.argmax())} allows nothing")
-    return torch.from_numpy(mask != 0)
+        row, component = is_empty.nonzero()[0].tolist()
+        of_component = f" of component {component}" if component_sizes else ""
+        raise ValueError(f"{name} of row {row} allows nothing{of_component}")
+    return allowed

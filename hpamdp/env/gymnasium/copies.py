@@ -10,13 +10,13 @@ from typing import Any, NoReturn
 import gymnasium
 import numpy as np
 
-from hpamdp import keys
 from hpamdp.env.errors import EnvironmentFaultError, ProblemError, fault_of
-from hpamdp.env.gymnasium.action_spaces import ActionSpace, OptionSpace, written
+from hpamdp.env.gymnasium.action_spaces import ActionForm, ActionSpace, OptionSpace, written
 from hpamdp.env.gymnasium.contract import ContractCheck, checked_step, refuse_step
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.masks import Masks, MaskSource
 from hpamdp.env.gymnasium.observation_spaces import ObservationSpace
+from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds
 from hpamdp.env.gymnasium.time_limit import limit_of
 from hpamdp.env.gymnasium.values import flag
 from hpamdp.settings import SettingError
@@ -34,13 +34,17 @@ class Reading:
     """How an environment's spaces are read.
 
     Attributes:
-        max_steps, parameter_dims, option_key, action_mask, observation_keys, out_of_bounds: see the settings.
+        max_steps, action_form, parameter_dims, option_key, action_mask, pair_mask, parameter_bounds, observation_keys,
+            out_of_bounds: see the settings.
     """
 
     max_steps: int | None = None
+    action_form: ActionForm = "auto"
     parameter_dims: tuple[int, ...] | None = None
     option_key: int | str | None = None
     action_mask: MaskSource | None = None
+    pair_mask: MaskSource | None = None
+    parameter_bounds: MaskSource | None = None
     observation_keys: tuple[int | str, ...] | None = None
     out_of_bounds: OutOfBounds = "refuse"
 
@@ -54,6 +58,8 @@ class Results:
         reward, terminated, truncated, success, has_success: `[N]`. `has_success` is 1 if the last info had a success.
         flags: the four of these that are flags, one after another, `[4, N]`.
         masks: by name, `[N, K]`.
+        bounds: the parameters' lower and upper bounds in the space's own numbers, `[N, num_parameters]` each; None if
+            the bounds do not depend on the state.
     """
 
     observation: np.ndarray
@@ -64,6 +70,7 @@ class Results:
     has_success: np.ndarray
     flags: np.ndarray
     masks: dict[str, np.ndarray]
+    bounds: tuple[np.ndarray, np.ndarray] | None
 
 
 @dataclass(frozen=True)
@@ -73,15 +80,17 @@ class Layout:
     Attributes:
         dim: length of the observation.
         mask_sizes: lengths of the masks, by name.
+        num_bounded: number of parameters whose bounds depend on the state.
     """
 
     dim: int
     mask_sizes: dict[str, int]
+    num_bounded: int
 
     @property
     def num_result_columns(self) -> int:
         """Number of columns of a table of results."""
-        return self.dim + _NUM_AFTER + sum(self.mask_sizes.values())
+        return self.dim + _NUM_AFTER + sum(self.mask_sizes.values()) + 2 * self.num_bounded
 
     def results(self, table: np.ndarray) -> Results:
         """Return views into a table of results."""
@@ -89,8 +98,11 @@ class Layout:
         for name, size in self.mask_sizes.items():
             masks[name] = table[:, start : start + size]
             start += size
+        middle = start + self.num_bounded
+        bounds = (table[:, start:middle], table[:, middle:]) if self.num_bounded else None
         reward, terminated, truncated, success, has_success = after = table[:, self.dim : self.dim + _NUM_AFTER].T
-        return Results(table[:, : self.dim], reward, terminated, truncated, success, has_success, after[1:], masks)
+        observation, flags = table[:, : self.dim], after[1:]
+        return Results(observation, reward, terminated, truncated, success, has_success, flags, masks, bounds)
 
 
 class Copies:
@@ -130,15 +142,14 @@ class Copies:
             self.max_steps = max(self._limits)
             space = self.envs[0].observation_space
             self.options = OptionSpace(self.envs[0].action_space, reading.option_key)
-            self.actions = ActionSpace(self.options.rest, reading.parameter_dims)
-            sizes = {
-                keys.ACTION_MASK: len(self.actions.parameter_dims),
-                keys.OPTION_MASK: self.options.num_options,
-            }
-            self._masks = Masks(self.envs[0], num, sizes, reading.action_mask)
+            self.actions = ActionSpace(self.options.rest, reading.parameter_dims, reading.action_form)
+            sources = reading.action_mask, reading.pair_mask
+            self._masks = Masks(self.envs[0], num, self.actions, self.options.num_options, *sources)
+            self._bounds = ParameterBounds(self.envs[0], num, self.actions, reading.parameter_bounds)
             entries: Sequence[int | str] | None = reading.observation_keys
-            if self._masks.in_observation and entries is None:
-                entries = [entry for entry in getattr(space, "spaces", {}) if entry not in self._masks.rows]
+            apart = {*self._masks.in_observation, *(self._bounds.names if self._bounds.in_observation else ())}
+            if apart and entries is None:
+                entries = [entry for entry in getattr(space, "spaces", {}) if entry not in apart]
             self.observations = ObservationSpace(space, entries, reading.out_of_bounds)
         except ValueError as error:
             raise SettingError(f"{name}: {error}") from error
@@ -146,7 +157,8 @@ class Copies:
         self.has_pictures = self.envs[0].render_mode == "rgb_array"
         self.pictures_per_second = _rate_of(self.envs[0])
         mask_sizes = {mask: rows.shape[1] for mask, rows in self._masks.rows.items()}
-        self.layout = Layout(self.observations.dim, mask_sizes)
+        num_bounded = sum(self.actions.parameter_dims) if self._bounds.names else 0
+        self.layout = Layout(self.observations.dim, mask_sizes, num_bounded)
         self.table = np.zeros((num, self.layout.num_result_columns))
         self.results = self.layout.results(self.table)
         # What each step needs, looked up once.
@@ -156,6 +168,7 @@ class Copies:
         self._num_steps = [0] * num
         self._after = self.table[:, self.layout.dim : self.layout.dim + _NUM_AFTER]
         self._has_masks = bool(mask_sizes)
+        self._has_bounds = num_bounded > 0
 
     def _check_spaces(self) -> None:
         if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
@@ -188,6 +201,7 @@ class Copies:
                 if not self._write[self._row](observation):
                     settled.add(self._row)
                 self._masks.keep(self._row, observation, info)
+                self._bounds.keep(self._row, observation, info)
                 self._num_steps[self._row] = 0
             self._settle(rows, settled)
         except Exception as error:
@@ -200,7 +214,7 @@ class Copies:
         Args:
             rows: numbers of these copies.
             option: of all copies, `[N]`; None if the environment has no options.
-            discrete: of all copies, `[N]`.
+            discrete: of all copies, `[N]`, or `[N, num_components]`.
             parameters: of all copies, `[N, num_parameters]`.
 
         Raises:
@@ -208,10 +222,7 @@ class Copies:
             EnvironmentFaultError: its `step` raised an error.
         """
         index: Any = _ALL if len(rows) == len(self.envs) else rows
-        natives = self.actions.to_native(discrete[index], parameters[index])
-        if option is not None:
-            chosen = zip(natives, option[index].tolist(), strict=True)
-            natives = [self.options.with_option(native, number) for native, number in chosen]
+        natives = self._natives(index, option, discrete, parameters)
         unchecked, write, num_steps, limits = self._unchecked, self._write, self._num_steps, self._limits
         rewards: list[float] = []
         flags: dict[int, tuple[bool, ...]] = {}  # of the few copies that have one
@@ -231,8 +242,9 @@ class Copies:
                 num_steps[row] += 1
                 truncated = not terminated and (truncated or num_steps[row] >= limits[row])
                 success = None
-                if info or self._has_masks or type(observation) is not np.ndarray:
+                if info or self._has_masks or self._has_bounds or type(observation) is not np.ndarray:
                     self._masks.keep(row, observation, info)
+                    self._bounds.keep(row, observation, info)
                     success = _success_in(info)
                 if terminated or truncated or success is not None:
                     flags[row] = (terminated, truncated, bool(success), success is not None)
@@ -245,8 +257,22 @@ class Copies:
         for row, of_row in flags.items():
             self.results.flags[:, row] = of_row
 
+    def _natives(
+        self, index: Any, option: np.ndarray | None, discrete: np.ndarray, parameters: np.ndarray
+    ) -> list[Any]:
+        """Return the actions of some copies in the space's own format, within the bounds of their states."""
+        bounds = None
+        if self.results.bounds is not None:
+            low, high = self.results.bounds
+            bounds = low[index], high[index]
+        natives = self.actions.to_native(discrete[index], parameters[index], bounds)
+        if option is None:
+            return natives
+        chosen = zip(natives, option[index].tolist(), strict=True)
+        return [self.options.with_option(native, number) for native, number in chosen]
+
     def _settle(self, rows: Any, settled: set[int]) -> None:
-        """Check the observations that these copies have written, and keep their masks.
+        """Check the observations that these copies have written, and keep their masks and bounds.
 
         Args:
             rows: index of the copies' rows.
@@ -262,6 +288,8 @@ class Copies:
         observations[rows] = self.observations.rounded(vectors)
         for name, masks in self._masks.rows.items():
             self.results.masks[name][:] = masks
+        if self.results.bounds is not None:
+            self.results.bounds[0][:], self.results.bounds[1][:] = self._bounds.low, self._bounds.high
 
     def pictures(self, num: int) -> list[np.ndarray]:
         """Return what `render` returns for the first `num` copies, uint8 `[height, width, 3]` each.

@@ -20,11 +20,13 @@ from torchrl.data import Binary, Categorical, Composite, Unbounded
 from hpamdp import keys
 from hpamdp.env.actions import check_action_values, invalid_action
 from hpamdp.env.base import PAMDPEnv, ProblemError, checked_option_names
+from hpamdp.env.gymnasium.action_spaces import ActionForm
 from hpamdp.env.gymnasium.copies import Copies, Reading
 from hpamdp.env.gymnasium.form import OwnForm
 from hpamdp.env.gymnasium.leaves import OutOfBounds
 from hpamdp.env.gymnasium.making import Maker
 from hpamdp.env.gymnasium.masks import MaskSource
+from hpamdp.env.gymnasium.parameter_bounds import of_agent
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling, RewardScaling, RunningStatistics, Scaling
 from hpamdp.env.registration import register
@@ -55,6 +57,12 @@ class GymnasiumOptions(Settings):
     """Arguments of the environment's constructor, as in `env.kwargs={size:5}`."""
     max_steps: PositiveInt | None = None
     """Steps after which an episode is truncated. If None, the limit of the `TimeLimit` wrapper or of the spec."""
+    action_form: ActionForm = "auto"
+    """How the action space is read. `auto`: a `Discrete` and boxes beside it can be one choice with its parameters.
+
+    `components`: all parts are independent, so that a `Box` beside a `Discrete` counts whatever is chosen. Only a
+    `OneOf` is then a choice with parameters of its own.
+    """
     parameter_dims: list[int] | None = None
     """How many parameters each discrete action takes of one box for all, as in [1, 1, 0]. If None, the whole box."""
     option_key: int | str | None = None
@@ -65,8 +73,18 @@ class GymnasiumOptions(Settings):
     `ignore`: masks are ignored. If None, the entries `action_mask` and `option_mask` of a `Dict` of observations, if it
     has them. A mask in another place, such as a method `action_masks()`, is refused unless masks are ignored.
     """
+    pair_mask: MaskSource | None = None
+    """Where the environment says which discrete actions of different components go together, `pair_mask`.
+
+    `info`: in each info; `ignore`: it is ignored. If None, the entry of a `Dict` of observations, if it has one.
+    """
+    parameter_bounds: MaskSource | None = None
+    """Where the environment gives bounds of the current state, `parameter_low` and `parameter_high`.
+
+    `info`: in each info; `ignore`: they are ignored. If None, entries of a `Dict` of observations, if it has them.
+    """
     observation_keys: list[int | str] | None = None
-    """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If None, all but masks."""
+    """Entries of a `Tuple` or `Dict` to observe, as in [0] or [position, speed]. If None, all but masks and bounds."""
     observation_scaling: Scaling = "bounds"
     """`bounds`: to [-1, 1], if the space has bounds; `running`: to mean 0 and standard deviation 1; `none`: not."""
     raw_observations: list[int | str] | None = None
@@ -83,7 +101,9 @@ class GymnasiumEnv(PAMDPEnv):
     """`num_envs` copies of a Gymnasium environment, stepped one after another, or at the same time in processes.
 
     `hpamdp.env.gymnasium.action_spaces` and `hpamdp.env.gymnasium.observation_spaces` tell which spaces are accepted
-    and how they are converted. Parameters outside their bounds are clipped; those of the chosen action must be finite.
+    and how they are converted. Parameters outside their bounds, those of the space and those of the current state, are
+    clipped; those of the chosen actions must be finite. Bounds of the current state are also observed: the observation
+    ends in all lower and all upper bounds, scaled so that the bounds of the space are -1 and 1.
     A space with an option in it, see there, leaves its choice to the agent; the environment may name its options in an
     attribute `option_names`. The leaf `success` bool `[N]` is `is_success` or `success` in the info of a step, False if
     it has neither.
@@ -136,7 +156,9 @@ class GymnasiumEnv(PAMDPEnv):
         self._copies = self._make_copies(maker)
         self.is_closed = False  # TorchRL's flag: from here on there are copies to close
         self.max_steps = self._copies.max_steps
-        self.parameter_dims = self._copies.actions.parameter_dims
+        actions = self._copies.actions
+        self.parameter_dims = actions.parameter_dims
+        self.component_sizes, self.integer_parameters = actions.component_sizes, actions.integer_parameters
         try:
             self.scaling = ObservationScaling(
                 self._copies.observations, options.observation_scaling, options.raw_observations or ()
@@ -147,7 +169,12 @@ class GymnasiumEnv(PAMDPEnv):
         self._make_specs()
         gamma = options.reward_scaling
         self._reward_scaling = None if gamma is None else RewardScaling(num_envs, gamma)
-        self._action_shapes = (self.batch_size, torch.Size((num_envs, sum(self.parameter_dims))))
+        num_parameters = sum(self.parameter_dims)
+        self._action_shapes = (
+            torch.Size((num_envs, *self.components.shape)),
+            torch.Size((num_envs, num_parameters)),
+        )
+        self._largest = np.array(self.components.sizes) - 1
         self._observation = np.zeros((num_envs, self._copies.layout.dim), np.float32)
         self._is_over = np.zeros(num_envs, bool)
         self._rows = [*range(num_envs)]
@@ -172,9 +199,12 @@ class GymnasiumEnv(PAMDPEnv):
         given = self.options
         return Reading(
             given.max_steps,
+            given.action_form,
             None if given.parameter_dims is None else tuple(given.parameter_dims),
             given.option_key,
             given.action_mask,
+            given.pair_mask,
+            given.parameter_bounds,
             None if given.observation_keys is None else tuple(given.observation_keys),
             given.out_of_bounds,
         )
@@ -201,7 +231,7 @@ class GymnasiumEnv(PAMDPEnv):
 
     def gymnasium_form(self) -> OwnForm:
         """Return the form of the environment itself."""
-        return OwnForm(self._copies, self.scaling, self.options.action_mask)
+        return OwnForm(self._copies, self.scaling, self._reading())
 
     def results(self, last: TensorDictBase) -> dict[str, Tensor]:
         """Return `success` bool `[M]` if any info so far had it."""
@@ -297,15 +327,21 @@ class GymnasiumEnv(PAMDPEnv):
     def _make_specs(self) -> None:
         n = self.num_envs
         device = self.device
+        layout, num_discrete = self._copies.layout, len(self.parameter_dims)
+        dim = layout.dim + 2 * layout.num_bounded
         self.observation_spec = Composite(
             {
-                keys.OBSERVATION: Unbounded(shape=(n, self._copies.layout.dim), device=device, dtype=torch.float32),
+                keys.OBSERVATION: Unbounded(shape=(n, dim), device=device, dtype=torch.float32),
                 _SUCCESS: Categorical(2, shape=(n,), dtype=torch.bool, device=device),
             },
             shape=(n,),
         )
-        for name, size in self._copies.layout.mask_sizes.items():
-            self.observation_spec[name] = Binary(size, shape=(n, size), dtype=torch.bool, device=device)
+        for name, size in layout.mask_sizes.items():
+            shape = (num_discrete, num_discrete) if name == keys.PAIR_MASK else (size,)
+            self.observation_spec[name] = Binary(shape[-1], shape=(n, *shape), dtype=torch.bool, device=device)
+        for name in (keys.PARAMETER_LOW, keys.PARAMETER_HIGH) if layout.num_bounded else ():
+            bound = Unbounded(shape=(n, layout.num_bounded), device=device, dtype=torch.float32)
+            self.observation_spec[name] = bound
         low = torch.from_numpy(self._copies.actions.low)
         high = torch.from_numpy(self._copies.actions.high)
         self.action_spec = self.make_action_spec(low, high, has_option=self._copies.options.num_options > 0)
@@ -354,7 +390,7 @@ class GymnasiumEnv(PAMDPEnv):
         return next_tensordict_out
 
     def _read_action(self, tensordict: TensorDictBase) -> tuple[np.ndarray, np.ndarray]:
-        """Return the discrete actions `[N]` and all parameters `[N, num_parameters]`, checked."""
+        """Return the discrete actions `[N, ...]` and all parameters `[N, num_parameters]`, checked."""
         discrete, parameters = tensordict.get(keys.DISCRETE), tensordict.get(keys.PARAMETERS)
         # The quick way for what almost every step gets. Otherwise the full checks say what is wrong.
         is_usual = (
@@ -368,12 +404,14 @@ class GymnasiumEnv(PAMDPEnv):
         if not is_usual:
             self.check_action(tensordict)
         chosen, values = discrete.numpy(force=True), parameters.numpy(force=True)
-        numbers = chosen.tolist()
+        if not self.component_sizes:
+            numbers = chosen.tolist()
+            exists = min(numbers) >= 0 and max(numbers) < len(self.parameter_dims)
+        else:
+            exists = bool(((chosen >= 0) & (chosen <= self._largest)).all())
         # Finite numbers have a finite sum of squares, or else the full check passes them.
-        if not (
-            math.isfinite(np.vdot(values, values)) and min(numbers) >= 0 and max(numbers) < len(self.parameter_dims)
-        ):
-            check_action_values(discrete, parameters, self.parameter_dims)
+        if not (math.isfinite(np.vdot(values, values)) and exists):
+            check_action_values(discrete, parameters, self.parameter_dims, components=self.components)
         return chosen, values
 
     def _read_option(self, tensordict: TensorDictBase) -> np.ndarray | None:
@@ -407,8 +445,14 @@ class GymnasiumEnv(PAMDPEnv):
             np.logical_or(flags[0], flags[1], out=flags[3])
         self._is_over[:] = flags[3]
         columns = flags[..., None]
+        observation = self._observation.copy()
+        bounds = {}
+        if results.bounds is not None:
+            low, high, seen = of_agent(self._copies.actions, *results.bounds)
+            observation = np.concatenate([observation, seen], axis=-1)
+            bounds = {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
         leaves = {
-            keys.OBSERVATION: torch.from_numpy(self._observation.copy()),
+            keys.OBSERVATION: torch.from_numpy(observation),
             _SUCCESS: torch.from_numpy(flags[2]),
             keys.TERMINATED: torch.from_numpy(columns[0]),
             keys.TRUNCATED: torch.from_numpy(columns[1]),
@@ -416,6 +460,9 @@ class GymnasiumEnv(PAMDPEnv):
         }
         for name, mask in results.masks.items():
             leaves[name] = torch.from_numpy(mask != 0.0)
+            if name == keys.PAIR_MASK:
+                leaves[name] = leaves[name].unflatten(-1, (len(self.parameter_dims), -1))
+        leaves |= bounds
         if reward is not None:
             leaves[keys.REWARD] = torch.from_numpy(reward[:, None])
         device = self.device

@@ -13,8 +13,9 @@ from tensordict import TensorDict, TensorDictBase
 
 from hpamdp import keys
 from hpamdp.env.gymnasium.action_spaces import written
-from hpamdp.env.gymnasium.copies import Copies
-from hpamdp.env.gymnasium.masks import Masks, MaskSource
+from hpamdp.env.gymnasium.copies import Copies, Reading
+from hpamdp.env.gymnasium.masks import Masks
+from hpamdp.env.gymnasium.parameter_bounds import ParameterBounds, of_agent
 from hpamdp.env.gymnasium.processes import ProcessCopies
 from hpamdp.env.gymnasium.scaling import ObservationScaling
 from hpamdp.env.gymnasium_form import GymnasiumForm, VectorScaling, checked_mask
@@ -26,20 +27,14 @@ class OwnForm(GymnasiumForm):
     Args:
         copies: the copies of the environment.
         scaling: how their observations are scaled.
-        mask_source: where the environment gives its masks.
+        reading: how their spaces are read.
     """
 
-    def __init__(
-        self, copies: Copies | ProcessCopies, scaling: ObservationScaling, mask_source: MaskSource | None
-    ) -> None:
+    def __init__(self, copies: Copies | ProcessCopies, scaling: ObservationScaling, reading: Reading) -> None:
         self._env = copies.example
         self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
         self._observations, self._actions, self._options = copies.observations, copies.actions, copies.options
-        self._scaling, self._mask_source = scaling, mask_source
-        self._mask_sizes = {
-            keys.ACTION_MASK: len(copies.actions.parameter_dims),
-            keys.OPTION_MASK: copies.options.num_options,
-        }
+        self._scaling, self._reading = scaling, reading
 
     def read(self, observation: Any, info: Mapping[str, Any] | None = None) -> tuple[TensorDict, bool]:
         """Return the rows of `GymnasiumForm.read`."""
@@ -47,14 +42,29 @@ class OwnForm(GymnasiumForm):
         space: Any = self.observation_space
         singles = [observation] if num is None else list(iterate(batch_space(space, num), observation))
         vectors = self._observations.rounded(np.stack([self._observations.flat(single) for single in singles]))
-        rows = {keys.OBSERVATION: torch.from_numpy(self._scaling.rescaled(vectors))}
-        masks = Masks(self._env, len(singles), self._mask_sizes, self._mask_source)
-        if masks.rows and not masks.in_observation and info is None:
-            raise ValueError(f"give the info of the step, which holds {' and '.join(masks.rows)}")
-        for row, single in enumerate(singles if masks.rows else ()):
-            in_row = {name: value[row] for name, value in (info or {}).items() if name in masks.rows and num}
-            masks.keep(row, single, in_row if num else info or {})
-        rows |= {name: checked_mask(name, mask) for name, mask in masks.rows.items()}
+        observed = self._scaling.rescaled(vectors)
+        reading, actions = self._reading, self._actions
+        sources = reading.action_mask, reading.pair_mask
+        masks = Masks(self._env, len(singles), actions, self._options.num_options, *sources)
+        bounds = ParameterBounds(self._env, len(singles), actions, reading.parameter_bounds)
+        in_info = [*masks.needs_info, *(() if bounds.in_observation else bounds.names)]
+        if in_info and info is None:
+            raise ValueError(f"give the info of the step, which holds {' and '.join(in_info)}")
+        for row, single in enumerate(singles if masks.rows or bounds.names else ()):
+            of_row = info or {}
+            if num is not None:
+                of_row = {name: _of_row(of_row[name], row) for name in in_info if name in of_row}
+            masks.keep(row, single, of_row)
+            bounds.keep(row, single, of_row)
+        sizes = {keys.ACTION_MASK: actions.component_sizes}
+        rows = {name: checked_mask(name, mask, sizes.get(name, ())) for name, mask in masks.rows.items()}
+        if keys.PAIR_MASK in rows:
+            rows[keys.PAIR_MASK] = rows[keys.PAIR_MASK].unflatten(-1, (len(actions.parameter_dims), -1))
+        if bounds.names:
+            low, high, seen = of_agent(actions, bounds.low, bounds.high)
+            observed = np.concatenate([observed, seen], axis=-1)
+            rows |= {keys.PARAMETER_LOW: torch.from_numpy(low), keys.PARAMETER_HIGH: torch.from_numpy(high)}
+        rows[keys.OBSERVATION] = torch.from_numpy(observed)
         return TensorDict(rows, batch_size=[len(singles)]), num is not None
 
     def scaling(self) -> VectorScaling:
@@ -71,6 +81,15 @@ class OwnForm(GymnasiumForm):
             return actions[0]
         batch: Any = create_empty_array(self.action_space, len(actions))
         return concatenate(self.action_space, actions, batch)
+
+
+def _of_row(batch: Any, row: int) -> Any:
+    """Return one row of a batch of arrays, in tuples and dicts of any depth."""
+    if isinstance(batch, Mapping):
+        return {name: _of_row(part, row) for name, part in batch.items()}
+    if isinstance(batch, tuple):
+        return tuple(_of_row(part, row) for part in batch)
+    return None if batch is None else batch[row]
 
 
 def num_in_batch(space: spaces.Space, observation: Any) -> int | None:

@@ -14,8 +14,9 @@ from gymnasium import spaces
 
 from hpamdp import keys
 from hpamdp.env.errors import ProblemError
+from hpamdp.env.gymnasium.action_spaces import ActionSpace
 from hpamdp.env.gymnasium.leaves import leaves
-from hpamdp.env.gymnasium.values import as_numbers, shown
+from hpamdp.env.gymnasium.values import MisfitError, as_numbers, shown
 from hpamdp.settings import SettingError
 
 MaskSource = Literal["info", "ignore"]
@@ -27,6 +28,13 @@ _ADJECTIVES = "(?:avail|available|legal|valid|allowed|permitted|possible|feasibl
 _MEANINGS = {
     keys.ACTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}actions?(?:masks?)?|actions?masks?|masks?actions?)",
     keys.OPTION_MASK: f"{_VERBS}(?:{_ADJECTIVES}options?(?:masks?)?|options?masks?|masks?options?)",
+    keys.PAIR_MASK: f"{_VERBS}(?:{_ADJECTIVES}pairs?(?:masks?)?|pairs?masks?|masks?pairs?)",
+}
+# The setting that says where a mask is.
+_SETTINGS = {
+    keys.ACTION_MASK: "env.action_mask",
+    keys.OPTION_MASK: "env.action_mask",
+    keys.PAIR_MASK: "env.pair_mask",
 }
 # Types that need no search, which takes longer.
 _NO_MAPPINGS = frozenset((bool, int, float, str, tuple, list, np.ndarray, np.float32, np.float64, np.int64, type(None)))
@@ -40,30 +48,56 @@ class Masks:
     Args:
         env: one of the copies.
         num_envs: number of copies.
-        sizes: lengths of `action_mask` and `option_mask`. If 0, there is nothing to choose.
-        source: `info`: masks come with the info of every reset and step; `ignore`: they are ignored; None: they are
-            entries of the observation, a `Dict`, if it has them.
+        actions: their action space, without the option.
+        num_options: number of options; 0: there is none to choose.
+        source: where `action_mask` and `option_mask` are. `info`: they come with the info of every reset and step;
+            `ignore`: they are ignored; None: they are entries of the observation, a `Dict`, if it has them.
+        pair_source: the same for `pair_mask`.
 
     Attributes:
-        rows: the masks that are honoured, by name, bool `[N, K]` each.
-        in_observation: whether they come with the observation.
+        rows: the masks that are honoured, by name, bool `[N, K]` each; `pair_mask` is flattened, `[N, K K]`.
+        in_observation: names of the masks that come with the observation.
 
     Raises:
-        ValueError: `source` is none of these, or the environment has a mask in a place that is not read.
+        ValueError: a source is none of these, or the environment has a mask in a place that is not read.
     """
 
-    def __init__(self, env: gymnasium.Env, num_envs: int, sizes: Mapping[str, int], source: MaskSource | None) -> None:
-        if source not in (None, "info", "ignore"):
-            raise SettingError(f"action_mask={source}: must be info, ignore or null")
+    def __init__(
+        self,
+        env: gymnasium.Env,
+        num_envs: int,
+        actions: ActionSpace,
+        num_options: int,
+        source: MaskSource | None = None,
+        pair_source: MaskSource | None = None,
+    ) -> None:
+        for setting, given in (("action_mask", source), ("pair_mask", pair_source)):
+            if given not in (None, "info", "ignore"):
+                raise SettingError(f"{setting}={given}: must be info, ignore or null")
+        if pair_source == "info" and actions.num_components == 1:
+            raise SettingError("pair_mask=info: the action has one component, so there are no pairs; use null")
+        self._actions = actions
         space = env.observation_space
         entries = space.spaces if isinstance(space, spaces.Dict) else {}
-        sizes = {name: size for name, size in sizes.items() if size > 0 and source != "ignore"}
+        num = len(actions.parameter_dims)
+        sizes = {keys.ACTION_MASK: num, keys.OPTION_MASK: num_options}
+        if actions.num_components > 1:
+            sizes[keys.PAIR_MASK] = num * num
+        sources = {keys.ACTION_MASK: source, keys.OPTION_MASK: source, keys.PAIR_MASK: pair_source}
+        sizes = {name: size for name, size in sizes.items() if size > 0 and sources[name] != "ignore"}
         self.rows = {
-            name: np.ones((num_envs, size), bool) for name, size in sizes.items() if source == "info" or name in entries
+            name: np.ones((num_envs, size), bool)
+            for name, size in sizes.items()
+            if sources[name] == "info" or name in entries
         }
-        self.in_observation = source is None and bool(self.rows)
+        self.in_observation = frozenset(name for name in self.rows if sources[name] is None)
         self._unread = {name: size for name, size in sizes.items() if name not in self.rows}
         self._refuse([*_in_space(space), *_in_attributes(env, is_new=True)], ValueError)
+
+    @property
+    def needs_info(self) -> list[str]:
+        """Names of the masks that come with the info."""
+        return [name for name in self.rows if name not in self.in_observation]
 
     def keep(self, row: int, observation: Any, info: Mapping[str, Any]) -> None:
         """Keep the masks that one copy gives with a reset or a step.
@@ -76,19 +110,32 @@ class Masks:
         Raises:
             ProblemError: a mask is not made of 0 and 1 for each choice, or is in a place that is not read.
         """
-        source = observation if self.in_observation else info
         for name, masks in self.rows.items():
-            given = source.get(name)
+            given = (observation if name in self.in_observation else info).get(name)
             if given is None and name == keys.OPTION_MASK:
                 self._refuse([*_in_mapping("info", info)], ProblemError, {name: masks.shape[1]})
                 masks[row] = True
                 continue
-            mask = as_numbers(given)
-            if mask is None or mask.shape != masks[row].shape or ((mask != 0) & (mask != 1)).any():
-                raise ProblemError(f"gave {shown(given)} as {name}, which must be {masks.shape[1]} numbers, 0 or 1")
-            masks[row] = mask != 0
+            masks[row] = self._flat(name, given, masks.shape[1])
         if self._unread and not (_is_plain(info) and _is_plain(observation)):
             self._refuse([*_in_mapping("info", info), *_in_mapping("observation", observation)], ProblemError)
+
+    def _flat(self, name: str, given: Any, size: int) -> np.ndarray:
+        """Return a mask as bool `[size]`."""
+        if name == keys.ACTION_MASK:
+            try:
+                return self._actions.mask(given)
+            except MisfitError as error:
+                raise error.named(name, given) from error
+        mask = as_numbers(given)
+        num = len(self._actions.parameter_dims)
+        shape: tuple[int, ...] = (size,)
+        wanted = f"{size} numbers"
+        if name == keys.PAIR_MASK:
+            shape, wanted = (num, num), f"{num} rows of {num} numbers"
+        if mask is None or mask.shape != shape or ((mask != 0) & (mask != 1)).any():
+            raise ProblemError(f"gave {shown(given)} as {name}, which must be {wanted}, 0 or 1")
+        return (mask != 0).ravel()
 
     def check_attributes(self, env: gymnasium.Env) -> None:
         """Check the attributes that a copy has set since it was made.
@@ -108,9 +155,10 @@ class Masks:
             name = _meaning(entry)
             if name is None or name not in unread or (_is_vague(entry) and not _is_like_mask(value, unread[name])):
                 continue
+            setting = _SETTINGS[name]
             raise error(
                 f"gave an {name} as {place}, which is not read; give it as {name} in a Dict of observations, or in the "
-                "info of every reset and step with env.action_mask=info; env.action_mask=ignore ignores it"
+                f"info of every reset and step with {setting}=info; {setting}=ignore ignores it"
             )
 
 

@@ -27,8 +27,8 @@ _PATIENCE_S = 2.0  # until a dead process has an exit code
 _SILENT = 100  # a level of Gymnasium's logger
 # A terminal sends Ctrl-C to every process, and only the run's own process may act on it.
 _SIGNALS_OF_THE_RUN = (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
-# Columns of a table of actions before the parameters.
-_IS_STEPPED, _OPTION, _DISCRETE, _NUM_BEFORE = 0, 1, 2, 3
+# Columns of a table of actions: the discrete actions of all components follow, then the parameters.
+_IS_STEPPED, _OPTION, _DISCRETE = 0, 1, 2
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,14 @@ class _BlockEnv(gymnasium.Env):
         assert self._copies is not None
         actions = action[: self._block.num]
         rows = np.flatnonzero(actions[:, _IS_STEPPED]).tolist()
-        option, discrete = (actions[:, column].astype(np.int64) for column in (_OPTION, _DISCRETE))
+        option = actions[:, _OPTION].astype(np.int64)
+        num_components = self._copies.actions.num_components
+        first_parameter = _DISCRETE + num_components
+        discrete = actions[:, _DISCRETE:first_parameter].astype(np.int64)
+        if num_components == 1:
+            discrete = discrete[:, 0]
         has_options = self._copies.options.num_options > 0
-        self._copies.step(rows, option if has_options else None, discrete, actions[:, _NUM_BEFORE:])
+        self._copies.step(rows, option if has_options else None, discrete, actions[:, first_parameter:])
         return self._results(), 0.0, False, False, {}
 
     def close(self) -> None:
@@ -141,7 +146,8 @@ class ProcessCopies:
         self.table = np.zeros((num, self.layout.num_result_columns))
         self.results = self.layout.results(self.table)
         rows = -(-num // num_workers)
-        columns = (_NUM_BEFORE + sum(self.actions.parameter_dims), self.layout.num_result_columns)
+        self._first_parameter = _DISCRETE + self.actions.num_components
+        columns = (self._first_parameter + sum(self.actions.parameter_dims), self.layout.num_result_columns)
         blocks = [
             _Block(make, reading, name, first, min(rows, num - first), rows, columns) for first in range(0, num, rows)
         ]
@@ -165,8 +171,8 @@ class ProcessCopies:
         actions[rows, _IS_STEPPED] = 1.0
         if option is not None:
             actions[:num, _OPTION] = option
-        actions[:num, _DISCRETE] = discrete
-        actions[:num, _NUM_BEFORE:] = parameters
+        actions[:num, _DISCRETE : self._first_parameter] = discrete.reshape(num, -1)
+        actions[:num, self._first_parameter :] = parameters
         with self._explained():
             table = self._vector.step(actions.reshape(self._shape_of_actions))[0]
         self._keep(table)

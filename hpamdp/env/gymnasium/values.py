@@ -14,6 +14,24 @@ _FLOATS = (float, np.float64, np.float32)
 _FLAGS = (bool, np.bool_)
 
 
+class MisfitError(ProblemError):
+    """A value has another structure than it must have.
+
+    Args:
+        given: the value.
+        must_be: what it must be.
+    """
+
+    def __init__(self, given: Any, must_be: str) -> None:
+        super().__init__(f"gave {shown(given)}, which must be {must_be}")
+        self._given, self._must_be = given, must_be
+
+    def named(self, name: str, whole: Any) -> ProblemError:
+        """Return the error about an entry of this name, of which the value is the whole or a part."""
+        where = f"as {name}" if self._given is whole else f"in {name}"
+        return ProblemError(f"gave {shown(self._given)} {where}, which must be {self._must_be}")
+
+
 def as_numbers(value: Any) -> np.ndarray | None:
     """Return a value as an array of real numbers in its own dtype; None if it is anything else.
 

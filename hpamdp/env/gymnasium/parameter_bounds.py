@@ -1,0 +1,124 @@
+"""Bounds of the parameters that a Gymnasium environment gives with every state, and what an agent sees of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+from hpamdp import keys
+from hpamdp.env.errors import ProblemError
+from hpamdp.env.gymnasium.action_spaces import ActionSpace
+from hpamdp.env.gymnasium.masks import MaskSource
+from hpamdp.env.gymnasium.values import MisfitError
+from hpamdp.settings import SettingError
+
+_NAMES = (keys.PARAMETER_LOW, keys.PARAMETER_HIGH)
+_ROUNDING = 4.0 * float(np.finfo(np.float32).eps)  # beyond a bound of the space that counts as rounding
+
+
+class ParameterBounds:
+    """The bounds of the copies of an environment, which change with the state.
+
+    Args:
+        env: one of the copies.
+        num_envs: number of copies.
+        actions: their action space, without the option.
+        source: `info`: the bounds come with the info of every reset and step; `ignore`: they are not read; None: they
+            are entries of the observation, a `Dict`, if it has them.
+
+    Attributes:
+        names: which of `parameter_low` and `parameter_high` are read; empty if none is.
+        in_observation: whether they come with the observation.
+        low, high: the bounds in the space's own numbers, float64 `[N, num_parameters]`.
+
+    Raises:
+        ValueError: `source` is none of these, or there are no parameters.
+    """
+
+    def __init__(self, env: gymnasium.Env, num_envs: int, actions: ActionSpace, source: MaskSource | None) -> None:
+        if source not in (None, "info", "ignore"):
+            raise SettingError(f"parameter_bounds={source}: must be info, ignore or null")
+        space = env.observation_space
+        entries = space.spaces if isinstance(space, spaces.Dict) and source is None else {}
+        self.names = tuple(name for name in _NAMES if source == "info" or name in entries)
+        if self.names and not sum(actions.parameter_dims):
+            raise SettingError(f"{' and '.join(self.names)}: the action has no parameters")
+        self.in_observation = source is None and bool(self.names)
+        self._actions = actions
+        self.low = np.tile(actions.own_low, (num_envs, 1))
+        self.high = np.tile(actions.own_high, (num_envs, 1))
+
+    def keep(self, row: int, observation: Any, info: Mapping[str, Any]) -> None:
+        """Keep the bounds that one copy gives with a reset or a step.
+
+        Args:
+            row: the copy's number.
+            observation: as the environment gives it.
+            info: as the environment gives it.
+
+        Raises:
+            ProblemError: the bounds are missing, have another structure than the space, are not finite or whole, lie
+                outside the bounds of the space, or the lower one is above the upper one.
+        """
+        if not self.names:
+            return
+        source = observation if self.in_observation else info
+        given = {name: source.get(name) for name in self.names}
+        if all(value is None for value in given.values()):
+            raise ProblemError(f"gave no {' or '.join(self.names)}, one of which must come with every reset and step")
+        actions = self._actions
+        static = {keys.PARAMETER_LOW: actions.own_low, keys.PARAMETER_HIGH: actions.own_high}
+        bounds = [self._checked(name, given.get(name), static[name]) for name in _NAMES]
+        self._refuse_where(bounds[0] > bounds[1], "parameter_low", bounds[0], "above parameter_high={}", bounds[1])
+        self.low[row], self.high[row] = bounds
+
+    def _checked(self, name: str, given: Any, static: np.ndarray) -> np.ndarray:
+        actions = self._actions
+        try:
+            bound = static if given is None else actions.bound(given, static)
+        except MisfitError as error:
+            raise error.named(name, given) from error
+        self._refuse_where(~np.isfinite(bound), name, bound, "which is not finite")
+        self._refuse_where(actions.is_whole & (bound != np.rint(bound)), name, bound, "but the parameter is whole")
+        low, high = actions.own_low, actions.own_high
+        slack = np.where(actions.is_whole, 0.0, _ROUNDING * np.maximum(np.abs(low), np.abs(high)))
+        is_outside = (bound < low - slack) | (bound > high + slack)
+        self._refuse_where(is_outside, name, bound, "outside the action space: {} to {}", low, high)
+        return bound.clip(low, high)
+
+    @staticmethod
+    def _refuse_where(is_wrong: np.ndarray, name: str, bound: np.ndarray, why: str, *others: np.ndarray) -> None:
+        if is_wrong.any():
+            place = int(is_wrong.argmax())
+            reason = why.format(*(f"{other[place]:.10g}" for other in others))
+            raise ProblemError(f"gave {name}={bound[place]:.10g} for parameter {place}, {reason}")
+
+
+def of_agent(actions: ActionSpace, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the bounds of states as an agent gets them.
+
+    Args:
+        actions: the action space.
+        low, high: the bounds in the space's own numbers, float64 `[N, num_parameters]` each.
+
+    Returns:
+        The bounds of the agent's parameters, float32 `[N, num_parameters]` each: every float32 between them is inside
+        the exact ones. And what the agent observes of them: both, scaled so that the bounds of the space are -1 and 1,
+        float32 `[N, 2 num_parameters]`.
+    """
+    exact = actions.of_agent(low), actions.of_agent(high)
+    width = actions.high.astype(np.float64) - actions.low
+    seen = np.concatenate([2.0 * (side - actions.low) / width - 1.0 for side in exact], axis=-1)
+    lowest, highest = (side.astype(np.float32) for side in exact)
+    lowest = np.where(lowest < exact[0], np.nextafter(lowest, np.float32(np.inf)), lowest)
+    highest = np.where(highest > exact[1], np.nextafter(highest, np.float32(-np.inf)), highest)
+    is_crossed = lowest > highest  # no float32 lies between
+    lowest = np.where(low <= actions.own_low, actions.low, lowest)
+    highest = np.where(high >= actions.own_high, actions.high, highest)
+    lowest, highest = (side.clip(actions.low, actions.high) for side in (lowest, highest))
+    highest = np.where(is_crossed | (lowest > highest), lowest, highest)
+    return lowest, highest, seen.clip(-1.0, 1.0).astype(np.float32)

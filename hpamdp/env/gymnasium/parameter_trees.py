@@ -1,0 +1,327 @@
+"""Trees of Gymnasium spaces whose numbers are all parameters of one discrete action, or of several side by side.
+
+A `Box` gives one parameter for each number, a `Discrete`, `MultiDiscrete` or `MultiBinary` one whole number for each
+entry. A `OneOf` gives a whole number, the alternative, then the parameters of all alternatives. An entry that allows
+one value alone, such as `Discrete(1)`, gives no parameter.
+
+An agent's parameters are float32. Usually they are the numbers of the space. There are three exceptions, in which
+float32 cannot hold these:
+
+- In some more precise Boxes float32 cannot resolve a millionth of the width, as with times in seconds since 1970. The
+  agent's parameter then lies in [-1, 1], and is mapped to the Box in float64.
+- Whole numbers beyond 16,777,216 are counted from their lower bound.
+- If there are more than 16,777,216 whole numbers between the bounds, the agent's parameter is a real number in [-1, 1].
+  Each whole number has a cell of equal width.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from hpamdp.env.gymnasium.values import MisfitError, as_numbers
+
+# Of a parameter, in widths of its Box.
+_RESOLUTION = 1e-6
+_MOST_EXACT = float(1 << 24)  # up to which float32 holds all whole numbers
+_MOST_WHOLE = 1 << 53  # the same for float64
+_WHOLE = np.dtype(np.int64)  # stands for all dtypes of whole numbers
+
+# From parameters by dtype, `[M, size]` each and inside their bounds, to M values of a space.
+_Build = Callable[[Mapping[np.dtype, np.ndarray]], list[Any]]
+
+
+class NotAcceptedError(ValueError):
+    """Why a space is not accepted, without the space's name."""
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """A space without parts, and where its parameters are.
+
+    Attributes:
+        space: a `Box`, `Discrete`, `MultiDiscrete` or `MultiBinary`.
+        low, high: bounds of its numbers, float64 `[numbers]`.
+        is_free: which numbers are parameters; the others have one value, bool `[numbers]`.
+        own: of the parameters.
+        start: number of the first parameter.
+    """
+
+    space: spaces.Space
+    low: np.ndarray
+    high: np.ndarray
+    is_free: np.ndarray
+    start: int
+
+    @property
+    def own(self) -> slice:
+        """The parameters' place."""
+        return slice(self.start, self.start + int(self.is_free.sum()))
+
+    @property
+    def is_float(self) -> bool:
+        """Whether the numbers are not whole."""
+        return self.space.dtype is not None and np.dtype(self.space.dtype).kind == "f"
+
+
+class ParameterTree:
+    """The parameters of a tree of spaces, and the way from parameters to its values.
+
+    Args:
+        space: see the module's docstring.
+
+    Attributes:
+        size: number of parameters.
+        low, high: bounds of the agent's parameters, float64 `[size]`.
+        is_integer: which of the agent's parameters are whole numbers, bool `[size]`.
+
+    Raises:
+        NotAcceptedError: the tree has another space in it, or bounds that are not finite.
+    """
+
+    def __init__(self, space: spaces.Space) -> None:
+        self.size = 0
+        self._entries: list[_Entry] = []
+        self._build, self._fill = self._read(space)
+        self._lows = self._joined("low")
+        self._highs = self._joined("high")
+        is_float = self._spread(lambda entry: entry.is_float)
+        is_precise = self._spread(lambda entry: entry.is_float and np.dtype(entry.space.dtype).itemsize > 4)
+        with np.errstate(over="ignore"):
+            floats = {np.dtype(entry.space.dtype) for entry in self._entries if entry.is_float}
+            self._bounds = {dtype: (self._lows.astype(dtype), self._highs.astype(dtype)) for dtype in floats}
+        if len(floats) == 0 or not all(entry.is_float for entry in self._entries):
+            self._bounds[_WHOLE] = (self._lows, self._highs)
+        is_many = ~is_float & (self._highs - self._lows >= _MOST_EXACT)
+        largest = np.maximum(np.abs(self._lows), np.abs(self._highs))
+        self._is_unit = (is_precise & ~_is_resolved(self._lows, self._highs)) | is_many
+        self._is_many = is_many
+        # Of whole numbers that float32 holds only if they are counted from the lowest.
+        self._shift = np.where(~is_float & ~is_many & (largest > _MOST_EXACT), self._lows, 0.0)
+        self._is_mapped = bool(self._is_unit.any() or self._shift.any())
+        self.low = np.where(self._is_unit, -1.0, self._lows - self._shift)
+        self.high = np.where(self._is_unit, 1.0, self._highs - self._shift)
+        self.is_integer = ~is_float & ~is_many
+
+    def natives(self, parameters: np.ndarray, bounds: tuple[np.ndarray, np.ndarray] | None = None) -> list[Any]:
+        """Return values of the space.
+
+        Args:
+            parameters: the agent's, `[M, size]`. Values outside their bounds are clipped, and NaN becomes the lower
+                bound. Whole numbers are rounded to the nearest one.
+            bounds: narrower bounds in the space's own numbers, float64 `[M, size]` each.
+        """
+        if self._is_mapped:
+            parameters = self._mapped(parameters)
+        # Clipped in the space's own precision: its bounds may differ from the float32 ones by rounding. fmax skips NaN.
+        clipped = {}
+        for dtype, (low, high) in self._bounds.items():
+            values: Any = np.rint(parameters.astype(np.float64)) if dtype == _WHOLE else _cast(parameters, dtype)
+            if bounds is not None:
+                low, high = (side if dtype == _WHOLE else _cast(side, dtype) for side in bounds)
+            clipped[dtype] = np.fmin(np.fmax(values, low), high)
+        return self._build(clipped)
+
+    def _mapped(self, parameters: np.ndarray) -> np.ndarray:
+        """Return the agent's parameters `[M, size]` in the space's own numbers."""
+        share = 0.5 * (np.clip(parameters.astype(np.float64), -1.0, 1.0) + 1.0)
+        width = self._highs - self._lows
+        units = self._lows + np.where(self._is_many, np.floor(share * (width + 1.0)), share * width)
+        return np.where(self._is_unit, units, np.where(self._shift != 0.0, parameters + self._shift, parameters))
+
+    def of_agent(self, numbers: np.ndarray) -> np.ndarray:
+        """Return the space's own numbers `[*M, size]` as the agent's parameters, float64."""
+        width = self._highs - self._lows
+        cell = np.where(self._is_many, 0.5, 0.0)
+        with np.errstate(invalid="ignore"):
+            units = 2.0 * (numbers - self._lows + cell) / np.maximum(width + 2.0 * cell, np.finfo(float).tiny) - 1.0
+        return np.where(self._is_unit, units, numbers - self._shift)
+
+    @property
+    def own_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """The bounds in the space's own numbers, float64 `[size]` each."""
+        return self._lows, self._highs
+
+    @property
+    def is_whole(self) -> np.ndarray:
+        """Which of the space's own numbers are whole, bool `[size]`."""
+        return self.is_integer | self._is_many
+
+    def fill(self, given: Any, numbers: np.ndarray) -> None:
+        """Write numbers that are given in the structure of the space into a vector of the space's own numbers.
+
+        Args:
+            given: as a value of the space, except that parts may be None or, in a dict, missing. They change nothing.
+                So do choices of alternatives.
+            numbers: float64 `[size]`.
+
+        Raises:
+            MisfitError: `given` has another structure.
+        """
+        self._fill(given, numbers)
+
+    def _read(self, space: spaces.Space) -> tuple[_Build, Callable[[Any, np.ndarray], None]]:
+        """Return how values of the space are built from parameters, and how parameters are read from a value."""
+        if isinstance(space, spaces.Tuple):
+            parts = [self._read(part) for part in space.spaces]
+            return _build_tuple([part[0] for part in parts]), _fill_sequence([part[1] for part in parts])
+        if isinstance(space, spaces.Dict):
+            named = {name: self._read(part) for name, part in space.spaces.items()}
+            return _build_dict({name: part[0] for name, part in named.items()}), _fill_mapping(
+                {name: part[1] for name, part in named.items()}
+            )
+        if isinstance(space, spaces.OneOf):
+            number = self._read(spaces.Discrete(len(space.spaces)))[0]
+            parts = [self._read(part) for part in space.spaces]
+            return _build_one_of(number, [part[0] for part in parts]), _fill_sequence([part[1] for part in parts])
+        low, high, is_free = bounds_of(space)
+        entry = _Entry(space, low, high, is_free, self.size)
+        self._entries.append(entry)
+        self.size = entry.own.stop
+        return _build_entry(entry), _fill_entry(entry)
+
+    def _joined(self, name: str) -> np.ndarray:
+        parts = [getattr(entry, name)[entry.is_free] for entry in self._entries]
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def _spread(self, of_entry: Callable[[_Entry], bool]) -> np.ndarray:
+        parts = [np.full(int(entry.is_free.sum()), of_entry(entry)) for entry in self._entries]
+        return np.concatenate(parts) if parts else np.zeros(0, bool)
+
+
+def bounds_of(space: spaces.Space) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the bounds of a space without parts, float64 `[numbers]` each, and which numbers can vary, bool.
+
+    Raises:
+        NotAcceptedError: the space is of another kind, or its bounds are not finite.
+    """
+    if isinstance(space, spaces.Discrete):
+        low, high = np.array([space.start], np.int64), np.array([space.start + space.n - 1], np.int64)
+    elif isinstance(space, spaces.MultiDiscrete):
+        low = np.asarray(space.start, np.int64).ravel()
+        high = low + np.asarray(space.nvec, np.int64).ravel() - 1
+    elif isinstance(space, spaces.MultiBinary):
+        low, high = np.zeros(int(np.prod(space.shape)), np.int64), np.ones(int(np.prod(space.shape)), np.int64)
+    elif isinstance(space, spaces.Box) and space.dtype.kind in "f":
+        return _float_bounds(space)
+    elif isinstance(space, spaces.Box) and space.dtype.kind in "iub":
+        low, high = space.low.ravel(), space.high.ravel()
+        if not space.is_bounded():
+            raise NotAcceptedError("parameters must have finite bounds, at most 9e15 for whole numbers")
+        if not (low < high).all():
+            raise NotAcceptedError("a parameter's lower bound must be less than its upper bound")
+    else:
+        raise NotAcceptedError(f"has a {type(space).__name__}")
+    if any(abs(int(bound)) > _MOST_WHOLE for bound in (*low, *high)):
+        raise NotAcceptedError("parameters must have finite bounds, at most 9e15 for whole numbers")
+    return low.astype(np.float64), high.astype(np.float64), low < high
+
+
+def _float_bounds(box: spaces.Box) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not np.isfinite(box.high.astype(np.float32) - box.low.astype(np.float32)).all():
+            raise NotAcceptedError("parameters must have finite bounds, at most 3.4e38 apart")
+    if not (box.low < box.high).all():
+        raise NotAcceptedError("a parameter's lower bound must be less than its upper bound")
+    return box.low.ravel().astype(np.float64), box.high.ravel().astype(np.float64), np.ones(box.low.size, bool)
+
+
+def _build_entry(entry: _Entry) -> _Build:
+    space, own = entry.space, entry.own
+    key = np.dtype(space.dtype) if entry.is_float else _WHOLE
+    shape = space.shape or ()
+    if entry.is_float:
+        return lambda columns: by_row(columns[key][:, own], shape)
+    kind = np.dtype(space.dtype)
+    fixed, is_free, is_scalar = entry.low, entry.is_free, isinstance(space, spaces.Discrete)
+
+    def build(columns: Mapping[np.dtype, np.ndarray]) -> list[Any]:
+        values = columns[key][:, own]
+        if not is_free.all():
+            free, values = values, np.tile(fixed, (len(values), 1))
+            values[:, is_free] = free
+        values = values.astype(kind)
+        return list(values[:, 0]) if is_scalar else by_row(values, shape)
+
+    return build
+
+
+def _build_tuple(parts: Sequence[_Build]) -> _Build:
+    if not parts:
+        return lambda columns: [()] * len(next(iter(columns.values())))
+    return lambda columns: list(zip(*[part(columns) for part in parts], strict=True))
+
+
+def _build_dict(parts: Mapping[str, _Build]) -> _Build:
+    build = _build_tuple([*parts.values()])
+    return lambda columns: [dict(zip(parts, values, strict=True)) for values in build(columns)]
+
+
+def _build_one_of(number: _Build, parts: Sequence[_Build]) -> _Build:
+    build = _build_tuple(parts)
+    return lambda columns: [
+        (index, values[int(index)]) for index, values in zip(number(columns), build(columns), strict=True)
+    ]
+
+
+def _fill_entry(entry: _Entry) -> Callable[[Any, np.ndarray], None]:
+    shape = entry.space.shape or ()
+
+    def fill(given: Any, numbers: np.ndarray) -> None:
+        if given is None:
+            return
+        values = as_numbers(given)
+        if values is None or values.shape != shape:
+            raise MisfitError(given, f"of shape {shape} of {entry.space}")
+        numbers[entry.own] = values.astype(np.float64).ravel()[entry.is_free]
+
+    return fill
+
+
+def _fill_sequence(parts: Sequence[Callable[[Any, np.ndarray], None]]) -> Callable[[Any, np.ndarray], None]:
+    def fill(given: Any, numbers: np.ndarray) -> None:
+        if given is None:
+            return
+        if not isinstance(given, tuple | list) or len(given) != len(parts):
+            raise MisfitError(given, f"a tuple of {len(parts)} parts")
+        for part, value in zip(parts, given, strict=True):
+            part(value, numbers)
+
+    return fill
+
+
+def _fill_mapping(parts: Mapping[str, Callable[[Any, np.ndarray], None]]) -> Callable[[Any, np.ndarray], None]:
+    def fill(given: Any, numbers: np.ndarray) -> None:
+        if given is None:
+            return
+        if not isinstance(given, Mapping) or not given.keys() <= parts.keys():
+            raise MisfitError(given, f"a dict with names of {list(parts)}")
+        for name, value in given.items():
+            parts[name](value, numbers)
+
+    return fill
+
+
+def by_row(values: np.ndarray, shape: tuple[int, ...]) -> list[np.ndarray]:
+    """Return the rows of values `[M, size]` as arrays of this shape."""
+    if len(shape) == 1:  # as a rule
+        return list(values)
+    rows = values.reshape(len(values), *shape)
+    return list(rows) if shape else [rows[row, ...] for row in range(len(rows))]
+
+
+def _cast(parameters: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    if dtype.itemsize >= 4:
+        return parameters.astype(dtype, copy=False)
+    with np.errstate(over="ignore"):  # parameters of other boxes
+        return parameters.astype(dtype)
+
+
+def _is_resolved(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return whether neighbouring numbers of float32 within the bounds lie at most a millionth of their width apart."""
+    largest = np.maximum(np.abs(low), np.abs(high)).astype(np.float32)
+    return np.spacing(largest).astype(np.float64) <= _RESOLUTION * (high - low)
