@@ -146,6 +146,21 @@ def _exploring_value(learner: Learner, observation: Tensor, *masks: Tensor) -> T
     return learner.value(observation, *masks)
 
 
+def _value(
+    learner: Learner,
+    observation: Tensor,
+    action_mask: Tensor | None,
+    memory: TensorDictBase | None,
+    has_seen: bool,
+) -> Tensor:
+    """Return a learner's values `[N]`, see `NextOptions.value`."""
+    given = [] if action_mask is None else [action_mask]
+    held = None if memory is None or learner.memory_key is None else memory.get(learner.memory_key, None)
+    if held is None:
+        return learner.value(observation, *given)
+    return learner.value(observation, *given, memory=held, has_seen=has_seen)  # type: ignore[call-arg]
+
+
 class HeldOption(TensorDictModuleBase):
     """The same option in every environment at every step, or the first allowed option if it is forbidden."""
 
@@ -179,23 +194,27 @@ class AgentNextOptions:
         self.sees_observation_alone = {*selector.in_keys} <= {keys.OBSERVATION, keys.IS_DECISION}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, option: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the values `[N]` of states under the options chosen there.
-
-        Args:
-            observation: of the states, `[N, observation_dim]`.
-            option: the options chosen there, `[N]`.
-            action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
-        """
-        masks = () if action_mask is None else (action_mask,)
+    def value(
+        self,
+        observation: Tensor,
+        option: Tensor,
+        action_mask: Tensor | None = None,
+        memory: TensorDictBase | None = None,
+        *,
+        has_seen: bool = False,
+    ) -> Tensor:
+        """Return the values `[N]` of states under the options chosen there, see `NextOptions.value`."""
         if self.is_shared:
             one_hot = F.one_hot(option, self.num_options).to(observation)
-            return self.learners[0].value(torch.cat([self._without_option(observation), one_hot], -1), *masks)
+            seen = torch.cat([self._without_option(observation), one_hot], -1)
+            return _value(self.learners[0], seen, action_mask, memory, has_seen)
         value = observation.new_zeros(len(observation))
         for i, learner in enumerate(self.learners):
             rows = option == i
             if rows.any():
-                value[rows] = learner.value(observation[rows], *(mask[rows] for mask in masks))
+                mask = None if action_mask is None else action_mask[rows]
+                held = None if memory is None else memory[rows]
+                value[rows] = _value(learner, observation[rows], mask, held, has_seen)
         return value
 
     @property

@@ -54,13 +54,24 @@ class NextOptions(Protocol):
     own learner. Learners reach one another in this way only. Observations are in the form that the asking learner sees.
     """
 
-    def value(self, observation: Tensor, option: Tensor, action_mask: Tensor | None = None) -> Tensor:
+    def value(
+        self,
+        observation: Tensor,
+        option: Tensor,
+        action_mask: Tensor | None = None,
+        memory: TensorDictBase | None = None,
+        *,
+        has_seen: bool = False,
+    ) -> Tensor:
         """Return the values `[N]` of states under the options chosen there.
 
         Args:
             observation: of the states, `[N, observation_dim]`.
             option: the options chosen there, `[N]`.
             action_mask: the allowed discrete actions, bool `[N, num_discrete]`. If None, all are.
+            memory: what the learners' policies remember there, `[N]`, under each learner's `memory_key`; zeros where an
+                option begins. If None, nothing.
+            has_seen: whether these memories have seen the observations already.
         """
         ...
 
@@ -401,6 +412,7 @@ class Learner(Level, nn.Module):
             several components, see `hpamdp.components`; with `PARAMETER_BOUNDS`, hand the step to `specs.from_unit` and
             `specs.to_unit`.
         value_setting: setting that must be true for `value` to work. If None, `value` always works.
+        memory_key: under which the policy's memory of earlier observations lies in a step, if `value` depends on it.
         progress: the buffers, by the last part of their names, that count the steps of a run, or follow from such
             counters. They start afresh if a new run takes over the learner.
         next_options: which options follow one that ended, and their values. The agent sets it.
@@ -410,6 +422,7 @@ class Learner(Level, nn.Module):
     modes: ClassVar[tuple[str, ...]] = ("train",)
     takes: ClassVar[frozenset[ActionFeature]] = frozenset()
     value_setting: ClassVar[str | None] = None
+    memory_key: str | None = None
     progress: ClassVar[frozenset[str]] = frozenset({"frames", "epsilon", "is_random"})
 
     policy: TensorDictModuleBase
@@ -433,7 +446,8 @@ class Learner(Level, nn.Module):
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the values `[N]` of states `[N, observation_dim]` from which this learner would bootstrap.
 
-        Target networks give the value, if the learner has any.
+        Target networks give the value, if the learner has any. A learner with a `memory_key` takes the further
+        arguments `memory`, `[N, *]`, and `has_seen`, see `NextOptions.value`.
 
         Args:
             observation: of the states.

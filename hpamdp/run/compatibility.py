@@ -92,6 +92,12 @@ def _levels(config: Config) -> list[Component]:
     return [config.high, *config.learners]
 
 
+def _memory(component: Component) -> str | None:
+    """Return what a level remembers by, `stack` or `gru`; None if nothing."""
+    memory = component.settings.get("memory")
+    return str(memory) if memory in ("stack", "gru") else None  # a bandit's memory is another thing
+
+
 def _needs(component: Component) -> tuple[str, ...]:
     return getattr(component.cls, "needs", ())
 
@@ -192,6 +198,37 @@ def compared_learners_have_values(config: Config) -> str | None:
             return f"{config.high}: {low} has no value to compare without low.{setting}=true"
         if not _overrides(low.cls, "value", base="hpamdp.policies.base"):
             return f"{config.high}: {low} has no value to compare; use another low or another high"
+    return None
+
+
+# Rules about what the levels remember.
+
+
+def memories_have_own_steps(config: Config) -> str | None:
+    """Refuse data sets for a level with a memory, whose states only a policy that acts can store."""
+    if config.run.mode == "eval" or config.data.cls is None:
+        return None
+    for level in _levels(config):
+        if _memory(level) is not None:
+            return f"{level.group}.memory={_memory(level)}: {config.data} lacks what a policy remembered; use data=none"
+    return None
+
+
+def memories_have_values(config: Config) -> str | None:
+    """Refuse to value options without the memory on which the value depends."""
+    low, run = config.low, config.run.agent
+    if _memory(low) is not None and run.sharing == "shared" and getattr(config.high.cls, "asks_learners", False):
+        return (
+            f"{config.high}: agent.sharing=shared with low.memory={_memory(low)} has values only of what the policy "
+            "remembers; use agent.sharing=per_option or low.memory=none"
+        )
+    settings = "memory", "memory_size", "stack_steps"
+    memories = {tuple(each.settings[name] for name in settings if _memory(each)) for each in config.learners}
+    if run.termination != "episode" and len(memories) > 1:
+        return (
+            f"low.per_option: agent.termination={run.termination} needs the same memory, memory_size and stack_steps "
+            "in all learners, which value each other's states"
+        )
     return None
 
 
@@ -370,6 +407,8 @@ RULES: tuple[Rule, ...] = (
     offline_runs_have_data,
     levels_support_the_mode,
     n_step_fits_a_batch,
+    memories_have_own_steps,
+    memories_have_values,
     compared_learners_have_values,
     collector_fits_the_run,
     workers_get_what_python_passed,

@@ -13,6 +13,8 @@ Differs from the source:
 - The Gaussian's standard deviation has a lower limit. Without it the ratios explode when the standard deviation shrinks
   faster than the mean moves. This limit, the learning rate and the entropy bonus are annealed over `anneal_steps`.
 - With `vector_products` actors and critic also see products of the vectors that the problem declares.
+- With `memory` actors and critic share a memory of the history. A recurrent one is trained on whole sequences, each
+  from the state that was stored at its first step.
 
 The advantages are TorchRL's. Its ClipPPOLoss does not fit: it multiplies the ratios of all heads and clips the
 product.
@@ -20,7 +22,7 @@ product.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 import torch
@@ -38,6 +40,7 @@ from hpamdp.policies.shared.default_dtype import float32_by_default
 from hpamdp.policies.shared.exported_policy import exported_actor
 from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, HybridPolicy, encoder
 from hpamdp.policies.shared.hybrid_distribution import HybridDistribution
+from hpamdp.policies.shared.memory import MemoryOptions
 from hpamdp.policies.shared.networks import InitialParameters
 from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_scalars, normalised
 from hpamdp.policies.shared.perception import Perception
@@ -45,7 +48,7 @@ from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
 
 
-class HPPOOptions(HeadOptions, OnPolicyOptions):
+class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Settings of `HPPO`. Standard deviations are in units where the parameters' bounds are [-1, 1]."""
 
     hidden_dims: Annotated[Widths, Field(min_length=1)] = (128, 128)
@@ -125,7 +128,8 @@ class HPPO(OnPolicy, Learner):
         super().__init__(specs)
         options = HPPOOptions.of(options, settings)
         self.options: HPPOOptions = options
-        self.perception = Perception(specs)
+        self.perception = Perception(specs, options)
+        self.memory_key = self.perception.memory_key
         actor = AutoregressiveActor if options.autoregressive else HybridActor
         self.actor = actor(
             self.perception.specs,
@@ -217,6 +221,11 @@ class HPPO(OnPolicy, Learner):
             rows[keys.ACTION_MASK] = batch.get(keys.ACTION_MASK)[mask]
         if self.specs.has_pair_mask:
             rows[keys.PAIR_MASK] = batch.get(keys.PAIR_MASK)[mask]
+        if self.memory_key is not None:
+            rows["memory"] = batch.get(self.memory_key)[mask]
+        if self.perception.is_recurrent:
+            rows["begins"] = self.perception.begins(batch)[mask]
+            rows["starts"] = sequence_starts(self.perception.begins(batch), mask, self.options.sequence_length)[mask]
         log_probs = self._distribution(self.features(rows), rows).log_prob(rows["discrete"], rows[RAW])
         rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
         return TensorDict(rows, batch_size=[int(mask.sum())])
@@ -233,7 +242,26 @@ class HPPO(OnPolicy, Learner):
             columns[keys.ACTION_MASK] = torch.zeros(0, self.specs.num_discrete, dtype=torch.bool)
         if self.specs.has_pair_mask:
             columns[keys.PAIR_MASK] = torch.zeros(0, *[self.specs.num_discrete] * 2, dtype=torch.bool)
+        if self.perception.memory is not None:
+            columns["memory"] = torch.zeros(0, self.perception.memory.size, dtype=torch.float32)
+        if self.perception.is_recurrent:
+            columns |= dict.fromkeys(("begins", "starts"), number.bool())
         return columns
+
+    def minibatches(self, rows: TensorDict) -> Iterator[dict[str, Tensor]]:
+        """Yield random minibatches of the gathered rows `[M]`, of whole sequences if the memory is recurrent."""
+        if not self.perception.is_recurrent:
+            yield from super().minibatches(rows)
+            return
+        columns = dict(rows.items())
+        sequence = rows["starts"].long().cumsum(0) - 1
+        num = int(sequence[-1]) + 1
+        for _ in range(self.options.epochs):
+            order = torch.randperm(num, device=rows.device)
+            for chosen in order.tensor_split(min(num, len(rows) // self.options.minibatch_size)):
+                is_chosen = torch.zeros(num, dtype=torch.bool, device=rows.device).index_fill(0, chosen, True)
+                indices = is_chosen[sequence].nonzero().squeeze(-1)
+                yield {name: column.index_select(0, indices) for name, column in columns.items()}
 
     @torch.no_grad()
     def advantages(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
@@ -245,8 +273,8 @@ class HPPO(OnPolicy, Learner):
         """
         after = batch.get("next")
         if keys.OPTION_ENDED in after.keys():
-            value = self._value_under(batch.get(keys.OPTION), batch)
-            next_value = self._value_under(batch.get(keys.NEXT_OPTION), after)
+            value = self._value_under(batch.get(keys.OPTION), batch, self._memory(batch), has_seen=True)
+            next_value = self._value_under(batch.get(keys.NEXT_OPTION), after, self._held_on(batch))
             reward = after.get(keys.REWARD)
         else:
             value, next_value = self._own_values(batch, mask)
@@ -259,19 +287,38 @@ class HPPO(OnPolicy, Learner):
             )
         return advantage.squeeze(-1), target.squeeze(-1)
 
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return V(s), `[N]`."""
-        return self.critic(self.perception(observation)).squeeze(-1)
+    def value(
+        self,
+        observation: Tensor,
+        action_mask: Tensor | None = None,
+        memory: Tensor | None = None,
+        *,
+        has_seen: bool = False,
+    ) -> Tensor:
+        """Return V(s), `[N]`, given what the policy remembers there; see `NextOptions.value`."""
+        return self.critic(self.perception(observation, memory, has_seen=has_seen)).squeeze(-1)
 
     def features(self, rows: Mapping[str, Tensor]) -> Tensor:
         """Return what actors and critic see of rows `[N]`, `[N, perception.specs.observation_dim]`."""
-        features: Tensor = self.perception(rows[keys.OBSERVATION])
+        if self.perception.is_recurrent:
+            columns = (rows[name] for name in (keys.OBSERVATION, "memory", "begins", "starts"))
+            return self.perception.of_sequences(*columns)
+        features: Tensor = self.perception(rows[keys.OBSERVATION], rows.get("memory", None), has_seen=True)
         return features
+
+    def _memory(self, batch: TensorDictBase) -> Tensor | None:
+        return None if self.memory_key is None else batch.get(self.memory_key)
 
     def _own_values(self, batch: TensorDictBase, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Return the values of the states and of the next states, `[*B, T, 1]`, 0 outside `mask`."""
+        memory = self._memory(batch)
+
+        def value_of(states: TensorDictBase, rows: Tensor, *, has_seen: bool) -> Tensor:
+            held = None if memory is None else memory[rows]
+            return self.value(states.get(keys.OBSERVATION)[rows], memory=held, has_seen=has_seen).unsqueeze(-1)
+
         value = torch.zeros(*mask.shape, 1, device=mask.device, dtype=torch.float32)
-        value[mask] = self.value(batch.get(keys.OBSERVATION)[mask]).unsqueeze(-1)
+        value[mask] = value_of(batch, mask, has_seen=True)
         # The next state is that of the next row, except after the last row and where an episode is truncated.
         next_value = torch.zeros_like(value)
         next_value[..., :-1, :] = value[..., 1:, :]
@@ -279,14 +326,34 @@ class HPPO(OnPolicy, Learner):
         is_another = done.clone()
         is_another[..., -1] = True
         is_another &= mask & ~terminated
-        next_value[is_another] = self.value(batch.get(("next", keys.OBSERVATION))[is_another]).unsqueeze(-1)
+        next_value[is_another] = value_of(batch.get("next"), is_another, has_seen=False)
         return value, next_value
 
-    def _value_under(self, option: Tensor, states: TensorDictBase) -> Tensor:
-        """Return the values `[*B, T, 1]` of states `[*B, T]` under options `[*B, T]`."""
+    def _value_under(
+        self, option: Tensor, states: TensorDictBase, memory: Tensor | None, *, has_seen: bool = False
+    ) -> Tensor:
+        """Return the values `[*B, T, 1]` of states `[*B, T]` under options `[*B, T]`; see `NextOptions.value`."""
         observation = states.get(keys.OBSERVATION).flatten(0, -2)
-        masks = [states.get(keys.ACTION_MASK).flatten(0, -2)] if self.specs.has_action_mask else []
-        return self.next_options.value(observation, option.flatten(), *masks).reshape(*option.shape, 1)
+        mask = states.get(keys.ACTION_MASK).flatten(0, -2) if self.specs.has_action_mask else None
+        held = None
+        if memory is not None:
+            held = TensorDict({self.memory_key: memory.flatten(0, -2)}, [len(observation)])
+        value = self.next_options.value(observation, option.flatten(), mask, held, has_seen=has_seen)
+        return value.reshape(*option.shape, 1)
+
+    def _held_on(self, batch: TensorDictBase) -> Tensor | None:
+        """Return the memories `[*B, T, size]` with which learners go on; zeros where they begin anew."""
+        if self.memory_key is None:
+            return None
+        memory: Tensor = batch.get(self.memory_key)
+        if self.perception.lasts_an_episode:
+            return memory
+        is_ended = batch.get(("next", keys.OPTION_ENDED)).squeeze(-1)
+        if self.next_options.decides_ends:
+            # The next batch will show whether the last step's option ends. It goes on if the selector would hold it.
+            is_ended = is_ended.clone()
+            is_ended[..., -1] &= (batch.get(keys.NEXT_OPTION) != batch.get(keys.OPTION))[..., -1]
+        return torch.where(is_ended.unsqueeze(-1), 0.0, memory)
 
     def _distribution(self, features: Tensor, rows: Mapping[str, Tensor]) -> HybridDistribution:
         allowed = self.specs.allowed(rows[keys.OBSERVATION], rows.get(keys.ACTION_MASK, None))
@@ -294,7 +361,12 @@ class HPPO(OnPolicy, Learner):
         return self.actor.given(features, rows["discrete"], rows[RAW], allowed, pair_mask)
 
     def compile_updates(self) -> None:
-        """Compile the loss and its gradient, at the first update."""
+        """Compile the loss and its gradient, at the first update.
+
+        Raises:
+            ValueError: it cannot be traced, or this machine cannot compile.
+        """
+        self.perception.check_traceable()
         # Minibatches differ in size where other options take their share of the steps.
         self.descent.compile(self.frames.device, any_size=True, while_compiling=lambda: self.while_compiling())
 
@@ -315,6 +387,20 @@ class HPPO(OnPolicy, Learner):
     def steps_to_update(self) -> dict[str, int]:
         """Return the size of a minibatch."""
         return {"minibatch_size": self.options.minibatch_size}
+
+
+def sequence_starts(begins: Tensor, mask: Tensor, length: int) -> Tensor:
+    """Return where sequences start, bool `[*B, T]`: where a history begins, or goes on, and then every `length` rows.
+
+    Args:
+        begins: where a history begins, bool `[*B, T]`.
+        mask: the learner's own rows, bool `[*B, T]`.
+        length: the most rows of a sequence.
+    """
+    time = torch.arange(mask.shape[-1], device=mask.device).expand_as(mask)
+    follows = torch.cat([torch.zeros_like(mask[..., :1]), mask[..., :-1]], -1) & ~begins
+    first = torch.where(follows, 0, time).cummax(-1).values
+    return mask & ((time - first) % length == 0)
 
 
 def kl_estimate(log_ratio: Tensor) -> Tensor:

@@ -43,6 +43,7 @@ from hpamdp.policies.shared.actor_critic import ActorCriticOptions, TargetRateOp
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
 from hpamdp.policies.shared.hybrid_actor import HeadOptions, HybridActor, ScaleOptions
 from hpamdp.policies.shared.hybrid_distribution import Draw, HybridDistribution, log_slope_of_tanh
+from hpamdp.policies.shared.memory import ReplayMemoryOptions
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
@@ -58,7 +59,7 @@ from hpamdp.settings import LearningRate
 from hpamdp.specs import PAMDPSpecs
 
 
-class HSACOptions(HeadOptions, ActorCriticOptions, TargetRateOptions, ScaleOptions):
+class HSACOptions(HeadOptions, ReplayMemoryOptions, ActorCriticOptions, TargetRateOptions, ScaleOptions):
     """Settings of `HSAC`."""
 
     batch_size: PositiveInt = 256
@@ -183,14 +184,13 @@ class HSAC(ReplayLearner):
         super().__init__(specs, device, options)
         self.most_discrete_entropy = sum(math.log(size) for size in specs.components.sizes)
         self.register_buffer("parameter_dims", torch.tensor(specs.parameter_dims).float(), persistent=False)
-        self.perception = Perception(specs)
+        self.set_perception(options)
         self.actor = make_actor(self.perception.specs, options)
         self.critics: HybridCritics | JointCritics = (
             HybridCritics(self.perception.specs, 2, options.hidden_dims, is_multipass=True)
             if isinstance(self.actor, HSACActor)
             else JointCritics(self.perception.specs, 2, options.hidden_dims)
         )
-        self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.log_discrete_temperature = log_temperature(
             options.discrete_temperature, is_tuned=options.tune_discrete_temperature
@@ -242,10 +242,21 @@ class HSAC(ReplayLearner):
         return discrete_loss + self.log_parameter_temperature * parameter_excess, {}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
-        """Return the soft value V'(s) by the target critics, `[B]`; the actor, too, sees the target's features."""
+    def value(
+        self,
+        observation: Tensor,
+        action_mask: Tensor | None = None,
+        memory: Tensor | None = None,
+        *,
+        has_seen: bool = False,
+    ) -> Tensor:
+        """Return the soft value V'(s) by the target critics, `[B]`; the actor, too, sees the target's features.
+
+        `NextOptions.value` explains `memory` and `has_seen`.
+        """
         allowed = self.specs.allowed(observation, action_mask)
-        value, _, _ = self.soft_value(self.target_critics, self.target_perception(observation), allowed)
+        features = self.target_perception(observation, memory, has_seen=has_seen)
+        value, _, _ = self.soft_value(self.target_critics, features, allowed)
         return value
 
     def soft_value(

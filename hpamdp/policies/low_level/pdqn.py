@@ -57,6 +57,7 @@ from hpamdp.policies.shared.actor_search import (
     with_variations,
 )
 from hpamdp.policies.shared.exploration import linear_schedule, with_exploring_noise
+from hpamdp.policies.shared.memory import ReplayMemoryOptions
 from hpamdp.policies.shared.networks import (
     HybridCritics,
     InitialLayer,
@@ -77,7 +78,7 @@ from hpamdp.specs import PAMDPSpecs
 _MAX_NUMBERS = 1 << 22
 
 
-class PDQNOptions(SearchingActorOptions):
+class PDQNOptions(ReplayMemoryOptions, SearchingActorOptions):
     """Settings of `PDQN`; `python run.py low=pdqn --help` shows them together with those of all replay learners."""
 
     multipass: bool = True
@@ -105,6 +106,10 @@ class PDQNOptions(SearchingActorOptions):
             raise ValueError(
                 f"preactivation_penalty={self.preactivation_penalty}: needs bounding=tanh; bounding={self.bounding!r}"
             )
+        if self.memory == "gru" and self.n_step > 1:
+            raise ValueError(f"n_step={self.n_step}: does not go with memory=gru; use n_step=1 or memory=stack")
+        if self.memory == "gru" and self.double_q:
+            raise ValueError("double_q=true: does not go with memory=gru, whose states differ between both critics")
         if self.search_samples > 0 and not self.multipass:
             raise ValueError(
                 f"search_samples={self.search_samples}: needs multipass=true, as values else depend on other actions' "
@@ -250,13 +255,12 @@ class PDQN(ReplayLearner):
         self.register_buffer("episodes", torch.zeros((), dtype=torch.long))
 
         dims = options.hidden_dims
-        self.perception = Perception(specs)
+        self.set_perception(options)
         seen = self.perception.specs
         self.actor = ParameterActor(seen, dims, options.bounding, options.initial_parameters)
         self.critics = HybridCritics(
             seen, 2 if options.twin else 1, dims, options.multipass, layer_norm=options.layer_norm
         )
-        self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
         self.target_actor = copy.deepcopy(self.actor).requires_grad_(False)
         self.target_critics = copy.deepcopy(self.critics).requires_grad_(False)
         self.policy = PDQNPolicy(self.actor, self.critics, self.perception, specs, options)
@@ -295,18 +299,27 @@ class PDQN(ReplayLearner):
         return loss, {"critic": loss, "q": q.mean()}
 
     @torch.no_grad()
-    def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
+    def value(
+        self,
+        observation: Tensor,
+        action_mask: Tensor | None = None,
+        memory: Tensor | None = None,
+        *,
+        has_seen: bool = False,
+    ) -> Tensor:
         """Return max_k Q'(s, k, x'(s)) over the allowed discrete actions k, `[B]`; the sum over the components.
 
-        With `double_q`, the learned critics choose k instead of the target critics.
+        With `double_q`, the learned critics choose k instead of the target critics. `NextOptions.value` explains
+        `memory` and `has_seen`.
         """
         smoothing = self.options.target_smoothing, self.options.target_smoothing_clip
-        state = self.target_perception(observation)
+        state = self.target_perception(observation, memory, has_seen=has_seen)
         unit_parameters = with_clipped_noise(self.target_actor(state), *smoothing)
         q = self.target_critics(state, unit_parameters).amin(0)
         choosing_q = q
         if self.options.double_q:
-            choosing_q = self.critics(self.perception(observation), unit_parameters).amin(0)
+            own_state = self.perception(observation, memory, has_seen=has_seen)
+            choosing_q = self.critics(own_state, unit_parameters).amin(0)
         choosing_q = masked_values(choosing_q, self.specs.allowed(observation, action_mask))
         components = self.specs.components
         return components.total(components.of_choice(q, components.best(choosing_q)))
@@ -370,6 +383,9 @@ class PDQN(ReplayLearner):
         for name in ("option_ended", "next_option"):
             if name in rows.keys():
                 rows[name] = rows[name].gather(-1, last)
+        if self.memory_key is not None and self.options.n_step > 1:
+            memory = rows["memory"]
+            rows["last_memory"] = memory.gather(-2, last.unsqueeze(-1).expand_as(memory))
         if "next_action_mask" in rows.keys():
             mask = rows["next_action_mask"]
             rows["next_action_mask"] = mask.gather(-2, last.unsqueeze(-1).expand_as(mask))

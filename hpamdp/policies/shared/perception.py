@@ -1,11 +1,15 @@
-"""What a learner's networks see of an observation: the observation itself, or features of it."""
+"""What a learner's networks see of an observation: the observation itself, or features of it and of its history."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from hpamdp import keys
+from hpamdp.policies.shared.memory import GRU, MemoryOptions, Stack
 from hpamdp.specs import PAMDPSpecs
 
 
@@ -18,28 +22,143 @@ class Perception(nn.Module):
     An on-policy learner trains it with its whole loss. A learner with a replay buffer trains it with the critics' loss
     alone, and has a target copy beside the target critics; actors see detached features.
 
+    A memory's history begins where its learner begins to act: with the option, if each option has its own learner
+    (Sutton, Precup and Singh 1999, *Between MDPs and semi-MDPs*: the policy of a semi-Markov option depends on what
+    happened since the option began); with the episode, if a learner serves all options or there are none.
+
     Args:
         specs: of the problem, as the learner sees it.
+        options: settings of the memory; None if there is none.
 
     Attributes:
         specs: of the features; the networks behind are built from them.
         is_plain: whether features are the observations themselves.
+        memory: what remembers earlier observations; None if there is none.
+        memory_key: of the memory's state in a step; None if there is none.
         in_keys: what `see` reads of a step.
         out_keys: what `see` writes.
     """
 
-    def __init__(self, specs: PAMDPSpecs) -> None:
+    def __init__(self, specs: PAMDPSpecs, options: MemoryOptions | None = None) -> None:
         super().__init__()
+        self.memory: Stack | GRU | None = None
+        self.memory_key: str | None = None
         self.specs = specs
-        self.is_plain = True
         self.in_keys: list[NestedKey] = [keys.OBSERVATION]
         self.out_keys: list[NestedKey] = []
+        is_shared = specs.num_options > 0 and specs.held_option is None
+        self._begins_key = keys.EPISODE_STEPS if is_shared else keys.IS_DECISION
+        if options is not None and options.memory != "none":
+            num = specs.observation_dim
+            is_stack = options.memory == "stack"
+            self.memory = Stack(num, options.stack_steps) if is_stack else GRU(num, options.memory_size)
+            self.memory_key = self.memory.name
+            self.in_keys += [self._begins_key, self.memory_key]
+            self.out_keys += [self.memory_key]
+            self.specs = _of_features(specs, self.memory.num_features)
+        self.is_plain = self.memory is None
+
+    @property
+    def lasts_an_episode(self) -> bool:
+        """Whether a history is an episode, and not an option."""
+        return self._begins_key == keys.EPISODE_STEPS
+
+    def check_traceable(self) -> None:
+        """Refuse a recurrent memory in compiled updates.
+
+        Raises:
+            ValueError: there is one.
+        """
+        if self.is_recurrent:
+            raise ValueError("memory=gru is PyTorch's GRU, which torch.compile cannot trace; use memory=stack")
+
+    @property
+    def is_recurrent(self) -> bool:
+        """Whether gradients flow back in time."""
+        return self.memory is not None and self.memory.is_recurrent
 
     def see(self, td: TensorDictBase) -> Tensor:
-        """Return the features of a step `[*B]`, `[*B, specs.observation_dim]`, for the policy."""
-        features: Tensor = self(td.get(keys.OBSERVATION))
-        return features
+        """Return the features of a step `[*B]`, `[*B, specs.observation_dim]`; write the memory's state after it."""
+        observation = td.get(keys.OBSERVATION)
+        if self.memory is None or self.memory_key is None:
+            features: Tensor = self(observation)
+            return features
+        held = td.get(self.memory_key, None)
+        if held is not None and self._begins_key in td.keys():
+            held = torch.where(self.begins(td).unsqueeze(-1), 0.0, held)
+        state = self.after(observation, held)
+        td.set(self.memory_key, state)
+        return self.memory.features(observation, state)
 
-    def forward(self, observation: Tensor) -> Tensor:
-        """Return the features `[*B, specs.observation_dim]` of observations `[*B, *]`."""
-        return observation
+    def begins(self, td: TensorDictBase) -> Tensor:
+        """Return where a history begins, bool `[*B]`."""
+        begins = td.get(self._begins_key).squeeze(-1)
+        return begins == 0 if self.lasts_an_episode else begins
+
+    def forward(self, observation: Tensor, memory: Tensor | None = None, *, has_seen: bool = False) -> Tensor:
+        """Return the features `[*B, specs.observation_dim]` of observations `[*B, *]`.
+
+        Args:
+            observation: the observations.
+            memory: the memory's states `[*B, size]`. If None, fresh.
+            has_seen: whether these states are after the observations. Otherwise they are before them.
+        """
+        if self.memory is None:
+            return observation
+        state = memory if has_seen and memory is not None else self.after(observation, memory)
+        return self.memory.features(observation, state)
+
+    def after(self, observation: Tensor, memory: Tensor | None = None) -> Tensor:
+        """Return the memory's states `[*B, size]` after observations `[*B, *]`, given those before; if None, fresh."""
+        assert self.memory is not None
+        if memory is None:
+            memory = observation.new_zeros(*observation.shape[:-1], self.memory.size, dtype=torch.float32)
+        shape = observation.shape[:-1]
+        state = self.memory.step(observation.reshape(-1, observation.shape[-1]), memory.reshape(-1, self.memory.size))
+        return state.reshape(*shape, self.memory.size)
+
+    def states(self, observations: Tensor, memory: Tensor, has_seen: Tensor) -> Tensor:
+        """Return a recurrent memory's states `[N, L, size]` after each step of sequences.
+
+        Args:
+            observations: `[N, L, observation_dim]`.
+            memory: the states to begin with, `[N, size]`.
+            has_seen: where these are after the first observation, and not before it, bool `[N]`.
+        """
+        assert isinstance(self.memory, GRU)
+        first = self.memory.step(observations[:, 0], memory)
+        first = torch.where(has_seen.unsqueeze(-1), memory, first)
+        if observations.shape[1] == 1:
+            return first.unsqueeze(1)
+        return torch.cat([first.unsqueeze(1), self.memory.unrolled(observations[:, 1:], first)], 1)
+
+    def of_sequences(self, observation: Tensor, memory: Tensor, begins: Tensor, starts: Tensor) -> Tensor:
+        """Return the features `[N, specs.observation_dim]` of rows that are sequences, one after another.
+
+        The first row of a sequence takes the stored state as it is, unless its history begins there.
+
+        Args:
+            observation: `[N, observation_dim]`.
+            memory: the states after them at the time, `[N, size]`.
+            begins: where a history begins, bool `[N]`.
+            starts: where a sequence starts, bool `[N]`. The first row does.
+        """
+        assert self.memory is not None
+        sequence = starts.long().cumsum(0) - int(starts[0])
+        lengths = sequence.bincount()
+        ends = lengths.cumsum(0)
+        place = torch.arange(len(sequence), device=sequence.device) - (ends - lengths)[sequence]
+        padded = observation.new_zeros(len(lengths), int(lengths.max()), observation.shape[-1])
+        padded[sequence, place] = observation
+        first = ends - lengths
+        is_fresh = begins[first]
+        states = self.states(padded, torch.where(is_fresh.unsqueeze(-1), 0.0, memory[first]), ~is_fresh)
+        return self.memory.features(observation, states[sequence, place])
+
+
+def _of_features(specs: PAMDPSpecs, num_features: int) -> PAMDPSpecs:
+    """Return the specs of features that end in the observation."""
+    weight, num_more = specs.initial_weight, num_features - specs.observation_dim
+    if weight is not None:
+        weight = tuple((*[0.0] * num_more, *row) for row in weight)
+    return replace(specs, observation_dim=num_features, initial_weight=weight, symmetries=None, geometry=None)

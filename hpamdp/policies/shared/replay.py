@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from typing_extensions import Self
 from hpamdp import keys
 from hpamdp.policies.base import Learner
 from hpamdp.policies.shared.gradients import Descent, Inputs, LossFunction
+from hpamdp.policies.shared.memory import HistoryLinks, MemoryOptions, ReplayMemoryOptions, ancestors
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.policies.shared.symmetry import RandomSymmetry
 from hpamdp.settings import PositiveFraction, Settings
@@ -75,8 +77,8 @@ class ReplayLearner(Learner):
     The `target` of a value is `reward + discount * next_value(sample)`, which asks `value`.
 
     Attributes:
-        perception: what the networks see of an observation. A learner whose networks see the observation itself need
-            not set it; others call `features` and `detached`.
+        perception: what the networks see of an observation, if `set_perception` was called; its target copy beside it.
+        links: which stored rows precede others, if the memory is recurrent.
         symmetry: maps samples by random symmetries of the problem, with `augment`; else None.
         stores_own_parameters: true if the buffer holds only the parameters of the discrete action that was taken. This
             saves memory where there are many; samples then have 0 for the others. With several components the buffer
@@ -89,6 +91,7 @@ class ReplayLearner(Learner):
     """
 
     modes: ClassVar[tuple[str, ...]] = ("train", "offline")
+    progress: ClassVar[frozenset[str]] = Learner.progress | {"last_rows"}
     stores_own_parameters: bool = False
     catches_up: bool = False
     reward_scale: float = 1.0
@@ -97,6 +100,8 @@ class ReplayLearner(Learner):
     options: ReplayOptions
     optimizers: dict[str, torch.optim.Optimizer]
     perception: Perception
+    target_perception: Perception
+    links: HistoryLinks | None
     frames: Tensor
     updates: Tensor
     slots: Tensor
@@ -106,7 +111,8 @@ class ReplayLearner(Learner):
         super().__init__(specs)
         self.options = options
         self.stores_own_parameters = self.stores_own_parameters and specs.components.is_single
-        augment = specs.symmetries is not None if options.augment == "auto" else options.augment
+        remembers = isinstance(options, MemoryOptions) and options.memory != "none"
+        augment = specs.symmetries is not None and not remembers if options.augment == "auto" else options.augment
         self.symmetry = RandomSymmetry(specs, torch.device(device)) if augment else None
         self.register_buffer("frames", torch.zeros((), dtype=torch.long))
         self.register_buffer("updates", torch.zeros((), dtype=torch.long))
@@ -114,6 +120,16 @@ class ReplayLearner(Learner):
         self.register_buffer("owner", specs.parameter_owner, persistent=False)
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(options.buffer_size, device=device))
         self.descent = Descent()
+        self.links = None
+
+    def set_perception(self, options: ReplayMemoryOptions) -> None:
+        """Make the perception and its target copy; call it before the networks, which are built from its specs."""
+        self.perception = Perception(self.specs, options)
+        self.target_perception = copy.deepcopy(self.perception).requires_grad_(False)
+        self.memory_key = self.perception.memory_key
+        if self.perception.is_recurrent:
+            self.links = HistoryLinks()
+            self.window = options.burn_in, options.sequence_length
 
     def stateful(self) -> dict[str, Any]:
         """Return the optimizers and the replay buffer."""
@@ -171,7 +187,13 @@ class ReplayLearner(Learner):
         return self.descent.step(self.optimizers[name], loss_of, *inputs, max_grad_norm=self.max_grad_norm)
 
     def compile_updates(self) -> None:
-        """Compile the gradients of each loss, at the first gradient step that needs it."""
+        """Compile the gradients of each loss, at the first gradient step that needs it.
+
+        Raises:
+            ValueError: a loss cannot be traced, or this machine cannot compile.
+        """
+        if self.links is not None:
+            self.perception.check_traceable()
         self.descent.compile(self.frames.device, any_size=False, while_compiling=lambda: self.while_compiling())
 
     def lower_precision(self) -> None:
@@ -201,28 +223,54 @@ class ReplayLearner(Learner):
 
     def store(self, batch: TensorDictBase, mask: Tensor) -> None:
         """Add the transitions in `mask` bool `[*B, T]` of a batch `[*B, T]` to the buffer."""
-        rows = self.transitions(batch)[mask]
+        rows = self.transitions(batch)
+        if self.links is not None:
+            begins = self.perception.begins(batch)
+            rows["begins"] = begins
+            rows["previous"] = self.links(begins, mask, self.buffer.write_count)
+        rows = rows[mask]
         if self.stores_own_parameters:
             rows["unit"] = rows["unit"].gather(-1, self.slots[rows["discrete"]])
         self.buffer.extend(rows)
 
     def replay_rows(self, batch: TensorDictBase) -> dict[str, TensorDictBase]:
         """Return the rows that the buffer would store of a batch `[*B, T]`."""
-        own = self.buffer
+        own, last_rows = self.buffer, None if self.links is None else self.links.last_rows
         self.buffer = ReplayBuffer(storage=LazyTensorStorage(batch.numel(), device=self.frames.device))
         try:
             self.store(batch, torch.ones(batch.shape, dtype=torch.bool, device=self.frames.device))
             return {"buffer": self.buffer[:]}
         finally:
             self.buffer = own
+            if self.links is not None and last_rows is not None:
+                self.links.last_rows = last_rows
 
     def sample_batches(self, num_batches: int) -> Iterator[TensorDictBase]:
         """Yield samples for `num_batches` updates, each with transitions `[batch_size]`."""
         # One call for all updates: the buffer's overhead is as long as a forward pass.
-        for sample in self.buffer.sample(num_batches * self.options.batch_size).split(self.options.batch_size):
+        num = num_batches * self.options.batch_size
+        drawn = self.buffer.sample(num) if self.links is None else self._sample_with_past(num)
+        for sample in drawn.split(self.options.batch_size):
             if self.stores_own_parameters:
                 sample = sample.set("unit", self._all_parameters(sample["discrete"], sample["unit"]))
             yield self.augmented(sample)
+
+    def _sample_with_past(self, num: int) -> TensorDict:
+        """Return random rows `[num]` of the buffer, each with the steps before it, see `_window_states`.
+
+        Each row is drawn with the same probability, and the sequence ends with it. TorchRL's SliceSampler draws
+        histories with the same probability instead, and would learn too seldom from the last step of a long one.
+        """
+        stored, (burn_in, length) = self.buffer[:], self.window
+        place = torch.randint(len(stored), (num,), device=self.frames.device)
+        num_stored = self.buffer.write_count
+        newest = num_stored - 1 - (num_stored - 1 - place) % len(stored)
+        places, num_found = ancestors(newest, stored["previous"], num_stored, burn_in + length)
+        sample: TensorDict = stored[place]
+        first = places[:, 0]
+        for name in ("memory", "begins"):
+            sample.set(f"first_{name}", stored[name][first])
+        return sample.set("past", stored["state"][places]).set("num_past", num_found)
 
     def augmented(self, sample: TensorDictBase) -> TensorDictBase:
         """Return a sample `[N, *]` with each row mapped by a random symmetry of the problem, if `augment` is set."""
@@ -257,6 +305,8 @@ class ReplayLearner(Learner):
             rows["next_action_mask"] = batch.get(("next", keys.ACTION_MASK), everything)
         if self.specs.has_pair_mask:
             rows["pair_mask"] = batch[keys.PAIR_MASK]
+        if self.memory_key is not None:
+            rows["memory"] = batch.get(self.memory_key)
         option_ended = batch.get(("next", keys.OPTION_ENDED), None)
         if option_ended is not None:
             rows["option_ended"] = option_ended.squeeze(-1)
@@ -277,20 +327,73 @@ class ReplayLearner(Learner):
         """
         state = sample["next_state"]
         masks = [sample["next_action_mask"]] if self.specs.has_action_mask else []
-        value = self.value(state, *masks)
+        memory = self.last_memory(sample)
+        remembered: dict[str, Any] = {} if memory is None else {"memory": memory}
+        value = self.value(state, *masks, **remembered)
         if "option_ended" not in sample.keys():
             return value
         is_ended = sample["option_ended"] | self.next_options.decides_ends
         if is_ended.any():
-            state = state[is_ended]
-            option = self.next_options.choose(state, sample["next_option"][is_ended], sample["option"][is_ended])
-            value[is_ended] = self.next_options.value(state, option, *(mask[is_ended] for mask in masks))
+            state, held = state[is_ended], sample["option"][is_ended]
+            mask = masks[0][is_ended] if masks else None
+            option = self.next_options.choose(state, sample["next_option"][is_ended], held)
+            begun = None if memory is None else self._memory_of_next(memory[is_ended], option == held)
+            value[is_ended] = self.next_options.value(state, option, mask, begun)
         return value
+
+    def last_memory(self, sample: TensorDictBase) -> Tensor | None:
+        """Return the target's memory before a sample's next states, `[B, size]`; None without memory."""
+        if "last_memory" in sample.keys():
+            return sample["last_memory"]
+        return self.memory_of(sample, self.target_perception) if self.memory_key is not None else None
+
+    def _memory_of_next(self, memory: Tensor, is_same: Tensor) -> TensorDict:
+        """Return the memories with which the next options begin; a learner of a single option begins anew.
+
+        Args:
+            memory: the target's memories before, `[N, size]`.
+            is_same: whether the next option is the held one, bool `[N]`. If the selector ends options, it goes on.
+        """
+        assert self.memory_key is not None
+        if not self.perception.lasts_an_episode:
+            goes_on = is_same if self.next_options.decides_ends else torch.zeros_like(is_same)
+            memory = torch.where(goes_on.unsqueeze(-1), memory, 0.0)
+        return TensorDict({self.memory_key: memory}, [len(memory)])
 
     def features(self, sample: TensorDictBase) -> Tensor:
         """Return what the networks see of a sample's states, `[B, perception.specs.observation_dim]`."""
-        features: Tensor = self.perception(sample["state"])
+        memory = self.memory_of(sample, self.perception)
+        features: Tensor = self.perception(sample["state"], memory, has_seen=True)
         return features
+
+    def memory_of(self, sample: TensorDictBase, perception: Perception) -> Tensor | None:
+        """Return the memory's states after a sample's states, `[B, size]`, by a perception; None without memory."""
+        if self.links is not None:
+            return self._window_states(sample, perception)
+        return None if self.memory_key is None else sample["memory"]
+
+    def _window_states(self, sample: TensorDictBase, perception: Perception) -> Tensor:
+        """Return the states `[B, size]` of a recurrent memory after the sequences of a sample.
+
+        They begin with the stored state of their first step, or fresh if the history begins there. The first `burn_in`
+        of the longest ones have no gradient: Kapturowski et al. 2019, section 3.
+        """
+        past, num_past = sample["past"], sample["num_past"]
+        burn_in, length = self.window
+        is_fresh = sample["first_begins"]
+        held = torch.where(is_fresh.unsqueeze(-1), 0.0, sample["first_memory"])
+        has_seen = ~is_fresh
+        num_burnt = (num_past - length).clamp(min=0)
+        if burn_in > 0:
+            with torch.no_grad():
+                burnt = perception.states(past[:, :burn_in], held, has_seen)
+            is_burnt = num_burnt > 0
+            held = torch.where(is_burnt.unsqueeze(-1), _at(burnt, (num_burnt - 1).clamp(min=0)), held)
+            has_seen = has_seen & ~is_burnt
+        places = num_burnt.unsqueeze(-1) + torch.arange(length, device=past.device)
+        places = places.clamp(max=past.shape[1] - 1)
+        recent = past.gather(1, places.unsqueeze(-1).expand(-1, -1, past.shape[-1]))
+        return _at(perception.states(recent, held, has_seen), num_past - num_burnt - 1)
 
     @torch.no_grad()
     def detached(self, sample: TensorDictBase) -> Tensor:
@@ -304,6 +407,11 @@ class ReplayLearner(Learner):
     def pairs(self, sample: TensorDictBase) -> Tensor | None:
         """Return which discrete actions go together in a sample's states, as in `pair_mask`. If None, all do."""
         return sample.get("pair_mask", None)
+
+
+def _at(states: Tensor, place: Tensor) -> Tensor:
+    """Return the states `[B, size]` at places `[B]` of sequences `[B, L, size]`."""
+    return states[torch.arange(len(place), device=place.device), place]
 
 
 def first_multiple(updates_per_step: float) -> int:

@@ -1,0 +1,348 @@
+"""Memory: what policies remember, where it begins anew, and how learners are trained on sequences of it."""
+
+import shutil
+import signal
+
+import pytest
+import torch
+from conftest import compose_config, make_config
+from tensordict import TensorDict
+from test_grid import SHORT
+from test_resume import stop_and_resume, words_of
+from toy_memory import Cue
+from toy_options import Crossing
+
+import hpamdp
+from hpamdp import keys
+from hpamdp.config.errors import ConfigError
+from hpamdp.env.decisions import with_decisions
+from hpamdp.policies.agent import HierarchicalAgent
+from hpamdp.policies.base import Learner
+from hpamdp.policies.high_level.uniform import Uniform
+from hpamdp.policies.low_level.hppo import HPPO, sequence_starts
+from hpamdp.policies.low_level.hsac import HSAC
+from hpamdp.policies.low_level.pdqn import PDQN
+from hpamdp.policies.shared.memory import HistoryLinks, ancestors
+from hpamdp.policies.shared.replay import ReplayLearner
+from hpamdp.run.assemble import assemble
+from hpamdp.run.train import run
+from hpamdp.specs import PAMDPSpecs
+
+SMALL = {"hidden_dims": [16, 16], "memory_size": 8}
+LEARNERS = {"hppo": HPPO, "pdqn": PDQN, "hsac": HSAC}
+# The state of a memory in a step.
+STATES = {"stack": "stack_8", "gru": "gru_8"}
+
+
+def make(low: str, specs: PAMDPSpecs, memory: str, **changes) -> Learner:
+    more = {"critic_hidden_dims": [16, 16], "minibatch_size": 32} if low == "hppo" else {"batch_size": 16}
+    return LEARNERS[low](specs, memory=memory, **{**SMALL, **more, **changes})
+
+
+def played(low: str, memory: str, steps: int = 12, num_envs: int = 6, **changes) -> tuple[Learner, TensorDict]:
+    """Return a learner and the steps of exploring episodes of Cue, `[num_envs, steps]`."""
+    torch.manual_seed(0)
+    env = with_decisions(Cue(num_envs))
+    learner = make(low, PAMDPSpecs.from_env(env.base_env), memory, **changes)
+    with torch.no_grad():
+        return learner, env.rollout(steps, learner.policy, break_when_any_done=False)
+
+
+@pytest.mark.parametrize("memory", ["stack", "gru"])
+@pytest.mark.parametrize("low", LEARNERS)
+def test_the_state_after_a_step_follows_from_the_observations_since_its_episode_began(low, memory):
+    learner, rolled = played(low, memory)
+    begins = rolled[keys.EPISODE_STEPS].squeeze(-1) == 0
+    assert begins.sum() == 6 * 3
+    state = None
+    for t in range(rolled.shape[1]):
+        # All episodes of Cue are equally long.
+        state = learner.perception.after(rolled[keys.OBSERVATION][:, t], None if begins[0, t] else state)
+        torch.testing.assert_close(rolled[STATES[memory]][:, t], state)
+
+
+def test_a_stack_shows_the_last_observations_oldest_first_after_zeros():
+    _, rolled = played("hppo", "stack", stack_steps=3)
+    seen, shown = rolled[keys.OBSERVATION], rolled["stack_6"]
+    assert torch.equal(shown[:, 3], seen[:, 1:4].flatten(1))
+    assert torch.equal(shown[:, 4], torch.cat([torch.zeros(6, 4), seen[:, 4]], -1)), "another episode"
+
+
+@pytest.mark.parametrize("is_shared", [False, True])
+@pytest.mark.parametrize("low", LEARNERS)
+def test_the_memory_of_one_option_begins_with_it_and_that_of_all_with_the_episode(low, is_shared):
+    torch.manual_seed(0)
+    env = Crossing(8, start=3.0)
+    specs = PAMDPSpecs.from_env(env)
+    own = [specs.with_option_observed()] if is_shared else [specs.of_option(i) for i in range(2)]
+    learners = [make(low, each, "gru") for each in own]
+    agent = HierarchicalAgent(Uniform(specs), learners, specs, is_shared=is_shared)
+    with torch.no_grad():
+        rolled = with_decisions(env, option_length=3).rollout(12, agent.policy, break_when_any_done=False)
+    steps = rolled[keys.EPISODE_STEPS].squeeze(-1)
+    begins = steps == 0 if is_shared else rolled[keys.IS_DECISION].squeeze(-1)
+    assert begins.sum() < (steps % 3 == 0).sum() if is_shared else torch.equal(begins, steps % 3 == 0)
+    for i, row in enumerate(rolled):
+        state = None
+        for t, step in enumerate(row):
+            option = int(step[keys.OPTION])
+            seen = step[keys.OBSERVATION]
+            if is_shared:
+                seen = torch.cat([seen, torch.eye(2)[option]])
+            perception = learners[0 if is_shared else option].perception
+            state = perception.after(seen, None if begins[i, t] else state)
+            torch.testing.assert_close(step["gru_8"], state)
+
+
+def everything(rolled: TensorDict) -> torch.Tensor:
+    return torch.ones(rolled.shape, dtype=torch.bool)
+
+
+# On-policy: H-PPO.
+
+
+@pytest.mark.parametrize("length", [2, 3, 16])
+def test_the_ratios_of_sequences_are_one_before_the_first_update(length):
+    learner, rolled = played("hppo", "gru", steps=11, sequence_length=length)
+    rows = learner.rows(rolled, everything(rolled))
+    assert rows["starts"].sum() == 6 * {2: 6, 3: 5, 16: 3}[length]
+    for minibatch in learner.minibatches(rows):
+        _, scalars = learner.loss(minibatch, torch.tensor(1.0))
+        assert scalars["discrete_kl"].abs() < 1e-9 and scalars["parameter_kl"].abs() < 1e-9
+
+
+def test_sequences_start_where_histories_begin_or_go_on_and_are_never_longer_than_their_length():
+    begins = torch.tensor([[1, 0, 0, 0, 0, 0, 1, 0], [0, 0, 0, 1, 0, 0, 0, 0]]).bool()
+    mask = torch.tensor([[1, 1, 1, 1, 1, 1, 1, 1], [1, 1, 0, 0, 0, 0, 1, 1]]).bool()
+    expected = torch.tensor([[1, 0, 0, 1, 0, 0, 1, 0], [1, 0, 0, 0, 0, 0, 1, 0]]).bool()
+    assert torch.equal(sequence_starts(begins, mask, 3), expected)
+
+
+def test_minibatches_hand_over_whole_sequences_and_each_row_once_a_pass():
+    learner, rolled = played("hppo", "gru", steps=20, epochs=2, sequence_length=3)
+    rows = learner.rows(rolled, everything(rolled))
+    rows["number"] = torch.arange(len(rows))
+    sequence = rows["starts"].cumsum(0)
+    seen = []
+    for minibatch in learner.minibatches(rows):
+        numbers = minibatch["number"]
+        seen += numbers.tolist()
+        of_sequences = sequence[numbers]
+        for one in of_sequences.unique():
+            assert torch.equal(numbers[of_sequences == one], (sequence == one).nonzero().squeeze(-1))
+    assert sorted(seen) == sorted([*range(len(rows))] * 2)
+
+
+def test_the_gradient_of_a_last_step_reaches_the_cue_through_time():
+    learner, rolled = played("hppo", "gru", steps=4)
+    rows = learner.rows(rolled, everything(rolled))
+    gradient = {}
+    for cue in (-1.0, 1.0):
+        rows[keys.OBSERVATION].reshape(6, 4, 2)[:, 0, 0] = cue
+        last = learner.critic(learner.features(rows)).reshape(6, 4)[:, -1].sum()
+        gradient[cue] = torch.autograd.grad(last, learner.perception.memory.net.weight_ih_l0)[0]
+    assert not torch.allclose(gradient[-1.0], gradient[1.0], atol=1e-6)
+    # The weights of the cue, which is 0 in all steps but the first.
+    assert gradient[1.0][:, 0].abs().max() > 0.0
+
+
+def test_waiting_sequences_are_part_of_the_state_dict_and_fit_the_declared_columns():
+    learner, rolled = played("hppo", "gru", minibatch_size=1000)
+    learner.learn(rolled, everything(rolled))
+    another = make("hppo", learner.specs, "gru", minibatch_size=1000)
+    state = learner.state_dict()
+    another.check_state(state)
+    another.load_state_dict(state)
+    for name, column in learner.waiting[0].items():
+        assert torch.equal(another.waiting[0][name], column)
+
+
+# From a replay buffer: P-DQN and H-SAC.
+
+
+def stored(low: str, num_batches: int, **changes) -> tuple[ReplayLearner, TensorDict]:
+    """Return a learner that stored steps of Cue in batches of three steps, and all the steps."""
+    learner, rolled = played(low, "gru", steps=3 * num_batches, warmup_steps=10_000, **changes)
+    for batch in rolled.split(3, 1):
+        learner.learn(batch, everything(batch))
+    return learner, rolled
+
+
+@pytest.mark.parametrize("buffer_size", [1000, 70])
+def test_a_sequence_is_the_history_of_its_last_step_across_batches_and_never_of_another_environment(buffer_size):
+    learner, rolled = stored("pdqn", 9, buffer_size=buffer_size, burn_in=1, sequence_length=2)
+    sample = learner._sample_with_past(500)
+    # The reward of a step and its observation after it tell nothing of the environment, but the stored state does.
+    where = {tuple(row.tolist()): i for i, row in enumerate(rolled["gru_8"].flatten(0, 1))}
+    lengths = set()
+    for row in sample:
+        env, step = divmod(where[tuple(row["memory"].tolist())], rolled.shape[1])
+        since = int(rolled[keys.EPISODE_STEPS][env, step])
+        num = int(row["num_past"])
+        lengths.add(num)
+        if buffer_size == 1000:
+            assert num == min(since + 1, 3)
+        expected = rolled[keys.OBSERVATION][env, step - num + 1 : step + 1]
+        assert num <= since + 1 and torch.equal(row["past"][:num], expected)
+        assert torch.equal(row["first_memory"], rolled["gru_8"][env, step - num + 1])
+        assert bool(row["first_begins"]) == (num == since + 1)
+    assert lengths == {1, 2, 3}
+
+
+@pytest.mark.parametrize(("burn_in", "length"), [(0, 4), (2, 2), (3, 1), (0, 1), (0, 9)])
+def test_sampled_states_are_those_of_the_policy_that_stored_them(burn_in, length):
+    learner, _ = stored("hsac", 6, burn_in=burn_in, sequence_length=length)
+    sample = learner._sample_with_past(200)
+    for perception in (learner.perception, learner.target_perception):
+        torch.testing.assert_close(learner.memory_of(sample, perception), sample["memory"])
+    held = learner.last_memory(sample)
+    torch.testing.assert_close(
+        learner.target_perception(sample["next_state"], held)[:, :8],
+        learner.perception.after(sample["next_state"], sample["memory"]),
+    )
+
+
+def test_gradients_flow_back_over_the_sequence_and_not_into_the_burn_in():
+    learner, _ = stored("pdqn", 8, burn_in=2, sequence_length=2)
+    sample = next(row for row in learner._sample_with_past(100) if int(row["num_past"]) == 4).unsqueeze(0)
+    sample.set("past", sample["past"].requires_grad_())
+    gradient = torch.autograd.grad(learner.features(sample).sum(), sample["past"])[0][0].abs().sum(-1)
+    assert (gradient[:2] == 0.0).all() and (gradient[2:] > 0.0).all()
+
+
+@pytest.mark.parametrize("low", ["pdqn", "hsac"])
+def test_only_the_critics_loss_trains_the_memory(low):
+    learner, _ = stored(low, 8)
+    before = {name: value.clone() for name, value in learner.perception.named_parameters()}
+    target = {name: value.clone() for name, value in learner.target_perception.named_parameters()}
+    sample = next(iter(learner.sample_batches(1)))
+    learner.gradient_step("actor", learner.actor_loss, learner.detached(sample), None)
+    assert all(torch.equal(value, before[name]) for name, value in learner.perception.named_parameters())
+    learner.updates += 2
+    learner.update_once(sample)
+    assert not any(torch.equal(value, before[name]) for name, value in learner.perception.named_parameters())
+    assert not any(torch.equal(value, target[name]) for name, value in learner.target_perception.named_parameters())
+
+
+def test_histories_go_on_across_batches_and_not_into_a_buffer_that_was_given_up():
+    links = HistoryLinks()
+    never, always = torch.zeros(2, 2, dtype=torch.bool), torch.ones(2, 2, dtype=torch.bool)
+    begun = torch.tensor([[True, False], [True, False]])
+    assert links(begun, always, 0).tolist() == [[-1, 0], [-1, 2]]
+    assert links(never, always, 4).tolist() == [[1, 4], [3, 6]]
+    masked = torch.tensor([[True, True], [False, False]])
+    assert links(never, masked, 8)[0].tolist() == [5, 8]
+    assert links(never, always, 10).tolist() == [[9, 10], [-1, 12]]
+    assert links(never, always, 0).tolist() == [[-1, 0], [-1, 2]], "an empty buffer"
+    assert links(never[:1], always[:1], 4).tolist() == [[-1, 4]], "another number of environments"
+
+
+def test_overwritten_rows_are_no_ancestors():
+    previous = torch.tensor([3, 4, 1, 2])  # of the rows 4, 5, 2 and 3 in a buffer of four
+    places, num = ancestors(torch.tensor([5, 4, 3, 2]), previous, 6, 3)
+    assert num.tolist() == [3, 3, 2, 1]
+    assert places[0].tolist() == [3, 0, 1] and places[1].tolist() == [2, 3, 0] and places[2, :2].tolist() == [2, 3]
+
+
+def test_asking_for_example_rows_leaves_buffer_and_links_alone():
+    learner, rolled = stored("pdqn", 2)
+    before, num = learner.links.last_rows.clone(), len(learner.buffer)
+    rows = learner.replay_rows(rolled[:, :1])["buffer"]
+    assert set(rows.keys()) == set(learner.buffer[:].keys())
+    assert torch.equal(learner.links.last_rows, before) and len(learner.buffer) == num
+
+
+def test_n_step_returns_with_a_stack_go_on_with_the_state_after_their_last_step():
+    learner, rolled = played("pdqn", "stack", n_step=3)
+    rows = learner.transitions(rolled)
+    assert torch.equal(rows["last_memory"][:, 0], rolled["stack_8"][:, 2])
+    assert torch.equal(rows["last_memory"][:, 2], rolled["stack_8"][:, 3]), "the episode ends there"
+
+
+# In runs.
+
+
+@pytest.mark.parametrize("low", LEARNERS)
+def test_a_run_with_a_recurrent_memory_resumes_to_the_last_bit(low, tmp_path, monkeypatch):
+    words = [*words_of("ucb", low), "low.memory=gru", "low.memory_size=8", "low.sequence_length=3"]
+    stop_and_resume(words, tmp_path, monkeypatch, signal.SIGINT)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [["collector=multi"], ["agent.sharing=shared"], ["low.memory=stack"]])
+@pytest.mark.parametrize("low", LEARNERS)
+def test_other_runs_with_a_memory_resume_to_the_last_bit(low, more, tmp_path, monkeypatch):
+    stop_and_resume([*words_of("ucb", low), "low.memory=gru", *more], tmp_path, monkeypatch, signal.SIGTERM)
+
+
+@pytest.mark.parametrize("termination", ["steps", "learned"])
+@pytest.mark.parametrize("sharing", ["per_option", "shared"])
+@pytest.mark.parametrize("memory", ["stack", "gru"])
+@pytest.mark.parametrize("low", LEARNERS)
+def test_options_that_end_go_with_a_memory(low, memory, sharing, termination, tmp_path):
+    words = [
+        "env=crossing", "high=meta_critic", f"low={low}", f"low.memory={memory}", f"agent.sharing={sharing}",
+        f"agent.termination={termination}", "high.warmup_decisions=8", "num_envs=8", "steps_per_batch=16",
+        "total_frames=384", "eval.layouts=4", *SHORT.get(low, []),
+    ]  # fmt: skip
+    words += ["agent.option_length=4"] if termination == "steps" else []
+    assert run(compose_config(words), tmp_path, words) == 0
+
+
+def test_a_run_from_the_learners_of_another_has_links_of_its_own(tmp_path):
+    words = [*words_of("ucb", "pdqn"), "low.memory=gru"]
+    assert run(compose_config(words), tmp_path / "first", words) == 0
+    words += [f"low.checkpoint={tmp_path / 'first'}", "num_envs=4"]
+    assert run(compose_config(words), tmp_path / "second", words) == 0
+
+
+@pytest.mark.parametrize("memory", ["stack", "gru"])
+def test_an_agent_remembers_until_its_episode_ends(memory):
+    settings = {"low.memory": memory, "total_frames": 2048, "eval.every": 0, "eval.layouts": 4, "progress": False}
+    agent = hpamdp.train(Cue, low="hppo", **settings)
+    learner = agent._agent.learners[0]
+    name = learner.memory_key
+    observations = torch.tensor([[1.0, 0.0], [0.0, 0.25], [0.0, 0.5]])
+    state = None
+    for t, observation in enumerate(observations):
+        agent.act(observation.numpy())
+        state = learner.perception.after(observation, state)
+        torch.testing.assert_close(agent._last[name][0], state), t
+    agent.reset()
+    agent.act(observations[0].numpy())
+    torch.testing.assert_close(agent._last[name][0], learner.perception.after(observations[0]))
+    with pytest.raises(ConfigError, match=f"export: HPPO cannot be exported: it remembers .*{name}"):
+        agent.export("agent.onnx")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["low=hppo", "low.memory=lstm"], "low.memory"),
+        (["low=hppo", "low.memory=gru", "low.vector_products=true"], "vector_products=true: does not go with memory"),
+        (["low=pdqn", "low.memory=stack", "low.augment=true"], "augment=true: does not go with memory=stack"),
+        (["low=pdqn", "low.memory=gru", "low.n_step=2"], "n_step=2: does not go with memory=gru"),
+        (["low=pdqn", "low.memory=gru", "low.double_q=true"], "double_q=true: does not go with memory=gru"),
+        (["low=hppo", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hppo: memory=gru"),
+        (["low=hsac", "low.memory=gru", "compile_updates=true"], "compile_updates=true: low=hsac: memory=gru"),
+        (["low=pdqn", "low.memory=gru", "data=human"], "low.memory=gru: .*lacks what a policy remembered"),
+        (["low=hsac", "low.memory=gru", "agent.sharing=shared", "high=value"], "agent.sharing=shared with low.memory"),
+    ],
+)
+def test_what_does_not_go_with_a_memory_is_refused_in_one_line(words, message, tmp_path):
+    with pytest.raises(ConfigError, match=message) as error:
+        assemble(make_config(words)).close()
+    assert "\n" not in str(error.value)
+
+
+def test_learners_without_a_memory_have_no_such_setting():
+    with pytest.raises(ConfigError, match=r"low\.memory: no such setting of QPAMDP"):
+        hpamdp.train("platform", low="qpamdp", **{"low.memory": "gru"})
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("low", LEARNERS)
+def test_updates_with_a_stack_can_be_compiled(low, tmp_path):
+    words = [*words_of("ucb", low), "low.memory=stack", "compile_updates=true"]
+    assert run(compose_config(words), tmp_path, words) == 0

@@ -1,0 +1,83 @@
+"""Cue, a problem that cannot be solved without memory: its first observation says what pays in its last step."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+
+from hpamdp import keys
+from hpamdp.env.base import PAMDPEnv
+
+
+class Cue(PAMDPEnv):
+    """See a cue of -1 or 1 in the first step, then the time alone; only the last of `length` steps is rewarded.
+
+    The right discrete action, 1 for a positive cue, earns 1 less the distance of its parameter from half the cue. The
+    other one earns -1. So the best return is 1, and the best one without memory 0 on average. With options, the option
+    of the last step counts instead: 1 if it is the one of the cue, else -1.
+
+    Args:
+        num_envs: environments of the batch.
+        length: steps of an episode.
+        seed: of the cues.
+        device: where the tensors live.
+    """
+
+    parameter_dims = (1, 1)
+
+    def __init__(self, num_envs: int = 1, *, length: int = 4, seed: int = 0, device: object = "cpu") -> None:
+        super().__init__(device=device, batch_size=[num_envs])
+        self.max_steps = length
+        n = num_envs
+        self.observation_spec = Composite(observation=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
+        action = Composite(discrete=Categorical(2, shape=(n,)), parameters=Bounded(-1.0, 1.0, shape=(n, 2)), shape=(n,))
+        option = {"option": Categorical(2, shape=(n,))} if self.option_names else {}
+        self.action_spec = Composite(action=action, **option, shape=(n,))
+        self.reward_spec = Unbounded(shape=(n, 1))
+        self.done_spec = self.make_done_spec()
+        self._set_seed(seed)
+
+    def _set_seed(self, seed: int | None) -> None:
+        self.generator = torch.Generator().manual_seed(seed or 0)
+        self.cue = torch.zeros(self.batch_size)
+        self.steps = torch.zeros(self.batch_size, dtype=torch.long)
+
+    def _reset(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
+        mask = self.reset_mask(tensordict)
+        cue = torch.randint(2, self.batch_size, generator=self.generator) * 2.0 - 1.0
+        self.cue = torch.where(mask, cue, self.cue)
+        self.steps = torch.where(mask, 0, self.steps)
+        return self._read()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        is_last = self.steps == self.max_steps - 1
+        reward = torch.where(is_last, self.earned(tensordict), 0.0)
+        self.steps = (self.steps + 1).clamp(max=self.max_steps)
+        return self._read().set(keys.REWARD, reward.unsqueeze(-1))
+
+    def earned(self, tensordict: TensorDictBase) -> Tensor:
+        """Return what the actions of a last step earn, `[N]`."""
+        chosen = (self.cue > 0.0).long()
+        if self.option_names:
+            return torch.where(tensordict[keys.OPTION] == chosen, 1.0, -1.0)
+        parameter = tensordict[keys.PARAMETERS].gather(-1, chosen.unsqueeze(-1)).squeeze(-1)
+        return torch.where(tensordict[keys.DISCRETE] == chosen, 1.0 - (parameter - 0.5 * self.cue).abs(), -1.0)
+
+    def _read(self) -> TensorDict:
+        cue = torch.where(self.steps == 0, self.cue, 0.0)
+        observation = torch.stack([cue, self.steps / self.max_steps], -1)
+        terminated = (self.steps >= self.max_steps).unsqueeze(-1)
+        flags = {
+            keys.TERMINATED: terminated,
+            keys.TRUNCATED: torch.zeros_like(terminated),
+            keys.DONE: terminated.clone(),
+        }
+        return TensorDict({keys.OBSERVATION: observation, **flags}, self.batch_size)
+
+
+class CueOfOptions(Cue):
+    """The cue says which of two options pays."""
+
+    option_names = ("left", "right")
