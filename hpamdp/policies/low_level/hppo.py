@@ -36,6 +36,7 @@ from typing_extensions import Self
 from hpamdp import keys
 from hpamdp.policies.base import ActionFeature, Learner
 from hpamdp.policies.shared.autoregressive_actor import AutoregressiveActor
+from hpamdp.policies.shared.credit import Credit, CreditCritic
 from hpamdp.policies.shared.default_dtype import float32_by_default
 from hpamdp.policies.shared.exported_policy import exported_actor
 from hpamdp.policies.shared.hybrid_actor import RAW, HeadOptions, HybridActor, HybridPolicy, encoder
@@ -46,6 +47,9 @@ from hpamdp.policies.shared.on_policy import OnPolicy, OnPolicyOptions, mean_sca
 from hpamdp.policies.shared.perception import Perception
 from hpamdp.settings import Fraction, LearningRate, Widths
 from hpamdp.specs import PAMDPSpecs
+
+# What the other components contributed to a step's return, for the credit of each.
+BASELINE = "credit_baseline"
 
 
 class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
@@ -89,6 +93,12 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
     """Steps of the whole run over which learning rate, `min_scale` and entropy bonuses are annealed."""
     max_grad_norm: PositiveFloat = 1.0
     """Largest gradient norm, of actors and critic together."""
+    credit: Credit = "joint"
+    """Advantage of each component of an action: `joint` gives the action's to all of them.
+
+    `summed` and `mixed` subtract what the other components contributed, by a critic of contributions that are summed,
+    or mixed by a network.
+    """
     greedy_discrete: Literal["most_probable", "sampled"] = "most_probable"
     """Discrete action of the greedy policy; its parameters are the means. `sampled` draws it, as in the published code.
 
@@ -104,6 +114,11 @@ class HPPOOptions(HeadOptions, MemoryOptions, OnPolicyOptions):
             )
         if not self.min_scale_final < self.max_scale:
             raise ValueError(f"min_scale_final={self.min_scale_final}: must be less than max_scale={self.max_scale}")
+        if self.credit != "joint" and self.autoregressive:
+            raise ValueError(
+                f"credit={self.credit!r}: needs autoregressive=false, as a component must not depend on "
+                "the choices of the others"
+            )
         if self.lr_final > self.lr:
             raise ValueError(f"lr_final={self.lr_final}: must be at most lr={self.lr}")
         return self
@@ -145,6 +160,10 @@ class HPPO(OnPolicy, Learner):
             encoder(self.actor.num_inputs, options.critic_hidden_dims),
             nn.Linear(options.critic_hidden_dims[-1], 1, dtype=torch.float32),
         )
+        has_credit = options.credit != "joint" and not specs.components.is_single
+        self.credit_critic = (
+            CreditCritic(self.perception.specs, options.critic_hidden_dims, options.credit) if has_credit else None
+        )
         samples = options.greedy_discrete == "sampled"
         self.policy = HybridPolicy(
             self.actor, specs, writes_raw=True, samples_when_greedy=samples, perception=self.perception
@@ -165,6 +184,8 @@ class HPPO(OnPolicy, Learner):
         rows = self.gather(self.rows(batch, mask)) if mask.any() else None
         if rows is None:
             return {}
+        if self.credit_critic is not None:
+            rows["advantage"] = rows["advantage"].unsqueeze(-1) - rows[BASELINE]
         rows["advantage"] = normalised(rows["advantage"])
         for group in self.optimizer.param_groups:
             group["lr"] = options.lr + progress * (options.lr_final - options.lr)
@@ -183,13 +204,17 @@ class HPPO(OnPolicy, Learner):
         discrete_log_ratio = discrete_log_prob - rows["discrete_log_prob"]
         parameter_log_ratio = parameter_log_prob - rows["parameter_log_prob"]
         advantage = rows["advantage"]
-        if not self.specs.components.is_single:
+        if advantage.ndim < discrete_log_ratio.ndim:
             advantage = advantage.unsqueeze(-1)
         gain = self.surrogate(discrete_log_ratio, advantage) + self.surrogate(parameter_log_ratio, advantage)
         gain = self.specs.components.total(gain).mean()
         discrete_entropy, parameter_entropy = (entropy.mean() for entropy in distribution.entropy())
         bonus = self.options.discrete_entropy * discrete_entropy + self.options.parameter_entropy * parameter_entropy
         critic_loss = F.mse_loss(self.critic(features).squeeze(-1), rows["target"])
+        if self.credit_critic is not None:
+            contributions = self.credit_critic.contributions(features, distribution, rows["discrete"], rows[RAW])
+            error = self.credit_critic.total(features, contributions) - rows["raw_advantage"]
+            critic_loss = critic_loss + error.square().mean()
         loss = self.options.critic_weight * critic_loss - gain - entropy_weight * bonus
         return loss, {
             "critic": critic_loss,
@@ -226,8 +251,14 @@ class HPPO(OnPolicy, Learner):
         if self.perception.is_recurrent:
             rows["begins"] = self.perception.begins(batch)[mask]
             rows["starts"] = sequence_starts(self.perception.begins(batch), mask, self.options.sequence_length)[mask]
-        log_probs = self._distribution(self.features(rows), rows).log_prob(rows["discrete"], rows[RAW])
+        features = self.features(rows)
+        distribution = self._distribution(features, rows)
+        log_probs = distribution.log_prob(rows["discrete"], rows[RAW])
         rows["discrete_log_prob"], rows["parameter_log_prob"] = log_probs
+        if self.credit_critic is not None:
+            contributions = self.credit_critic.contributions(features, distribution, rows["discrete"], rows[RAW])
+            rows[BASELINE] = self.credit_critic.baselines(features, contributions)
+            rows["raw_advantage"] = rows["advantage"]
         return TensorDict(rows, batch_size=[int(mask.sum())])
 
     def empty_rows(self) -> dict[str, Tensor]:
@@ -238,6 +269,8 @@ class HPPO(OnPolicy, Learner):
         columns[RAW] = torch.zeros(0, self.specs.num_parameters, dtype=torch.float32)
         columns |= {"discrete": choice.long(), "advantage": number, "target": number}
         columns |= {"discrete_log_prob": choice, "parameter_log_prob": choice}
+        if self.credit_critic is not None:
+            columns |= {BASELINE: choice, "raw_advantage": number}
         if self.specs.has_action_mask:
             columns[keys.ACTION_MASK] = torch.zeros(0, self.specs.num_discrete, dtype=torch.bool)
         if self.specs.has_pair_mask:

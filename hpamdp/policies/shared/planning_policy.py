@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hpamdp import keys
 from hpamdp.policies.base import is_greedy
-from hpamdp.policies.masks import random_choice
+from hpamdp.policies.masks import random_discrete
 from hpamdp.policies.shared.end_values import EndValueOptions
 from hpamdp.policies.shared.planning import SearchOptions
 from hpamdp.policies.shared.replay import ReplayOptions
@@ -65,7 +65,7 @@ class PlanningPolicy(TensorDictModuleBase):
         mask = td.get(keys.ACTION_MASK, None)
         mask = None if mask is None else mask.flatten(0, -2)
         allowed = self.specs.allowed(observation, mask)
-        discrete = random_choice(torch.Size([num]), self.specs.num_discrete, allowed, device)
+        discrete = random_discrete(self.specs, torch.Size([num]), allowed, device)
         unit_parameters = 2.0 * torch.rand(num, self.specs.num_parameters, device=device, dtype=torch.float32) - 1.0
         is_planned = self.is_trained.expand(num)
         done = td.get(keys.DONE, None)
@@ -78,7 +78,8 @@ class PlanningPolicy(TensorDictModuleBase):
             discrete[is_planned], unit_parameters[is_planned] = self.first_action(td, observation, is_planned, mask)
         shape = td.batch_size
         parameters = self.specs.from_unit(unit_parameters.reshape(*shape, self.specs.num_parameters), td)
-        return td.update({keys.ACTION: {"discrete": discrete.reshape(shape), "parameters": parameters}})
+        discrete = discrete.reshape((*shape, *discrete.shape[1:]))
+        return td.update({keys.ACTION: {"discrete": discrete, "parameters": parameters}})
 
     def first_action(
         self, td: TensorDictBase, observation: Tensor, is_planned: Tensor, mask: Tensor | None

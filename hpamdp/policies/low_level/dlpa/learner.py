@@ -37,7 +37,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp import keys
-from hpamdp.policies.base import is_greedy, option_ends
+from hpamdp.policies.base import ActionFeature, is_greedy, option_ends
 from hpamdp.policies.low_level.dlpa.model import PAMDPModel
 from hpamdp.policies.low_level.dlpa.planner import Planner, PlannerOptions
 from hpamdp.policies.shared.end_values import EndValues
@@ -92,10 +92,13 @@ class DLPAPolicy(PlanningPolicy):
         """Return the first action of each plan, see `PlanningPolicy.first_action`."""
         plan = self.planner.plan(observation[is_planned], mask)
         probability, mean, deviation = (part[:, 0] for part in plan)
+        components = self.specs.components
         if is_greedy():
-            return probability.argmax(-1), mean
+            return components.best(probability), mean
         unit_parameters = mean + deviation * torch.randn_like(mean)
-        return probability.multinomial(1).squeeze(-1), unit_parameters.clamp(-1.0, 1.0)
+        drawn = [part.multinomial(1) for part in probability.split(components.sizes, -1)]
+        discrete = drawn[0].squeeze(-1) if components.is_single else torch.cat(drawn, -1)
+        return discrete, unit_parameters.clamp(-1.0, 1.0)
 
 
 class DLPA(ReplayLearner):
@@ -106,6 +109,7 @@ class DLPA(ReplayLearner):
     """
 
     Options = DLPAOptions
+    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
     modes: ClassVar[tuple[str, ...]] = ("train",)
     value_setting = "end_values"
     catches_up = True

@@ -26,11 +26,15 @@ class Predictor(nn.Module):
     - `masking`: as `parallel`, but with the parameters of all actions, those of the others set to 0;
     - `sequential`: the state and the discrete action first, then their embedding and the action's own parameters.
 
+    With several components, the networks see what each component chose, and the parameters of all discrete actions,
+    those of the others set to 0.
+
     Shapes: states `[B, observation_dim]`, discrete actions `[B]`, parameters `[B, num_parameters]` in [-1, 1].
     """
 
     mask: Tensor
     slots: Tensor
+    owner: Tensor
 
     def __init__(
         self, specs: PAMDPSpecs, form: str, num_members: int, hidden_dims: Sequence[int], out_dim: int
@@ -40,19 +44,26 @@ class Predictor(nn.Module):
         self.num_discrete = specs.num_discrete
         max_parameters = max(specs.parameter_dims)
         first_dim = specs.observation_dim + specs.num_discrete
-        parameters_dim = specs.num_parameters if form == "masking" else max_parameters
+        self.components = specs.components
+        shows_all = form == "masking" or not self.components.is_single
+        parameters_dim = specs.num_parameters if shows_all else max_parameters
         self.first = nn.Linear(first_dim, hidden_dims[0], dtype=torch.float32) if form == "sequential" else None
         in_dim = hidden_dims[0] if form == "sequential" else first_dim
         self.net = EnsembleMLP(num_members, in_dim + parameters_dim, hidden_dims, out_dim)
         self.register_buffer("mask", specs.parameter_mask.float())
         self.register_buffer("slots", specs.parameter_slots)
+        self.register_buffer("owner", specs.parameter_owner, persistent=False)
 
     def forward(self, state: Tensor, discrete: Tensor, unit_parameters: Tensor) -> Tensor:
         """Apply all members."""
-        own = unit_parameters * self.mask[discrete]
-        if self.form != "masking":
-            own = own.gather(-1, self.slots[discrete])
-        x = torch.cat([state, F.one_hot(discrete, self.num_discrete).to(state.dtype)], -1)
+        if self.components.is_single:
+            own, is_chosen = unit_parameters * self.mask[discrete], F.one_hot(discrete, self.num_discrete)
+            if self.form != "masking":
+                own = own.gather(-1, self.slots[discrete])
+        else:
+            is_chosen = self.components.is_chosen(discrete)
+            own = unit_parameters * is_chosen.index_select(-1, self.owner)
+        x = torch.cat([state, is_chosen.to(state.dtype)], -1)
         if self.first is not None:
             x = self.first(x).relu()
         return self.net(torch.cat([x, own], -1))

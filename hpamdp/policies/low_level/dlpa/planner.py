@@ -12,7 +12,6 @@ from typing import Annotated, Any, NamedTuple
 import torch
 from pydantic import Field, NonNegativeFloat, model_validator
 from torch import Tensor
-from torch.nn import functional as F
 from typing_extensions import Self
 
 from hpamdp.policies.shared.planning import Prediction, discounted_return, elite_weights
@@ -42,7 +41,7 @@ class PlannerOptions(PlanningOptions):
 class Plan(NamedTuple):
     """A distribution over action sequences: at each step a categorical and a Gaussian for each parameter."""
 
-    probability: Tensor  # [N, H, num_discrete]
+    probability: Tensor  # [N, H, num_discrete], of the discrete actions in their component
     mean: Tensor  # [N, H, num_parameters] in [-1, 1]
     deviation: Tensor  # [N, H, num_parameters]
 
@@ -68,6 +67,7 @@ class Planner:
         self.options: PlannerOptions = PlannerOptions.of(options, settings)
         self.model = model
         self.specs = specs
+        self.components = specs.components
         self.end_value = end_value
         self.precision: torch.dtype = getattr(torch, self.options.planning_precision)
 
@@ -87,7 +87,9 @@ class Planner:
 
     def _plan(self, state: Tensor, action_mask: Tensor | None) -> Plan:
         shape = state.shape[0], self.options.horizon
-        probability = state.new_full((*shape, self.specs.num_discrete), 1.0 / self.specs.num_discrete)
+        sizes = state.new_tensor([1.0 / size for size in self.components.sizes])
+        sizes = sizes[self.components.component_of(state.device)]
+        probability = sizes.expand(*shape, -1).clone()
         later = self.specs.allowed(state)
         if later is not None:
             probability = probability * later.unsqueeze(1)
@@ -95,7 +97,8 @@ class Planner:
             probability[:, 0] *= action_mask
         if later is not None or action_mask is not None:
             # The iterations never leave these actions: what is not sampled is no elite.
-            probability = probability / probability.sum(-1, keepdim=True)
+            parts = probability.split(self.components.sizes, -1)
+            probability = torch.cat([part / part.sum(-1, keepdim=True) for part in parts], -1)
         mean = state.new_zeros(*shape, self.specs.num_parameters)
         plan = Plan(probability, mean, torch.ones_like(mean))
         for _ in range(self.options.num_iterations):
@@ -104,10 +107,13 @@ class Planner:
         return plan
 
     def sample(self, plan: Plan) -> tuple[Tensor, Tensor]:
-        """Sample discrete actions `[N, S, H]` and parameters `[N, S, H, num_parameters]` in [-1, 1]."""
-        discrete = plan.probability.flatten(0, 1).multinomial(self.options.num_samples, replacement=True)
-        discrete = discrete.unflatten(0, plan.probability.shape[:2]).transpose(1, 2)
-        noise = torch.randn(*discrete.shape, self.specs.num_parameters, device=discrete.device, dtype=torch.float32)
+        """Sample discrete actions `[N, S, H, ...]` and parameters `[N, S, H, num_parameters]` in [-1, 1]."""
+        drawn = []
+        for part in plan.probability.flatten(0, 1).split(self.components.sizes, -1):
+            choice = part.multinomial(self.options.num_samples, replacement=True)
+            drawn.append(choice.unflatten(0, plan.probability.shape[:2]).transpose(1, 2))
+        discrete = drawn[0] if self.components.is_single else torch.stack(drawn, -1)
+        noise = torch.randn(*drawn[0].shape, self.specs.num_parameters, device=discrete.device, dtype=torch.float32)
         unit_parameters = plan.mean.unsqueeze(1) + plan.deviation.unsqueeze(1) * noise
         return discrete, unit_parameters.clamp(-1.0, 1.0)
 
@@ -119,7 +125,8 @@ class Planner:
             nonlocal rows
             for h in range(discrete.shape[2]):
                 with torch.autocast(rows.device.type, self.precision, enabled=self.precision != torch.float32):
-                    predicted = self.model(rows, discrete[:, :, h].flatten(), unit_parameters[:, :, h].flatten(0, 1))
+                    chosen = discrete[:, :, h].flatten(0, 1)
+                    predicted = self.model(rows, chosen, unit_parameters[:, :, h].flatten(0, 1))
                 rows = predicted.next_state
                 yield predicted
 
@@ -137,9 +144,9 @@ class Planner:
         """
         options = self.options
         elite, elite_weight = elite_weights(returns, options.num_elites, options.temperature)
-        discrete = discrete.take_along_dim(elite[..., None], 1)
+        discrete = discrete.take_along_dim(elite.reshape(*elite.shape, *[1] * (discrete.ndim - 2)), 1)
         unit_parameters = unit_parameters.take_along_dim(elite[..., None, None], 1)
-        discrete_weight = elite_weight[..., None, None] * F.one_hot(discrete, self.specs.num_discrete)
+        discrete_weight = elite_weight[..., None, None] * self.components.is_chosen(discrete)
         parameter_weight = discrete_weight @ self.specs.parameter_mask.to(discrete_weight)
         total = parameter_weight.sum(1)
         parameter_weight = parameter_weight / total.clamp(min=1e-8).unsqueeze(1)

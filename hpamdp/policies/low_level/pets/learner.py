@@ -44,6 +44,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from hpamdp import keys
+from hpamdp.policies.base import ActionFeature
 from hpamdp.policies.low_level.pets.model import PETSModel
 from hpamdp.policies.low_level.pets.policy import PETSPolicy, PETSPolicyOptions
 from hpamdp.policies.shared.end_values import EndValues
@@ -76,6 +77,7 @@ class PETS(ReplayLearner):
     """A PETSModel trained on all steps so far, and a SequenceSearch that plans in it."""
 
     Options = PETSOptions
+    takes = frozenset({ActionFeature.COMPONENTS, ActionFeature.PARAMETER_BOUNDS})
     modes: ClassVar[tuple[str, ...]] = ("train",)
     stores_own_parameters = True
     catches_up = True
@@ -169,9 +171,15 @@ class PETS(ReplayLearner):
         frame = self.model.frame
         if self.symmetry is not None and not frame.turns:
             stored = self._with_all_maps(stored)
-        direction = frame.direction(stored["state"], stored["discrete"])
-        turned = [frame.turn(stored[name], direction) for name in ("state", "next_state")]
-        kind, own = frame.kind[stored["discrete"]], stored["unit"] * self.policy.search.has_slot[stored["discrete"]]
+        joint = self.policy.joint
+        if joint.components.is_single:
+            direction = frame.direction(stored["state"], stored["discrete"])
+            turned = [frame.turn(stored[name], direction) for name in ("state", "next_state")]
+            kind, own = frame.kind[stored["discrete"]], stored["unit"] * joint.has_slot[stored["discrete"]]
+        else:
+            turned = [stored["state"], stored["next_state"]]
+            kind = joint.number(stored["discrete"])
+            own = joint.own(kind, stored["unit"])
         reward, terminated = stored["reward"], stored["terminated"]
         if frame.turns and frame.geometry is not None and frame.geometry.has_mirror:
             turned = [torch.cat([state, frame.mirror(state)]) for state in turned]

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from hpamdp.policies.shared.canonical_frame import CanonicalFrame, joined
+from hpamdp.policies.shared.joint_choice import JointChoice
 from hpamdp.policies.shared.networks import EnsembleLinear
 from hpamdp.policies.shared.planning import Prediction
 from hpamdp.policies.shared.planning_policy import PlanningOptions
@@ -105,6 +106,7 @@ class PETSModel(nn.Module):
         self.is_probabilistic = options.probabilistic
         self.frame = CanonicalFrame(specs, is_used=options.augment is not False)
         self.has_linear_part = not self.frame.turns if options.linear_part == "auto" else options.linear_part
+        self.joint = None if specs.components.is_single else JointChoice(specs)
         kinds = self.frame.kind.tolist()
         of_kinds = zip(kinds, specs.parameter_dims, strict=True)
         slots = sorted({(kind, slot) for kind, num_slots in of_kinds for slot in range(num_slots)})
@@ -149,13 +151,14 @@ class PETSModel(nn.Module):
 
         Args:
             state: `[E, B, observation_dim]`.
-            discrete: `[E, B]`.
+            discrete: discrete actions, or with several components numbered choices (`JointChoice`), `[E, B]`.
             own: parameters of the discrete actions, `[E, B, D]` in [-1, 1].
             precision: of the networks.
         """
-        direction = self.frame.direction(state, discrete)
-        turned = self.frame.turn(state, direction)
-        x = self._inputs(turned, self.action_inputs(self.frame.kind[discrete], own))
+        direction = None if self.joint is not None else self.frame.direction(state, discrete)
+        turned = state if direction is None else self.frame.turn(state, direction)
+        kind = discrete if direction is None else self.frame.kind[discrete]
+        x = self._inputs(turned, self.action_inputs(kind, own))
         if self.is_probabilistic:
             change = self._sampled(self.transition(x, precision)) @ self._change_map()
         else:
@@ -166,7 +169,7 @@ class PETSModel(nn.Module):
         logit, terminating, continuing = outcome.unbind(-1)
         mean, scale = self.reward_mean, self.reward_scale
         return Prediction(
-            self.frame.turn_back(turned + change, direction),
+            turned + change if direction is None else self.frame.turn_back(turned + change, direction),
             continuing * scale[0] + mean[0],
             terminating * scale[1] + mean[1],
             logit,
@@ -175,8 +178,12 @@ class PETSModel(nn.Module):
     def action_inputs(self, kind: Tensor, own: Tensor) -> Tensor:
         """Return what the networks see of actions of a kind `[*B]` with parameters `[*B, D]`.
 
-        That is the kind, and each kind's own parameters and their squares, 0 for the other kinds.
+        That is the kind, and each kind's own parameters and their squares, 0 for the other kinds. With several
+        components, a kind is a numbered choice, of which the networks see what each component chose.
         """
+        if self.joint is not None:
+            value = self.joint.spread(kind, own)
+            return joined(self.joint.is_chosen[kind].to(own.dtype), value, value.square())
         if not self.has_kinds:
             return joined(own, own.square())
         value = own[..., self.slot_number] * (kind.unsqueeze(-1) == self.slot_kind)

@@ -15,6 +15,7 @@ from hpamdp.policies.base import is_greedy
 from hpamdp.policies.low_level.pets.model import PETSModel, PETSModelOptions
 from hpamdp.policies.shared.end_values import EndValues
 from hpamdp.policies.shared.exploration import ParameterNoiseOptions, with_exploring_noise
+from hpamdp.policies.shared.joint_choice import JointChoice
 from hpamdp.policies.shared.planning import (
     PlannedAction,
     Prediction,
@@ -79,12 +80,12 @@ class PETSPolicy(PlanningPolicy):
         self.options = options
         self.entries = entries
         self.model = model
-        self.search = SequenceSearch(specs.parameter_dims, options)
+        self.joint = JointChoice(specs)
+        self.search = SequenceSearch(self.joint.parameter_dims, options)
         auto = options.posterior_sampling == "auto"
         self.samples_posterior = model.frame.turns if auto else bool(options.posterior_sampling)
         self.precision: torch.dtype = getattr(torch, options.planning_precision)
         self.end_value = end_value
-        self.register_buffer("slots", specs.parameter_slots, persistent=False)
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         """Write the discrete action, the member `[*B]` and the parameters `[*B, num_parameters]`."""
@@ -107,8 +108,7 @@ class PETSPolicy(PlanningPolicy):
         member = td.get(MEMBER).flatten()[is_planned] if self._follows_member else None
         planned = self.plan(observation[:, self.entries], member, self._allowed(observation, mask))
         own = planned.own if is_greedy() else with_exploring_noise(planned.own, self.options.parameter_noise)
-        unit_parameters = own.new_zeros(len(own), self.specs.num_parameters)
-        return planned.discrete, unit_parameters.scatter(-1, self.slots[planned.discrete], own)
+        return self.joint.choice(planned.discrete), self.joint.spread(planned.discrete, own)
 
     @torch.no_grad()
     def value(self, observation: Tensor, action_mask: Tensor | None = None) -> Tensor:
@@ -137,7 +137,7 @@ class PETSPolicy(PlanningPolicy):
         Args:
             state: where the plans begin.
             member: of each of them.
-            allowed: the discrete actions that each step may take, bool `[N, horizon, num_discrete]`. If None, all.
+            allowed: the numbered choices that each step may take, bool `[N, horizon, J]`. If None, all.
         """
         num_members = self.model.num_members
         if member is None:
@@ -157,7 +157,7 @@ class PETSPolicy(PlanningPolicy):
         return PlannedAction(*(part[row] for part in planned))
 
     def _allowed(self, observation: Tensor, action_mask: Tensor | None) -> Tensor | None:
-        """Return which actions each step of a plan may take, bool `[N, horizon, num_discrete]`. If None, all.
+        """Return which numbered choices each step of a plan may take, bool `[N, horizon, J]`. If None, all.
 
         What the environment will allow in predicted states is unknown, and taken to be everything.
         """
@@ -166,13 +166,13 @@ class PETSPolicy(PlanningPolicy):
             return None
         later = self.specs.allowed(observation)
         later = torch.ones_like(first) if later is None else later
-        return torch.stack([first] + [later] * (self.options.horizon - 1), 1)
+        return self.joint.allowed(torch.stack([first] + [later] * (self.options.horizon - 1), 1))
 
     def _plan(self, state: Tensor, allowed: Tensor | None, *, is_mean: bool) -> PlannedAction:
         """Plan from states `[E, N, observation_dim]`: N plans by the mean of all members, or one for each state.
 
         In a plan by the mean, single members choose the sequences that are refined, which takes a fraction of the time.
-        `allowed` is bool `[N, horizon, num_discrete]`, or `[E, N, horizon, num_discrete]`.
+        `allowed` is bool `[N, horizon, J]`, or `[E, N, horizon, J]`.
         """
         search = self.search
         num_sequences = min(self.options.num_kept, search.num_sequences) if is_mean else search.num_sequences
