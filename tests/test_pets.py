@@ -592,7 +592,7 @@ def test_a_share_epsilon_of_exploring_actions_is_random_and_no_greedy_one(monkey
 
     def plan(state, member=None, allowed=None):
         asked.append(len(state))
-        own = torch.zeros(len(state), learner.policy.slots.shape[-1])
+        own = torch.zeros(len(state), learner.policy.joint.slots.shape[-1])
         return PlannedAction(torch.full((len(state),), 2), own, torch.zeros(len(state)))
 
     monkeypatch.setattr(learner.policy, "plan", plan)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -14,13 +16,17 @@ from hpamdp.env.base import PAMDPEnv
 class OneStep(PAMDPEnv):
     """Choose two of two discrete actions with a parameter each, and three without; the observation is one coin.
 
-    The first component pays best for discrete action `coin`, with its parameter near 0.4; the second for action 2.
-    With `is_matched`, the second component must match a first one that is a matter of taste: pairs (0, 0) and (1, 1)
-    pay 1.0, all others -1.0, so that each component by itself is worth the same whatever it chooses.
+    The parameter of what the first component chose should be 0.4. How the components pay depends on `pays`:
+
+    - `each`: 0.5 for a first component equal to the coin, and 0.5 for a second one of 2;
+    - `matched`: 1 for the pairs (0, 0) and (1, 1), -1 for all others. Each component by itself pays the same whatever
+      it chooses;
+    - `climbing`: 1 for the pair (0, 0), but -2 for a first component of 0 with any other second one. On average over
+      the other component, 1 pays more than 0 in the first one, and 1 or 2 more than 0 in the second: at most 0.5.
 
     Args:
         num_envs: number of environments.
-        is_matched: whether the components depend on each other.
+        pays: see above.
         forbids_pairs: whether a `pair_mask` forbids what does not match.
         seed: of the coins.
         device: of the tensors.
@@ -34,14 +40,14 @@ class OneStep(PAMDPEnv):
         self,
         num_envs: int = 1,
         *,
-        is_matched: bool = False,
+        pays: Literal["each", "matched", "climbing"] = "each",
         forbids_pairs: bool = False,
         seed: int = 0,
         device: object = "cpu",
     ) -> None:
         super().__init__(device=device, batch_size=[num_envs])
         n = num_envs
-        self.is_matched = is_matched
+        self.pays = pays
         self.forbids_pairs = forbids_pairs
         self.violations = 0
         observed = {keys.OBSERVATION: Bounded(0.0, 1.0, shape=(n, 2))}
@@ -72,10 +78,13 @@ class OneStep(PAMDPEnv):
 
     def pay(self, coin: Tensor, discrete: Tensor, own: Tensor) -> Tensor:
         """Return the rewards `[N]`; the best is 1."""
+        first, second = discrete.unbind(-1)
         near = -(own - 0.4).square()
-        if self.is_matched:
-            return torch.where(discrete[:, 0] == discrete[:, 1], 1.0, -1.0) + near
-        return 0.5 * (discrete[:, 0] == coin) + 0.5 * (discrete[:, 1] == 2) + near
+        if self.pays == "each":
+            return 0.5 * (first == coin) + 0.5 * (second == 2) + near
+        if self.pays == "matched":
+            return torch.where(first == second, 1.0, -1.0) + near
+        return torch.tensor([[1.0, -2.0, -2.0], [-0.5, 0.5, 0.5]])[first, second] + near
 
     def _read(self, *, is_over: bool) -> TensorDict:
         n = self.batch_size
